@@ -1,0 +1,1 @@
+"""Spike-camera recordings in, camera trajectory and Gaussian scene out: the library, without hardware or network."""

@@ -1,0 +1,131 @@
+"""A scene of Gaussians, and the PLY file with the fields that 3D Gaussian splatting tools expect."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.errors import SceneError
+
+Array = NDArray[np.float32]
+
+SH_C0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+
+_KINDS = {
+    "char": "i1", "uchar": "u1", "int8": "i1", "uint8": "u1", "short": "<i2", "ushort": "<u2", "int16": "<i2",
+    "uint16": "<u2", "int": "<i4", "uint": "<u4", "int32": "<i4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
+    "double": "<f8", "float64": "<f8",
+}  # fmt: skip
+
+
+@dataclass
+class Scene:
+    """Gaussians as float32 arrays, C-contiguous. Positions in the trajectory's length unit."""
+
+    means: Array  # [N, 3]
+    quats: Array  # [N, 4] wxyz, any length
+    log_scales: Array  # [N, 3] natural logarithm of the standard deviations
+    opacity_logits: Array  # [N]
+    colours: Array  # [N, C] radiance in expected spikes a frame, C = 1 (grey) or 3
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @classmethod
+    def empty(cls, channels: int) -> "Scene":
+        """A scene without Gaussians."""
+        shapes = ((0, 3), (0, 4), (0, 3), (0,), (0, channels))
+        return cls(*(np.zeros(shape, np.float32) for shape in shapes))
+
+    def arrays(self) -> tuple[Array, Array, Array, Array, Array]:
+        """The five arrays in the order of the fields."""
+        return self.means, self.quats, self.log_scales, self.opacity_logits, self.colours
+
+    def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "Scene":
+        """The Gaussians at `rows`, copied."""
+        return Scene(*(np.ascontiguousarray(array[rows]) for array in self.arrays()))
+
+    def join(self, other: "Scene") -> "Scene":
+        """These Gaussians followed by those of `other`."""
+        return Scene(*(np.concatenate(pair) for pair in zip(self.arrays(), other.arrays(), strict=True)))
+
+    def write_ply(self, path: Path | str, white: float = 1.0) -> None:
+        """Write a binary PLY with the standard 3DGS fields; radiance `white` becomes colour 1."""
+        Path(path).write_bytes(self.ply(white))
+
+    def ply(self, white: float = 1.0) -> bytes:
+        """The bytes of the PLY file; radiance `white` becomes colour 1."""
+        rgb = np.broadcast_to(self.colours, (len(self), 3)) / white
+        names = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+        names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+        head = ["ply", "format binary_little_endian 1.0", f"comment radiance {white!r} spikes per frame is colour 1"]
+        head += [f"element vertex {len(self)}", *(f"property float {name}" for name in names), "end_header\n"]
+        quats = self.quats / np.maximum(np.linalg.norm(self.quats, axis=1, keepdims=True), 1e-12)
+        columns = [self.means, np.zeros_like(self.means), (rgb - 0.5) / SH_C0, self.opacity_logits[:, None]]
+        body = np.concatenate([*columns, self.log_scales, quats], 1).astype("<f4")
+        return "\n".join(head).encode() + body.tobytes()
+
+    @classmethod
+    def read_ply(cls, path: Path | str) -> "Scene":
+        """Read a 3DGS PLY. View-dependent colour (f_rest) is left out; a `radiance` comment written by us is undone;
+        equal red, green and blue read as one channel.
+
+        Raises SceneError for anything that is not such a file.
+        """
+        try:
+            raw = Path(path).read_bytes()
+        except OSError as error:
+            raise SceneError(f"cannot read scene {path}: {error.strerror}") from error
+        names, count, white, start = _parse_header(raw, path)
+        table = np.frombuffer(raw, np.dtype(names), count, start)
+
+        def pick(*fields: str) -> Array:
+            missing = [field for field in fields if field not in (table.dtype.names or ())]
+            if missing:
+                raise SceneError(f"{path} has no property {missing[0]!r}; it is not a 3D Gaussian scene")
+            return np.stack([table[field] for field in fields], 1).astype(np.float32)
+
+        rgb = (0.5 + SH_C0 * pick("f_dc_0", "f_dc_1", "f_dc_2")) * np.float32(white)
+        grey = len(rgb) == 0 or bool(np.all(rgb == rgb[:, :1]))
+        scene = cls(
+            pick("x", "y", "z"),
+            pick("rot_0", "rot_1", "rot_2", "rot_3"),
+            pick("scale_0", "scale_1", "scale_2"),
+            pick("opacity")[:, 0].copy(),
+            np.ascontiguousarray(rgb[:, :1] if grey else rgb),
+        )
+        if not all(np.isfinite(array).all() for array in scene.arrays()):
+            raise SceneError(f"{path} holds values that are not finite")
+        return scene
+
+
+def _parse_header(raw: bytes, path: Path | str) -> tuple[list[tuple[str, str]], int, float, int]:
+    """Property names with types, number of vertices, radiance of colour 1, and where the data begin."""
+    mark = b"end_header\n"
+    end = raw.find(mark)
+    if not raw.startswith(b"ply") or end < 0:
+        raise SceneError(f"{path} is not a PLY file")
+    names: list[tuple[str, str]] = []
+    count, white, element = 0, 1.0, ""
+    for line in raw[:end].decode("latin-1").splitlines():
+        words = line.split()
+        match words:
+            case ["format", kind, *_] if kind != "binary_little_endian":
+                raise SceneError(f"{path} is a PLY of format {kind}; only binary_little_endian is read")
+            case ["comment", "radiance", value, *_]:
+                white = float(value)
+            case ["element", element, number]:
+                count = int(number) if element == "vertex" else count
+            case ["property", kind, name] if element == "vertex":
+                if kind not in _KINDS:
+                    raise SceneError(f"{path}: property {name} has unknown type {kind}")
+                names.append((name, _KINDS[kind]))
+            case _:
+                pass
+    start = end + len(mark)
+    need = count * np.dtype(names).itemsize if names else 0
+    if len(raw) - start < need:
+        raise SceneError(f"{path} is cut short: {count} Gaussians need {need} bytes, {len(raw) - start} are there")
+    return names, count, white, start

@@ -1,0 +1,142 @@
+"""A continuous camera path: a cumulative B-spline on SO(3) x R^3 over frames.
+
+Rotation: R(t) = R_i Exp(lam_1 d_1) ... Exp(lam_n d_n) with d_j = Log(R_{i+j-1}^T R_{i+j}); centre: the ordinary
+B-spline of the knots' centres. Degree 3 for smooth motion, degree 1 where motion is kinked.
+(C. Sommer et al., "Efficient derivative computation for cumulative B-splines on Lie groups", CVPR 2020.)
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from spiked.pose import Array, exp_so3, inverse_right_jacobian, log_so3, right_jacobian
+
+_BASIS = {
+    1: np.array([[1.0, -1.0], [0.0, 1.0]]),
+    3: np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0,
+}
+"""Weights of the degree + 1 knots as polynomials of u in [0, 1): row k holds the coefficients of 1, u, u^2, ..."""
+
+
+@dataclass
+class Spline:
+    """Knots at `first + k * spacing` frames. `rotations` [n, 3, 3] camera-to-world, `centres` [n, 3], changed in place
+    by optimisers. Times are in frames; the pose of frame k is at k + 0.5."""
+
+    first: float
+    spacing: float
+    rotations: Array
+    centres: Array
+    degree: int = 3
+
+    @classmethod
+    def fit(cls, times: ArrayLike, rotations: Array, centres: Array, spacing: float, degree: int = 3) -> "Spline":
+        """A spline through poses at increasing `times` [m] (frames), knots every `spacing` frames; before and after
+        the given times it continues at constant velocity. Least squares for centres; rotations start interpolated."""
+        t = np.asarray(times, float)
+        pad = (degree - 1) / 2
+        count = int(np.ceil(max(t[-1] - t[0], 1e-6) / spacing)) + degree + 1
+        first = t[0] - pad * spacing - 1e-6
+        knots = first + spacing * np.arange(count)
+        spline = cls(first, spacing, interpolate_rotations(t, rotations, knots), np.zeros((count, 3)), degree)
+        basis = spline.basis_matrix(t)
+        guess = _interpolate_linear(t, centres, knots)
+        smooth = 1e-4 * np.diff(np.eye(count), 2, axis=0)
+        lhs = np.vstack([basis, smooth])
+        rhs = np.vstack([centres - basis @ guess, -smooth @ guess * 0])
+        spline.centres = guess + np.linalg.lstsq(lhs, rhs, rcond=None)[0]
+        for _ in range(3):
+            error = log_so3(rotations @ spline.poses(t)[0].swapaxes(-1, -2))
+            step = np.linalg.lstsq(lhs, np.vstack([error, np.zeros((count - 2, 3))]), rcond=None)[0]
+            spline.rotations = exp_so3(step) @ spline.rotations
+        return spline
+
+    @property
+    def begin(self) -> float:
+        """First time (frames) at which the spline is defined."""
+        return self.first + self.spacing * (self.degree - 1) / 2
+
+    @property
+    def end(self) -> float:
+        """Last time (frames) at which the spline is defined."""
+        return self.begin + self.spacing * (len(self.centres) - self.degree)
+
+    def locate(self, times: ArrayLike) -> tuple[NDArray[np.int64], Array]:
+        """First knot i [m] and weights [m, degree + 1] of the knots i.. at `times` (clamped to the defined range)."""
+        s = (np.asarray(times, float) - self.begin) / self.spacing
+        last = len(self.centres) - self.degree - 1
+        i = np.clip(np.floor(s).astype(np.int64), 0, last)
+        u = np.clip(s - i, 0.0, 1.0)
+        return i, (u[..., None] ** np.arange(self.degree + 1)) @ _BASIS[self.degree].T
+
+    def basis_matrix(self, times: ArrayLike) -> Array:
+        """Dense weights [m, knots]: the pose at a time is, to first order, this blend of the knots' perturbations."""
+        i, weights = self.locate(times)
+        dense = np.zeros((len(i), len(self.centres)))
+        np.put_along_axis(dense, i[:, None] + np.arange(self.degree + 1), weights, 1)
+        return dense
+
+    def poses(self, times: ArrayLike) -> tuple[Array, Array]:
+        """Rotations [m, 3, 3] and centres [m, 3] at `times` [m] in frames."""
+        i, weights = self.locate(times)
+        k = i[:, None] + np.arange(self.degree + 1)
+        centres = np.einsum("mk,mkd->md", weights, self.centres[k])
+        cumulative = np.cumsum(weights[:, ::-1], 1)[:, ::-1]
+        knots = self.rotations[k]
+        rotation = knots[:, 0]
+        for j in range(1, self.degree + 1):
+            delta = log_so3(knots[:, j - 1].swapaxes(-1, -2) @ knots[:, j])
+            rotation = rotation @ exp_so3(cumulative[:, j, None] * delta)
+        return rotation, centres
+
+    def rotation_jacobians(self, times: ArrayLike) -> tuple[NDArray[np.int64], Array]:
+        """Exact d(phi at t) / d(phi of knot), left perturbations: first knots [m] and Jacobians [m, degree+1, 3, 3]."""
+        i, weights = self.locate(times)
+        k = i[:, None] + np.arange(self.degree + 1)
+        cumulative = np.cumsum(weights[:, ::-1], 1)[:, ::-1]
+        knots = self.rotations[k]
+        jacobians = np.zeros((*k.shape, 3, 3))
+        jacobians[:, 0] = np.eye(3)
+        product = knots[:, 0]
+        for j in range(1, self.degree + 1):
+            delta = log_so3(knots[:, j - 1].swapaxes(-1, -2) @ knots[:, j])
+            lam = cumulative[:, j, None]
+            product = product @ exp_so3(lam * delta)
+            m = product @ (lam[..., None] * right_jacobian(lam * delta)) @ inverse_right_jacobian(delta)
+            m = m @ knots[:, j].swapaxes(-1, -2)
+            jacobians[:, j] += m
+            jacobians[:, j - 1] -= m
+        return i, jacobians
+
+    def knot_gradients(self, times: ArrayLike, rotation: Array, centre: Array) -> tuple[Array, Array]:
+        """Chain dL/dphi [m, 3] and dL/dcentre [m, 3] at `times` to the knots: two arrays [knots, 3], exact."""
+        i, jacobians = self.rotation_jacobians(times)
+        _, weights = self.locate(times)
+        k = i[:, None] + np.arange(self.degree + 1)
+        by_rotation = np.zeros_like(self.centres)
+        by_centre = np.zeros_like(self.centres)
+        np.add.at(by_rotation, k, np.einsum("mkij,mi->mkj", jacobians, rotation))
+        np.add.at(by_centre, k, weights[..., None] * centre[:, None])
+        return by_rotation, by_centre
+
+    def move(self, rotation: Array, centre: Array) -> "Spline":
+        """The spline with knots perturbed: R <- Exp(rotation) R, c <- c + centre; both [knots, 3]."""
+        return Spline(self.first, self.spacing, exp_so3(rotation) @ self.rotations, self.centres + centre, self.degree)
+
+
+def interpolate_rotations(times: Array, rotations: Array, at: Array) -> Array:
+    """Geodesic interpolation of rotations [m, 3, 3], continued at constant velocity outside: [k, 3, 3]."""
+    if len(times) == 1:
+        return np.repeat(rotations, len(at), 0)
+    i = np.clip(np.searchsorted(times, at) - 1, 0, len(times) - 2)
+    u = (at - times[i]) / (times[i + 1] - times[i])
+    return np.asarray(rotations[i] @ exp_so3(u[:, None] * log_so3(rotations[i].swapaxes(-1, -2) @ rotations[i + 1])))
+
+
+def _interpolate_linear(times: Array, values: Array, at: Array) -> Array:
+    if len(times) == 1:
+        return np.repeat(values, len(at), 0)
+    i = np.clip(np.searchsorted(times, at) - 1, 0, len(times) - 2)
+    u = ((at - times[i]) / (times[i + 1] - times[i]))[:, None]
+    return np.asarray((1 - u) * values[i] + u * values[i + 1])

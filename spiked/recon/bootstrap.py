@@ -1,0 +1,191 @@
+"""The first map from nothing: sparse tracks over a few views, several starting guesses, the lowest robust cost wins.
+
+Joint optimisation from one guess often ends in the depth-reversed scene; trying guesses and the mirror image of the best
+(translations negated, inverse depths mirrored about their median) avoids that.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.pose import Array
+from spiked.recon.bundle import Bundle
+from spiked.sensor import Intrinsics
+
+SCALE_PX = 0.3
+"""Scale of the Cauchy loss: tracks on spike-aligned rates are good to about 0.05 px."""
+INLIER_PX = 1.0
+
+
+class Guess(StrEnum):
+    """Where a hypothesis came from."""
+
+    FLAT = "flat"
+    RANDOM = "random"
+    FIVE_POINT = "five_point"
+    MIRROR = "mirror"
+
+
+@dataclass(frozen=True)
+class Views:
+    """Tracks seen in all of K views: `pixels` [K, P, 2]; `ids` [P] name them."""
+
+    pixels: Array
+    ids: NDArray[np.int64]
+    intrinsics: Intrinsics
+
+    def rays(self) -> Array:
+        """Directions with z = 1 in each camera, [K, P, 3]."""
+        k = self.intrinsics
+        xy = (self.pixels - [k.cx, k.cy]) / [k.fx, k.fy]
+        return np.concatenate([xy, np.ones((*xy.shape[:2], 1))], 2)
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One converged reconstruction of the views, normalised to median depth 1 in the first camera."""
+
+    guess: Guess
+    bundle: Bundle
+    cost: float
+    inliers: float
+    """Share of observations within INLIER_PX."""
+    parallax_px: float
+    """Median over tracks of the largest motion that rotation alone cannot explain."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The outcome of a bootstrap attempt: a hypothesis, or why there is none yet."""
+
+    winner: Hypothesis | None
+    reason: str
+    tried: list[Hypothesis]
+
+
+def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = 3.0) -> Verdict:
+    """Try all guesses on `views`. Accepts when inliers > 60 %, parallax is enough and the depth-reversed rival is worse."""
+    if len(views.ids) < 30:
+        return Verdict(None, f"only {len(views.ids)} tracks span the views; more texture or light is needed", [])
+    rotation_only = _rotation_residual(views)
+    if rotation_only < min_parallax_px:
+        return Verdict(
+            None, f"parallax {rotation_only:.1f} px is below {min_parallax_px:g}: move the camera sideways", []
+        )
+    rng = np.random.default_rng(seed)
+    count = len(views.ids)
+    starts = {
+        Guess.FLAT: lambda: _from_depth(views, np.ones(count)),
+        Guess.RANDOM: lambda: _from_depth(views, 1 / rng.uniform(0.5, 1.5, count)),
+        Guess.FIVE_POINT: lambda: _from_five_point(views),
+    }
+    tried = []
+    for guess, start in starts.items():
+        bundle = start()
+        if bundle is not None:
+            tried.append(_converge(guess, bundle, rotation_only))
+    best = min(tried, key=lambda h: h.cost)
+    rival = _converge(Guess.MIRROR, _mirrored(views, best.bundle), rotation_only)
+    tried.append(rival)
+    if rival.cost < best.cost * 0.98:
+        best = rival
+    return _judge(best, tried)
+
+
+def _judge(best: Hypothesis, tried: list[Hypothesis]) -> Verdict:
+    if best.inliers < 0.6:
+        return Verdict(None, f"only {best.inliers:.0%} of the tracks agree with one rigid scene", tried)
+    different = [h for h in tried if h is not best and _reversed_depth(h, best)]
+    if different and min(h.cost for h in different) < 1.1 * best.cost:
+        return Verdict(
+            None, "the scene and its depth-reversed twin explain the tracks equally well: more motion is needed", tried
+        )
+    return Verdict(best, "accepted", tried)
+
+
+def _reversed_depth(a: Hypothesis, b: Hypothesis) -> bool:
+    """Whether the two disagree about which points are near."""
+    za, zb = a.bundle.points[:, 2], b.bundle.points[:, 2]
+    return bool(np.corrcoef(1 / np.maximum(za, 1e-3), 1 / np.maximum(zb, 1e-3))[0, 1] < 0.5)
+
+
+def _converge(guess: Guess, bundle: Bundle, parallax: float) -> Hypothesis:
+    bundle.optimise(15, 2.0)
+    cost = bundle.optimise(40, SCALE_PX, tolerance=1e-3)
+    depth = float(np.median(bundle.points[:, 2]))
+    if depth > 0:
+        bundle.points /= depth
+        bundle.centres /= depth
+    inliers = float(np.mean(np.linalg.norm(bundle.residuals(), axis=1) < INLIER_PX))
+    return Hypothesis(guess, bundle, cost, inliers, parallax)
+
+
+def _bundle(views: Views, rotations: Array, centres: Array, points: Array) -> Bundle:
+    k, p = views.pixels.shape[:2]
+    camera, point = np.divmod(np.arange(k * p), p)
+    return Bundle(rotations, centres, points, camera, point, views.pixels.reshape(-1, 2).copy(), views.intrinsics)
+
+
+def _from_depth(views: Views, depth: Array) -> Bundle:
+    """Cameras that only rotate, and points at the given depths in the first."""
+    rays = views.rays()
+    rotations = np.stack([_align(rays[0], rays[k]) for k in range(len(rays))])
+    return _bundle(views, rotations, np.zeros((len(rays), 3)), rays[0] * depth[:, None])
+
+
+def _align(first: Array, other: Array) -> Array:
+    """The rotation (camera-to-world, first camera = world) that best carries rays of `other` onto `first` (Kabsch)."""
+    a = other / np.linalg.norm(other, axis=1, keepdims=True)
+    b = first / np.linalg.norm(first, axis=1, keepdims=True)
+    weight = np.ones(len(a))
+    rotation = np.eye(3)
+    for _ in range(4):
+        u, _, vt = np.linalg.svd((b * weight[:, None]).T @ a)
+        rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+        error = np.linalg.norm(a @ rotation.T - b, axis=1)
+        weight = 1 / (1 + (error / (np.median(error) + 1e-9)) ** 2)
+    return np.asarray(rotation)
+
+
+def _rotation_residual(views: Views) -> float:
+    """Median over tracks of the largest motion left (px) when the views are explained by rotation alone."""
+    rays = views.rays()
+    left = [rays[k] @ _align(rays[0], rays[k]).T for k in range(1, len(rays))]
+    focal = views.intrinsics.fx
+    distance = [np.linalg.norm(r[:, :2] / r[:, 2:] - rays[0][:, :2], axis=1) * focal for r in left]
+    return float(np.median(np.max(distance, axis=0)))
+
+
+def _from_five_point(views: Views) -> Bundle | None:
+    """Relative pose of the first and last view from the essential matrix, the others by PnP."""
+    k = views.intrinsics.matrix()
+    first, last = views.pixels[0], views.pixels[-1]
+    essential, mask = cv2.findEssentialMat(first, last, k, cv2.RANSAC, 0.999, 0.5)
+    if essential is None or essential.shape != (3, 3):
+        return None
+    _, r, t, _ = cv2.recoverPose(essential, first, last, k, mask=mask)
+    projections = k @ np.eye(3, 4), k @ np.hstack([r, t])
+    homogeneous = cv2.triangulatePoints(*projections, first.T, last.T)
+    points = (homogeneous[:3] / homogeneous[3]).T
+    ok = np.isfinite(points).all(1) & (points[:, 2] > 0.05) & (points[:, 2] < 1e3)
+    if ok.sum() < 12:
+        return None
+    points[~ok] = views.rays()[0][~ok] * np.median(points[ok, 2])
+    rotations, centres = np.tile(np.eye(3), (len(views.pixels), 1, 1)), np.zeros((len(views.pixels), 3))
+    for i in range(1, len(views.pixels)):
+        found, rvec, tvec, _ = cv2.solvePnPRansac(points[ok], views.pixels[i][ok], k, None, reprojectionError=3.0)
+        if not found:
+            return None
+        rotation = cv2.Rodrigues(rvec)[0].T
+        rotations[i], centres[i] = rotation, -rotation @ tvec[:, 0]
+    return _bundle(views, rotations, centres, points)
+
+
+def _mirrored(views: Views, bundle: Bundle) -> Bundle:
+    """The depth-reversed start: translations negated, inverse depths mirrored about their median."""
+    inverse = 1 / np.maximum(bundle.points[:, 2], 1e-3)
+    mirrored = np.clip(2 * np.median(inverse) - inverse, 0.1 * np.median(inverse), None)
+    return _bundle(views, bundle.rotations.copy(), -bundle.centres, views.rays()[0] / mirrored[:, None])

@@ -1,0 +1,107 @@
+"""Corners followed through rate images: pyramidal Lucas-Kanade with a forward-backward check.
+
+Each track keeps the window where it was born and is re-aligned against it, so that small errors do not add up.
+"""
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.pose import Array
+
+Picture = NDArray[np.uint8]
+
+
+def picture(rate: NDArray[np.float32], white: float) -> Picture:
+    """Rates [H, W] as 8-bit values, square root for even contrast (noise grows with the rate); `white` becomes 255."""
+    scaled = np.sqrt(np.clip(rate / white, 0, 1)) * 255
+    return np.asarray(cv2.GaussianBlur(scaled.astype(np.float32), (0, 0), 0.8) + 0.5, np.uint8)
+
+
+@dataclass
+class Tracks:
+    """Positions of tracks over the windows seen so far; `observations` lists (track, window, u, v)."""
+
+    target: int = 400
+    """How many live tracks are kept."""
+    reach_px: float = 0.6
+    """Largest forward-backward distance of a good track."""
+    next_id: int = 0
+    ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    at: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    """Positions [live, 2] px (pixel centres at +0.5) in the newest window."""
+    born: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    birthplace: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    pictures: dict[int, Picture] = field(default_factory=dict)
+    newest: int = -1
+    log: list[tuple[NDArray[np.int64], int, Array]] = field(default_factory=list)
+    """(ids, window, positions) of each window."""
+
+    def add(self, window: int, image: Picture) -> float:
+        """Follow all tracks into a window and start new ones; returns the median motion in px (0 without tracks)."""
+        motion = 0.0
+        if self.newest >= 0 and len(self.ids):
+            motion = self._follow(image)
+        self.newest = window
+        self.pictures[window] = image
+        if len(self.ids) < 0.7 * self.target:
+            self._start(window, image)
+        self.log.append((self.ids.copy(), window, self.at.copy()))
+        for old in set(self.pictures) - set(self.born.tolist()) - {window}:
+            del self.pictures[old]
+        return motion
+
+    def _follow(self, image: Picture) -> float:
+        before = self.pictures[self.newest]
+        moved, good = _flow(before, image, self.at, self.at, self.reach_px, levels=4)
+        motion = float(np.median(np.linalg.norm(moved - self.at, axis=1)[good])) if good.any() else 0.0
+        for window in np.unique(self.born[good]):
+            rows = np.flatnonzero(good & (self.born == window))
+            refined, ok = _flow(
+                self.pictures[window], image, self.birthplace[rows], moved[rows], self.reach_px, levels=0
+            )
+            near = np.linalg.norm(refined - moved[rows], axis=1) < 1.5
+            moved[rows] = np.where((ok & near)[:, None], refined, moved[rows])
+            good[rows] &= ok & near
+        height, width = image.shape
+        good &= (moved > 4).all(1) & (moved[:, 0] < width - 4) & (moved[:, 1] < height - 4)
+        self.ids, self.at = self.ids[good], moved[good]
+        self.born, self.birthplace = self.born[good], self.birthplace[good]
+        return motion
+
+    def _start(self, window: int, image: Picture) -> None:
+        mask = np.full(image.shape, 255, np.uint8)
+        mask[:6], mask[-6:], mask[:, :6], mask[:, -6:] = 0, 0, 0, 0
+        for x, y in self.at:
+            cv2.circle(mask, (int(x), int(y)), 7, 0, -1)
+        wanted = self.target - len(self.ids)
+        corners = cv2.goodFeaturesToTrack(image, wanted, 0.003, 7, mask=mask, blockSize=5)
+        if corners is None:
+            return
+        fresh = corners[:, 0].astype(float) + 0.5
+        self.ids = np.concatenate([self.ids, self.next_id + np.arange(len(fresh))])
+        self.next_id += len(fresh)
+        self.at = np.concatenate([self.at, fresh])
+        self.born = np.concatenate([self.born, np.full(len(fresh), window)])
+        self.birthplace = np.concatenate([self.birthplace, fresh])
+
+
+def _flow(
+    a: Picture, b: Picture, start: Array, guess: Array, reach_px: float, levels: int
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Positions in `b` of the points `start` of `a`, and which came back to where they started."""
+    p = (start - 0.5).astype(np.float32)[:, None]
+    q = (guess - 0.5).astype(np.float32)[:, None]
+    options = {
+        "winSize": (13, 13),
+        "maxLevel": levels,
+        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003),
+        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+        "minEigThreshold": 1e-4,
+    }
+    forth, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, p, q.copy(), **options)
+    back, ok2, _ = cv2.calcOpticalFlowPyrLK(b, a, forth, p.copy(), **options)
+    close = np.linalg.norm(back[:, 0] - p[:, 0], axis=1) < reach_px
+    return forth[:, 0].astype(float) + 0.5, (ok[:, 0] == 1) & (ok2[:, 0] == 1) & close

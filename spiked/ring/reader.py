@@ -1,0 +1,251 @@
+"""The reading end of a ring: one consumer in one process, which nobody waits for."""
+
+import time
+from bisect import bisect_left
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.native._ring import NAME_BYTES, READER_PLACES, Control, Entry, ReaderCounters, ReaderPlace, WriterCounters
+from spiked.ring.items import Cause, End, EndReason, Gap, Policy, RingError, decode, encode
+from spiked.ring.process import is_alive, own_identity
+from spiked.ring.segment import Geometry, Segment, attach_segment
+from spiked.ring.status import RingStatus, read_status
+
+_LOOK_AGAIN_S = 0.1
+"""A writer that was killed does not ring the bell: readers look after it this often while nothing comes."""
+
+
+class Frames:
+    """Frames `first` to `first + count - 1`, lying in the ring itself.
+
+    The writer does not wait, so what was computed from `data` counts only if `release` says afterwards that the frames
+    were whole all the time. As a context manager it yields `data` and releases at the end; ask `intact` then.
+    """
+
+    def __init__(self, reader: "RingReader", first: int, data: NDArray[np.uint8], slot: int) -> None:
+        self._reader = reader
+        self._slot = slot
+        self._intact: bool | None = None
+        self.first = first
+        self.count = len(data)
+        self.data = data
+        """Compact frames, uint8 [count, frame_bytes], read-only."""
+
+    def valid(self) -> bool:
+        """Whether the frames have not been overwritten up to now."""
+        return self._reader._holds(self._slot) if self._intact is None else self._intact
+
+    def release(self) -> bool:
+        """Give the slot back; true if the frames were intact until now, and then they count as received.
+
+        Otherwise they count as lost and the next item is a gap that tells so. Taking the next item releases too.
+        """
+        if self._intact is None:
+            self._intact = self._reader._settle(self)
+        return self._intact
+
+    @property
+    def intact(self) -> bool:
+        """Releases, and says what `release` said."""
+        return self.release()
+
+    def __enter__(self) -> NDArray[np.uint8]:
+        return self.data
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.release()
+
+
+Item = Frames | Gap | End
+
+
+class RingReader:
+    """Takes frames, gaps and the end in order: every frame of the capture comes once, in `Frames` or in a `Gap`.
+
+    Frames from before it attached that the ring no longer holds come as a gap too. Used by one thread.
+    """
+
+    def __init__(self, segment: Segment, policy: Policy, consumer: str) -> None:
+        self._segment = segment
+        self._control: Control = segment.control
+        self._policy = policy
+        self._lease_slots = _lease(policy, segment.geometry.slots)
+        self._counters = ReaderCounters()
+        self._jumped = False  # the entry at the position was told of by a gap, so it is taken even if it is late again
+        self._held: Frames | None = None
+        self._end: End | None = None
+        writer = self._control.writer()
+        self._counters.next_entry = self._position_to_take(writer)
+        self._counters.next_slot = self._slot_of(self._counters.next_entry, writer)
+        self._start = self._counters.next_entry  # what lies before was missed by joining late, not by being slow
+        self._owner = own_identity()
+        self._place = self._claim_place(consumer)
+
+    @classmethod
+    def attach(cls, name: str, policy: Policy, consumer: str) -> Self:
+        """Read the ring of that name; `consumer` is shown in the ring's status.
+
+        Raises RingError if there is no such ring or no place for another reader.
+        """
+        return cls(attach_segment(name), policy, consumer)
+
+    @property
+    def geometry(self) -> Geometry:
+        """Sensor, number of slots, and frames a slot."""
+        return self._segment.geometry
+
+    def next(self, timeout_s: float) -> Item | None:
+        """The next item, or None if none comes in time. After the end, the end again.
+
+        A writer that dies ends the capture with EndReason.WRITER_DIED, after all that it had published.
+        """
+        if self._held is not None:
+            self._held.release()
+        deadline = time.monotonic() + timeout_s
+        while True:
+            seen = self._control.committed.value()
+            item = self._take()
+            if item is not None:
+                return item
+            remaining_s = deadline - time.monotonic()
+            if self._control.committed.wait(seen, min(max(remaining_s, 0.0), _LOOK_AGAIN_S)):
+                continue
+            if not is_alive(self._segment.owner):
+                return self._take() or self._finish(self._control.writer(), EndReason.WRITER_DIED)
+            if remaining_s <= 0:
+                return None
+
+    def status(self) -> RingStatus:
+        """Counters of the writer and of every reader."""
+        return read_status(self._segment)
+
+    def close(self) -> None:
+        """Release the frames held and detach; the reader's counters leave the ring's status."""
+        if self._held is not None:
+            self._held.release()
+        self._place.claim(self._owner, 0)
+        self._control.progress.ring()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _take(self) -> Item | None:
+        if self._end is not None:
+            return self._end
+        while True:
+            writer = self._control.writer()
+            position = self._counters.next_entry if self._jumped else self._position_to_take(writer)
+            if position >= writer.entries:
+                return self._finish(writer, decode(EndReason, writer.end)) if writer.end else None
+            entry = self._control.read_entry(position)
+            if entry is None or (entry.cause == 0 and not self._holds(entry.slot)):
+                self._jumped = False
+                continue  # overwritten between choosing and reading: choose again, from newer ones
+            if entry.first > self._counters.next_frame:
+                return self._jump(position, entry)
+            return self._accept(position, entry, newest=position + 1 == writer.entries)
+
+    def _accept(self, position: int, entry: Entry, *, newest: bool) -> Item:
+        self._jumped = False
+        if newest:
+            self._counters.lagging = 0
+        self._counters.next_entry = position + 1
+        if entry.cause:
+            return self._lose(entry.count, decode(Cause, entry.cause))
+        data = self._segment.slot(entry.slot, entry.count)
+        data.flags.writeable = False
+        self._held = Frames(self, entry.first, data, entry.slot)
+        return self._held
+
+    def _jump(self, position: int, entry: Entry) -> Gap:
+        """Tell of all that lies between the last item and this entry, which is the one to come next."""
+        self._jumped = True
+        self._counters.next_entry = position
+        self._counters.next_slot = entry.slot
+        if self._policy is not Policy.LATEST and position != self._start:
+            self._counters.lagging = 1
+            self._counters.overruns += 1
+        return self._lose(entry.first - self._counters.next_frame, Cause.RING)
+
+    def _finish(self, writer: WriterCounters, reason: EndReason) -> Gap | End:
+        missing = writer.next_frame - self._counters.next_frame
+        if missing:
+            return self._lose(missing, Cause.RING)
+        self._end = End(writer.next_frame, reason)
+        return self._end
+
+    def _lose(self, count: int, cause: Cause) -> Gap:
+        gap = Gap(self._counters.next_frame, count, cause)
+        self._counters.lost += count
+        self._counters.next_frame += count
+        self._publish()
+        return gap
+
+    def _settle(self, frames: Frames) -> bool:
+        self._held = None
+        intact = self._holds(frames._slot)
+        if intact:
+            self._counters.received += frames.count
+            self._counters.next_frame += frames.count
+        self._counters.next_slot = frames._slot + 1
+        self._publish()
+        return intact
+
+    def _holds(self, slot: int) -> bool:
+        """Whether the ring still has this slot; to be asked after reading it."""
+        return bool(self._control.reserved() <= slot + self.geometry.slots)
+
+    def _position_to_take(self, writer: WriterCounters) -> int:
+        """The next position in the log, or a later one if the policy has the reader skip."""
+        position: int = self._counters.next_entry
+        if position >= writer.entries:
+            return position
+        if self._policy is Policy.LATEST:
+            return int(writer.entries) - 1
+        if writer.slots - self._slot_of(position, writer) <= self._lease_slots:
+            return position
+        # Half a lease behind the newest: far enough from the edge not to be overrun by the next block.
+        oldest = max(position, writer.entries - self.geometry.log_places // 2)
+        target_slot = writer.slots - max(1, self._lease_slots // 2)
+        candidates = range(oldest, writer.entries)
+        index = bisect_left(candidates, target_slot, key=lambda p: self._slot_of(p, writer))
+        return candidates[min(index, len(candidates) - 1)]
+
+    def _slot_of(self, position: int, writer: WriterCounters) -> int:
+        """Number of the slot at or after this entry; if it is overwritten, a number older than any lease."""
+        if position >= writer.entries:
+            return int(writer.slots)
+        entry = self._control.read_entry(position)
+        return -1 - self.geometry.slots if entry is None else int(entry.slot)
+
+    def _claim_place(self, consumer: str) -> ReaderPlace:
+        for index in range(READER_PLACES):
+            place = self._control.place(index)
+            owner = place.owner()
+            if (owner and is_alive(owner)) or not place.claim(owner, self._owner):
+                continue
+            place.publish(self._counters)
+            name = consumer.encode()[:NAME_BYTES]
+            place.describe(encode(self._policy), self._lease_slots, name.decode(errors="ignore"))
+            self._control.progress.ring()
+            return place
+        raise RingError(f"ring {self._segment.name} has {READER_PLACES} readers, no more fit: end one of them")
+
+    def _publish(self) -> None:
+        self._place.publish(self._counters)
+        self._control.progress.ring()
+
+
+def _lease(policy: Policy, slots: int) -> int:
+    """Slots a reader may lag; the rest of the ring is the time for which a view stays whole once handed out."""
+    return slots - slots // 8 if policy is Policy.PRIORITY else slots // 2

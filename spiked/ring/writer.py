@@ -1,0 +1,178 @@
+"""The writing end of a ring: one process, usually the acquisition."""
+
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.native._ring import Entry, WriterCounters
+from spiked.ring.items import Cause, Condition, DeviceState, EndReason, Policy, RingError, encode
+from spiked.ring.process import is_alive
+from spiked.ring.segment import MIN_SLOTS, Geometry, Segment, create_segment
+from spiked.ring.status import ReaderPlace, RingStatus, read_places, read_status
+from spiked.sensor import Sensor
+
+DEFAULT_BYTES = 128 << 20
+"""A ring's pixels unless the number of slots is given: half a second of a 400x250 camera at 20 kHz."""
+_LOOK_AGAIN_S = 0.1
+
+
+class RingWriter:
+    """Fills slots and publishes them, never waiting for a reader. Used by one thread.
+
+    `acquire` gives a slot to write into and `commit` publishes it; several slots may be acquired ahead (an eighth of
+    the ring), as asynchronous transfers need, and are committed in the order of acquisition.
+    """
+
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+        self._control = segment.control
+        self._counters = WriterCounters()
+        self._reserved = 0
+        self.publish_condition(Condition(DeviceState.ABSENT))
+
+    @classmethod
+    def create(
+        cls, sensor: Sensor, *, slots: int | None = None, block_frames: int = 8, ring_id: str | None = None
+    ) -> Self:
+        """A new ring `spiked-<ring_id>` for compact frames of that sensor; without `slots`, of about DEFAULT_BYTES.
+
+        Raises RingError if the name is taken, the sizes are not possible, or there is too little shared memory.
+        """
+        if block_frames < 1 or (slots is not None and slots < MIN_SLOTS):
+            raise RingError(
+                f"a ring of {slots} slots of {block_frames} frames is not possible: "
+                f"at least {MIN_SLOTS} slots of at least 1 frame"
+            )
+        compact = sensor.compact()
+        count = max(MIN_SLOTS, DEFAULT_BYTES // (block_frames * compact.frame_bytes)) if slots is None else slots
+        return cls(create_segment(Geometry(compact, count, block_frames), ring_id))
+
+    @property
+    def name(self) -> str:
+        """Name by which readers attach."""
+        return self._segment.name
+
+    @property
+    def geometry(self) -> Geometry:
+        """Sensor, number of slots, and frames a slot."""
+        return self._segment.geometry
+
+    @property
+    def next_frame(self) -> int:
+        """Absolute index of the next frame: committed and lost frames so far."""
+        return int(self._counters.next_frame)
+
+    def acquire(self) -> NDArray[np.uint8]:
+        """The next slot, uint8 [block_frames, frame_bytes], to be filled and committed.
+
+        What it held before is lost to readers from now on. Raises RingError if too many slots are acquired.
+        """
+        ahead = self._reserved - self._counters.slots
+        if ahead >= max(1, self.geometry.slots // 8):
+            raise RingError(f"{ahead} slots of ring {self.name} are acquired and not committed: no more than an eighth")
+        number = self._reserved
+        self._reserved += 1
+        self._control.reserve(self._reserved)
+        return self._segment.slot(number, self.geometry.block_frames)
+
+    def commit(self, frames: int) -> None:
+        """Publish the first `frames` frames of the slot acquired longest ago as the next frames of the capture."""
+        self._check_open()
+        if self._counters.slots == self._reserved:
+            raise RingError(f"no slot of ring {self.name} is acquired")
+        if not 1 <= frames <= self.geometry.block_frames:
+            raise RingError(f"a slot of {self.geometry.block_frames} frames cannot be committed with {frames}")
+        self._append(Entry(self.next_frame, frames, 0, self._counters.slots))
+        self._counters.slots += 1
+        self._counters.committed += frames
+        self._advance(frames)
+
+    def gap(self, count: int, cause: Cause) -> None:
+        """Publish that the next `count` frames of the capture are lost."""
+        self._check_open()
+        if count <= 0:
+            raise RingError(f"a gap of {count} frames is not possible")
+        self._append(Entry(self.next_frame, count, encode(cause), self._counters.slots))
+        self._counters.add_lost(encode(cause) - 1, count)
+        self._advance(count)
+
+    def publish_condition(self, condition: Condition) -> None:
+        """Let every process see where the device stands."""
+        self._control.publish_condition(encode(condition.state), condition.reason)
+
+    def has_room(self) -> bool:
+        """Whether another slot can be acquired without any lossless or priority reader losing frames."""
+        return not any(self._holds_back(reader) and is_alive(reader.owner) for reader in read_places(self._segment))
+
+    def wait_for_room(self, timeout_s: float) -> bool:
+        """Wait for `has_room`; for sources that can wait, as a recording can, and a camera cannot."""
+        return self._wait(self.has_room, timeout_s)
+
+    def wait_for_readers(self, count: int, timeout_s: float) -> bool:
+        """Wait until so many readers are attached, so that they see the capture from its first frame."""
+        return self._wait(
+            lambda: sum(is_alive(reader.owner) for reader in read_places(self._segment)) >= count, timeout_s
+        )
+
+    def status(self) -> RingStatus:
+        """Counters of the writer and of every reader."""
+        return read_status(self._segment)
+
+    def end(self, reason: EndReason) -> None:
+        """Publish the end of the capture; readers get it after the last frames. Ending twice keeps the first reason."""
+        if not self._counters.end:
+            self._counters.end = encode(reason)
+            self._publish()
+
+    def close(self, reason: EndReason = EndReason.STOPPED) -> None:
+        """End the capture if it has not ended, and remove the ring's name; attached readers read on to the end."""
+        self.end(reason)
+        self._segment.unlink()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close(EndReason.STOPPED if kind is None else EndReason.FAILED)
+
+    def _holds_back(self, reader: ReaderPlace) -> bool:
+        counters = reader.counters
+        return reader.policy is not Policy.LATEST and (
+            self._reserved - counters.next_slot >= reader.lease_slots
+            or self._counters.entries - counters.next_entry >= self.geometry.log_places // 2
+        )
+
+    def _append(self, entry: Entry) -> None:
+        self._control.write_entry(self._counters.entries, entry)
+        self._counters.entries += 1
+
+    def _advance(self, frames: int) -> None:
+        self._counters.next_frame += frames
+        self._publish()
+
+    def _publish(self) -> None:
+        """Show readers all counters at once, so that a kill before or after leaves a consistent ring, and wake them."""
+        self._control.publish(self._counters)
+        self._control.committed.ring()
+
+    def _check_open(self) -> None:
+        if self._counters.end:
+            raise RingError(f"the capture of ring {self.name} has ended")
+
+    def _wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        """Sleep on the readers' bell, looking again now and then because a killed reader does not ring it."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            seen = self._control.progress.value()
+            if condition():
+                return True
+            remaining_s = deadline - time.monotonic()
+            if remaining_s <= 0:
+                return False
+            self._control.progress.wait(seen, min(remaining_s, _LOOK_AGAIN_S))

@@ -1,0 +1,180 @@
+// Python bindings of the block kernels: checks shapes, lines up frame pointers and picks the instruction set.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <cstring>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "kernels.hpp"
+
+namespace nb = nanobind;
+
+namespace spiked {
+namespace {
+
+using Frames = nb::ndarray<const uint8_t, nb::ndim<2>, nb::device::cpu>;
+template <class T>
+using Images = nb::ndarray<T, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+template <class T>
+using Image = nb::ndarray<T, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+
+std::vector<const Kernels*> supported_kernels() {
+    std::vector<const Kernels*> kernels;
+#if defined(__x86_64__)
+    __builtin_cpu_init();
+    if (avx512_kernels() && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl") &&
+        __builtin_cpu_supports("avx512bitalg") && __builtin_cpu_supports("gfni")) {
+        kernels.push_back(avx512_kernels());
+    }
+    if (avx2_kernels() && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("bmi2")) {
+        kernels.push_back(avx2_kernels());
+    }
+#endif
+    kernels.push_back(baseline_kernels());
+    return kernels;
+}
+
+const Kernels& kernels_named(const std::string& name) {
+    static const std::vector<const Kernels*> supported = supported_kernels();
+    if (name.empty()) return *supported.front();
+    for (const Kernels* kernels : supported) {
+        if (name == kernels->name) return *kernels;
+    }
+    throw std::invalid_argument("this machine has no kernels for the instruction set " + name);
+}
+
+std::vector<std::string> instruction_sets() {
+    std::vector<std::string> names;
+    for (const Kernels* kernels : supported_kernels()) names.emplace_back(kernels->name);
+    return names;
+}
+
+struct Layout {
+    size_t width, height, row_stride;
+    bool flipped, msb;
+};
+
+Geometry geometry_of(const Layout& layout, const Frames& frames) {
+    if (layout.width == 0 || layout.width % 8 || layout.row_stride < layout.width / 8) {
+        throw std::invalid_argument("a row is whole bytes and fits its stride");
+    }
+    if (frames.shape(1) != layout.row_stride * layout.height || frames.stride(1) != 1) {
+        throw std::invalid_argument("frames must be uint8 [n, " + std::to_string(layout.row_stride * layout.height) +
+                                    "] with contiguous bytes for this sensor, not [" + std::to_string(frames.shape(0)) +
+                                    ", " + std::to_string(frames.shape(1)) + "]");
+    }
+    const size_t padded = (layout.width / 8 + kMaxLoad - 1) / kMaxLoad * kMaxLoad;
+    const size_t bytes = layout.row_stride * layout.height;
+    const size_t tail = bytes < padded ? 0 : std::min((bytes - padded) / layout.row_stride + 1, layout.height);
+    return {layout.width, layout.height, layout.row_stride, padded, tail, layout.flipped, layout.msb};
+}
+
+// Pointers to frames in any order, padded with empty frames, and padded copies of each frame's last rows.
+class FrameList {
+  public:
+    FrameList(const Geometry& geometry, const Frames& frames) : geometry_(geometry), frames_(frames) {
+        tail_bytes_ = (geometry.height - geometry.tail_row) * geometry.row_stride;
+        empty_.resize(geometry.row_stride * geometry.height + geometry.padded_row);
+    }
+
+    // `count` frames from `first` on in steps of +1 or -1. The run is valid until the list dies.
+    Run run(int64_t first, int64_t step, int64_t count) {
+        const int64_t blocks = (count + 7) / 8;
+        pointers_.emplace_back(blocks * 16, empty_.data());
+        std::vector<const uint8_t*>& pointers = pointers_.back();
+        tails_.emplace_back(count * (tail_bytes_ + geometry_.padded_row));
+        uint8_t* tail = tails_.back().data();
+        for (int64_t i = 0; i < count; ++i) {
+            const uint8_t* frame = frames_.data() + (first + step * i) * frames_.stride(0);
+            std::memcpy(tail, frame + geometry_.tail_row * geometry_.row_stride, tail_bytes_);
+            pointers[i] = frame;
+            pointers[blocks * 8 + i] = tail;
+            tail += tail_bytes_ + geometry_.padded_row;
+        }
+        return {pointers.data(), pointers.data() + blocks * 8, static_cast<int>(blocks)};
+    }
+
+  private:
+    const Geometry& geometry_;
+    const Frames& frames_;
+    size_t tail_bytes_;
+    std::vector<uint8_t> empty_;
+    std::vector<std::vector<const uint8_t*>> pointers_;
+    std::vector<std::vector<uint8_t>> tails_;
+};
+
+template <class Array>
+void check_image(const Array& array, const Geometry& g, size_t axis) {
+    if (array.shape(axis) != g.height || array.shape(axis + 1) != g.width) {
+        throw std::invalid_argument("an output array does not have the sensor's height and width");
+    }
+}
+
+void reduce_frames(const Frames& frames, const Layout& layout, const Images<uint8_t>& count,
+                   const Images<uint8_t>& first, const Images<uint8_t>& last, const std::string& instruction_set) {
+    const Geometry g = geometry_of(layout, frames);
+    const Kernels& kernels = kernels_named(instruction_set);
+    const int64_t n = frames.shape(0), blocks = (n + 7) / 8;
+    for (const auto* out : {&count, &first, &last}) {
+        check_image(*out, g, 1);
+        if (static_cast<int64_t>(out->shape(0)) < blocks) {
+            throw std::invalid_argument("the output arrays hold fewer blocks than the frames fill");
+        }
+    }
+    nb::gil_scoped_release release;
+    FrameList list(g, frames);
+    const Run all = list.run(0, 1, n);
+    const size_t pixels = g.width * g.height;
+    for (int64_t b = 0; b < blocks; ++b) {
+        const Run block = {all.frames + 8 * b, all.tails + 8 * b, 1};
+        kernels.reduce({g, block, count.data() + b * pixels, first.data() + b * pixels, last.data() + b * pixels});
+    }
+}
+
+void aligned_window(const Frames& frames, const Layout& layout, int64_t begin, int64_t end,
+                    const Image<uint16_t>& spikes, const Image<uint16_t>& start, const Image<uint16_t>& stop,
+                    const Image<uint16_t>& count, const std::string& instruction_set) {
+    const Geometry g = geometry_of(layout, frames);
+    const Kernels& kernels = kernels_named(instruction_set);
+    const int64_t n = frames.shape(0);
+    if (begin < 0 || begin >= end || end > n) {
+        throw std::invalid_argument("the window [begin, end) must be non-empty and inside the frames given");
+    }
+    if (n >= kNever16) throw std::invalid_argument("at most 65534 frames at a time");
+    for (const auto* out : {&spikes, &start, &stop, &count}) check_image(*out, g, 0);
+    nb::gil_scoped_release release;
+    FrameList list(g, frames);
+    std::vector<uint16_t> scratch(kWindowRows * g.padded_row * 8);
+    WindowJob job = {g,
+                     list.run(begin - 1, -1, begin),
+                     list.run(begin, 1, end - begin),
+                     list.run(end, 1, n - end),
+                     static_cast<uint16_t>(begin),
+                     static_cast<uint16_t>(end),
+                     scratch.data(),
+                     spikes.data(),
+                     start.data(),
+                     stop.data(),
+                     count.data()};
+    kernels.window(job);
+}
+
+}  // namespace
+}  // namespace spiked
+
+NB_MODULE(_blocks, m) {
+    using namespace spiked;
+    nb::class_<Layout>(m, "Layout")
+        .def(nb::init<size_t, size_t, size_t, bool, bool>(), nb::arg("width"), nb::arg("height"), nb::arg("row_stride"),
+             nb::arg("flipped"), nb::arg("msb"));
+    m.def("instruction_sets", &instruction_sets, "Instruction sets this machine can run, best first.");
+    m.def("reduce_frames", &reduce_frames, nb::arg("frames"), nb::arg("layout"), nb::arg("count"), nb::arg("first"),
+          nb::arg("last"), nb::arg("instruction_set") = "");
+    m.def("aligned_window", &aligned_window, nb::arg("frames"), nb::arg("layout"), nb::arg("begin"), nb::arg("end"),
+          nb::arg("spikes"), nb::arg("start"), nb::arg("stop"), nb::arg("count"), nb::arg("instruction_set") = "");
+}

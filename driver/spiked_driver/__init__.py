@@ -1,1 +1,7 @@
 """Camera sources: replayed recordings, the simulated camera, and USB hardware, all behind one `Source` protocol."""
+
+from spiked_driver.acquisition import StopEvent, acquire
+from spiked_driver.faults import Faults, FaultySource, Loss, Stall
+from spiked_driver.source import Chunk, Pacer, Source
+
+__all__ = ["Chunk", "Faults", "FaultySource", "Loss", "Pacer", "Source", "Stall", "StopEvent", "acquire"]

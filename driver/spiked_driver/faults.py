@@ -1,0 +1,203 @@
+"""Faults on purpose, for any source: losses, stalls and unplugging at exactly repeatable frames."""
+
+import time
+from collections import deque
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.errors import ConfigurationError
+from spiked.ring import Cause, Condition, DeviceState, End, Gap
+from spiked.sensor import Sensor
+from spiked_driver.source import READ_WAIT_S, Chunk, Source
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Frames that the source delivers and the fault takes away."""
+
+    first: int
+    count: int
+    cause: Cause = Cause.USB
+    unplugged: bool = False
+    """The device is seen as lost meanwhile."""
+
+
+@dataclass(frozen=True)
+class Stall:
+    """Nothing comes for a while before this frame; the frames come late, and are not lost."""
+
+    frame: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What shall go wrong with a source."""
+
+    losses: tuple[Loss, ...] = ()
+    stalls: tuple[Stall, ...] = ()
+    drop: float = 0.0
+    """Fraction of the frames lost at random (cause usb)."""
+    drop_run: int = 1
+    """Frames lost each time."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.drop < 1 or self.drop_run < 1:
+            raise ConfigurationError(
+                f"dropping a fraction of {self.drop:g}, {self.drop_run} frames each, is not possible"
+            )
+        if any(loss.first < 0 or loss.count < 1 for loss in self.losses):
+            raise ConfigurationError("a loss begins at frame 0 or later and takes at least one frame")
+        if any(stall.frame < 0 or stall.seconds < 0 for stall in self.stalls):
+            raise ConfigurationError("a stall is at frame 0 or later and takes no negative time")
+        for earlier, later in pairwise(sorted(self.losses, key=lambda loss: loss.first)):
+            if earlier.first + earlier.count > later.first:
+                raise ConfigurationError(f"losses overlap at frame {later.first}: give each frame to one of them")
+
+
+class FaultySource:
+    """A source with faults. Frames are lost after the inner source delivered them, so its timing and content stay."""
+
+    def __init__(self, inner: Source, faults: Faults) -> None:
+        self.inner = inner
+        self._faults = faults
+        self._losses: deque[Loss] = deque()
+        self._stalls: deque[Stall] = deque()
+        self._told: deque[Gap | End] = deque()
+        self._loss: Loss | None = None  # the one going on
+        self._stalled_since_s: float | None = None
+        self._restart()
+
+    @property
+    def sensor(self) -> Sensor:
+        """The inner source's."""
+        return self.inner.sensor
+
+    @property
+    def frames(self) -> int | None:
+        """The inner source's: a lost frame counts."""
+        return self.inner.frames
+
+    @property
+    def waits(self) -> bool:
+        """The inner source's."""
+        return self.inner.waits
+
+    @property
+    def condition(self) -> Condition:
+        """The inner source's, but lost while unplugged."""
+        if self._loss is not None and self._loss.unplugged:
+            return Condition(DeviceState.LOST, "unplugged on purpose")
+        return self.inner.condition
+
+    def open(self) -> None:
+        """Open the inner source and start the faults anew."""
+        self._restart()
+        self.inner.open()
+
+    def close(self) -> None:
+        """Close the inner source."""
+        self._loss = None
+        self.inner.close()
+
+    def read_into(self, view: NDArray[np.uint8]) -> Chunk | Gap | End | None:
+        """See `Source.read_into`."""
+        if self._told:
+            return self._told.popleft()
+        if self._stalls and self._stalls[0].frame <= self._next:
+            self._stall(self._stalls[0])
+            return None
+        if self._loss is None:
+            self._loss = self._loss_at(self._next)
+        if self._loss is not None:
+            return self._lose(self._loss, view)
+        item = self.inner.read_into(view[: self._undisturbed(len(view))])
+        self._advance(item)
+        return item
+
+    def _restart(self) -> None:
+        self._next = 0
+        self._lost_first = 0
+        self._losses = deque(sorted(self._faults.losses, key=lambda loss: loss.first))
+        self._stalls = deque(sorted(self._faults.stalls, key=lambda stall: stall.frame))
+        self._random = np.random.default_rng(self._faults.seed)
+        self._next_drop = self._draw_drop()
+        self._loss = None
+        self._told.clear()
+        self._stalled_since_s = None
+
+    def _draw_drop(self) -> int | None:
+        """Where the next random loss begins: after a geometric number of frames whose mean gives the fraction."""
+        if not self._faults.drop:
+            return None
+        chance = self._faults.drop / (self._faults.drop_run * (1 - self._faults.drop) + self._faults.drop)
+        return self._next + int(self._random.geometric(chance)) - 1
+
+    def _loss_at(self, frame: int) -> Loss | None:
+        while self._losses and self._losses[0].first + self._losses[0].count <= frame:
+            self._losses.popleft()
+        if self._losses and self._losses[0].first <= frame:
+            loss = self._losses.popleft()
+        elif self._next_drop is not None and self._next_drop <= frame:
+            loss = Loss(frame, self._faults.drop_run)
+        else:
+            return None
+        self._lost_first = frame
+        return loss
+
+    def _undisturbed(self, wanted: int) -> int:
+        """How many frames may be read before the next fault begins."""
+        starts = [self._losses[0].first] if self._losses else []
+        starts += [self._stalls[0].frame] if self._stalls else []
+        starts += [self._next_drop] if self._next_drop is not None else []
+        return min([wanted, *(start - self._next for start in starts)])
+
+    def _lose(self, loss: Loss, view: NDArray[np.uint8]) -> Gap | End | None:
+        """Take away what the inner source delivers, and tell of it once, when all of it has come.
+
+        One read a call, so that the state of an unplugged device can be seen while it lasts.
+        """
+        item = self.inner.read_into(view[: loss.first + loss.count - self._next])
+        if isinstance(item, Chunk):
+            self._advance(item)
+            return self._end_loss(loss) if self._next == loss.first + loss.count else None
+        return None if item is None else self._interrupted(loss, item)
+
+    def _interrupted(self, loss: Loss, item: Gap | End) -> Gap | End:
+        """The inner source itself tells of a gap or the end: that comes behind what was lost until then."""
+        self._losses.appendleft(loss)  # it goes on after the gap
+        if self._next == self._lost_first:
+            self._loss = None
+            self._advance(item)
+            return item
+        lost = self._end_loss(loss)
+        self._advance(item)
+        self._told.append(item)
+        return lost
+
+    def _end_loss(self, loss: Loss) -> Gap:
+        gap = Gap(self._lost_first, self._next - self._lost_first, loss.cause)
+        self._loss = None
+        if self._next_drop is not None and self._next_drop < self._next:
+            self._next_drop = self._draw_drop()
+        return gap
+
+    def _advance(self, item: Chunk | Gap | End | None) -> None:
+        if isinstance(item, Chunk):
+            self._next += item.frames
+        elif isinstance(item, Gap):
+            self._next += item.count
+
+    def _stall(self, stall: Stall) -> None:
+        now_s = time.monotonic()
+        if self._stalled_since_s is None:
+            self._stalled_since_s = now_s
+        remaining_s = self._stalled_since_s + stall.seconds - now_s
+        time.sleep(max(0.0, min(remaining_s, READ_WAIT_S)))
+        if remaining_s <= READ_WAIT_S:
+            self._stalls.popleft()
+            self._stalled_since_s = None

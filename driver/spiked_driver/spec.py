@@ -1,0 +1,136 @@
+"""Sources by a line of text: `replay:FILE?pace=1&repeat=2&range=0:8000` and `sim:?seed=1&seconds=2`, with faults."""
+
+from typing import Annotated, Any, TypeVar
+from urllib.parse import parse_qs
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
+from spiked.recording import open_recording
+
+from spiked.errors import SourceError
+from spiked.ring import Cause
+from spiked.sensor import Sensor
+from spiked_driver.faults import Faults, FaultySource, Loss, Stall
+from spiked_driver.replay import ReplaySource
+from spiked_driver.simulated import SimulatedSource
+from spiked_driver.source import Source
+
+Pace = Annotated[float, Field(ge=0), BeforeValidator(lambda value: 0.0 if value == "max" else value)]
+
+
+class _Options(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class SourceOptions(_Options):
+    """Options of every source: its pace, and what shall go wrong."""
+
+    pace: Pace = 1.0
+    """Factor of the sensor's frame rate; 0 or `max`: as fast as lossless consumers take frames."""
+    drop: float = Field(0.0, ge=0, lt=1)
+    """Fraction of the frames lost at random."""
+    drop_run: int = Field(1, ge=1)
+    """Frames lost each time."""
+    fault_seed: int = 0
+    gap: tuple[tuple[int, int, Cause], ...] = ()
+    """`first:count` or `first:count:cause`, any number of times: frames to lose."""
+    unplug: tuple[tuple[int, int], ...] = ()
+    """`first:count`: the device is gone for so many frames."""
+    stall: tuple[tuple[int, float], ...] = ()
+    """`frame:seconds`: nothing comes for a while."""
+
+    @field_validator("gap", mode="before")
+    @classmethod
+    def _with_cause(cls, values: Any) -> Any:
+        return [[*text.split(":"), Cause.USB][:3] for text in _many(values)]
+
+    @field_validator("unplug", "stall", mode="before")
+    @classmethod
+    def _pairs(cls, values: Any) -> Any:
+        return [text.split(":") for text in _many(values)]
+
+    def faults(self) -> Faults:
+        """The faults among the options."""
+        losses = tuple(Loss(*gap) for gap in self.gap)
+        unplugged = tuple(Loss(first, count, Cause.DEVICE, unplugged=True) for first, count in self.unplug)
+        stalls = tuple(Stall(*stall) for stall in self.stall)
+        return Faults(losses + unplugged, stalls, self.drop, self.drop_run, self.fault_seed)
+
+
+class ReplayOptions(SourceOptions):
+    """Options of `replay:FILE`."""
+
+    repeat: int = Field(1, ge=1)
+    range: tuple[int | None, int | None] = (None, None)
+    """`first:stop` frames, either may be left out."""
+
+    @field_validator("range", mode="before")
+    @classmethod
+    def _bounds(cls, value: Any) -> Any:
+        return [part or None for part in value.split(":")] if isinstance(value, str) else value
+
+
+class SimulationOptions(SourceOptions):
+    """Options of `sim:`."""
+
+    seed: int = 0
+    seconds: float | None = Field(None, gt=0)
+    """None: no end."""
+    width: int = Field(320, gt=0)
+    height: int = Field(180, gt=0)
+    rate: float = Field(20_000.0, gt=0)
+    """Frames a second."""
+
+
+_Kind = TypeVar("_Kind", bound=SourceOptions)
+
+
+def open_source(spec: str) -> Source:
+    """The source that a line of text names; `open` it to start. Raises SourceError or RecordingError in one line."""
+    kind, separator, rest = spec.partition(":")
+    if not separator:
+        raise SourceError(f"source {spec!r} names no kind: write replay:FILE or sim:")
+    target, _, query = rest.partition("?")
+    source: Source
+    match kind:
+        case "replay":
+            replay = _parse(ReplayOptions, query, spec)
+            source, faults = _replay(target, replay), replay.faults()
+        case "sim":
+            if target:
+                raise SourceError(f"source {spec!r}: sim: takes options only, as in sim:?seed=1")
+            simulation = _parse(SimulationOptions, query, spec)
+            source, faults = _simulated(simulation), simulation.faults()
+        case _:
+            raise SourceError(f"source {spec!r}: there is no kind {kind!r}, only replay:FILE and sim:")
+    return source if faults == Faults(seed=faults.seed) else FaultySource(source, faults)
+
+
+def _replay(path: str, options: ReplayOptions) -> Source:
+    first, stop = options.range
+    return ReplaySource(open_recording(path), pace=options.pace, repeat=options.repeat, first=first or 0, stop=stop)
+
+
+def _simulated(options: SimulationOptions) -> Source:
+    sensor = Sensor(options.width, options.height, options.rate)
+    frames = None if options.seconds is None else round(options.seconds * options.rate)
+    return SimulatedSource(sensor, seed=options.seed, frames=frames, pace=options.pace)
+
+
+def _many(values: Any) -> list[str]:
+    return [values] if isinstance(values, str) else list(values)
+
+
+def _parse(kind: type[_Kind], query: str, spec: str) -> _Kind:
+    values = {
+        name: texts if len(texts) > 1 else texts[0] for name, texts in parse_qs(query, keep_blank_values=True).items()
+    }
+    try:
+        return kind.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = first["loc"][0]
+        if first["type"] == "extra_forbidden":
+            raise SourceError(
+                f"source {spec!r} has no option {where}: there are {', '.join(kind.model_fields)}"
+            ) from error
+        raise SourceError(f"source {spec!r}: option {where}={values[str(where)]}: {first['msg']}") from error

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from spiked.pose import Array, exp_so3, hat
 from spiked.sensor import Intrinsics
+from spiked.spline import Spline
 
 Index = NDArray[np.int64]
 
@@ -73,6 +74,35 @@ class Bundle:
                 break
         return current
 
+    def optimise_spline(
+        self, spline: Spline, times: Array, iterations: int, scale_px: float = 0.5, tolerance: float = 1e-4
+    ) -> tuple[Spline, float]:
+        """As `optimise`, with the poses tied to a spline at `times` [C] (frames): returns the new spline and the cost."""
+        self.rotations, self.centres = spline.poses(times)
+        blend = spline.basis_matrix(times)
+        everything = np.ones(len(self.centres), bool)
+        damping, current = 1e-4, self.cost(scale_px)
+        for _ in range(iterations):
+            system = self._linearise(scale_px, everything)
+            while damping < 1e6:
+                step, points = system.solve(damping, blend)
+                moved = spline.move(step[:, :3], step[:, 3:])
+                trial = Bundle(
+                    *moved.poses(times), self.points + points, self.camera, self.point, self.pixels, self.intrinsics
+                )
+                cost = trial.cost(scale_px)
+                if cost < current:
+                    break
+                damping *= 8
+            else:
+                return spline, current
+            spline, self.rotations, self.centres, self.points = moved, trial.rotations, trial.centres, trial.points
+            damping = max(damping / 5, 1e-9)
+            gain, current = (current - cost) / current, cost
+            if gain < tolerance:
+                break
+        return spline, current
+
     def _stepped(self, poses: Array, points: Array, free: NDArray[np.bool_]) -> "Bundle":
         rotations, centres = self.rotations.copy(), self.centres.copy()
         rotations[free] = exp_so3(poses[:, :3]) @ rotations[free]
@@ -134,8 +164,11 @@ class _System:
         self.cross = np.zeros((cameras, 6, points, 3))
         np.add.at(self.cross, (c, slice(None), p), np.einsum("mki,mkj->mij", a, b))
 
-    def solve(self, damping: float) -> tuple[Array, Array]:
-        """Steps of the free poses [c, 6] and of the points [P, 3]."""
+    def solve(self, damping: float, blend: Array | None = None) -> tuple[Array, Array]:
+        """Steps of the free poses [c, 6] and of the points [P, 3].
+
+        With `blend` [c, knots] the poses move only as that blend of knots, and the knots' steps [knots, 6] are returned.
+        """
         cameras, _, points, _ = self.cross.shape
         eye = np.eye(3)
         v = self.points_hessian * (1 + damping * eye) + 1e-9 * eye
@@ -147,9 +180,19 @@ class _System:
         index = np.arange(cameras)
         blocks[index, :, index, :] += self.pose_hessian * (1 + damping * np.eye(6)) + 1e-9 * np.eye(6)
         right = -self.pose_gradient.ravel() + scaled @ self.points_gradient.ravel()
-        poses = np.linalg.solve(reduced, right)
-        back = -self.points_gradient - (cross.T @ poses).reshape(points, 3)
-        return poses.reshape(cameras, 6), np.einsum("Pij,Pj->Pi", v_inverse, back)
+        if blend is None:
+            steps = np.linalg.solve(reduced, right).reshape(cameras, 6)
+            poses = steps
+        else:
+            knots = blend.shape[1]
+            by_knot = np.tensordot(np.tensordot(blend, blocks, (0, 0)), blend, (2, 0))  # [k, 6, 6, k]
+            square = by_knot.transpose(0, 1, 3, 2).reshape(knots * 6, knots * 6)
+            square[np.diag_indices(knots * 6)] *= 1 + damping
+            square[np.diag_indices(knots * 6)] += 1e-9
+            steps = np.linalg.solve(square, (blend.T @ right.reshape(cameras, 6)).ravel()).reshape(knots, 6)
+            poses = blend @ steps
+        back = -self.points_gradient - (cross.T @ poses.ravel()).reshape(points, 3)
+        return steps, np.einsum("Pij,Pj->Pi", v_inverse, back)
 
 
 def _sum_by(index: Index, values: Array, length: int) -> Array:

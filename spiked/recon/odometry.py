@@ -1,0 +1,373 @@
+"""The camera's path from sparse tracks: bootstrap, pose of every view, triangulation, and adjustment on a spline.
+
+It needs no map of Gaussians, so a trajectory exists within a second or two; mapping then refines the same spline.
+"""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.pose import Array, exp_so3, hat, log_so3
+from spiked.recon.bootstrap import INLIER_PX, SCALE_PX, Views, bootstrap
+from spiked.recon.bundle import Bundle
+from spiked.recon.tracks import Picture, Tracks
+from spiked.sensor import Intrinsics
+from spiked.spline import Spline
+
+
+class State(StrEnum):
+    """What the tracker knows."""
+
+    BOOT = "boot"
+    TRACK = "track"
+    DEGRADED = "degraded"
+    LOST = "lost"
+    RELOC = "reloc"
+
+
+@dataclass
+class Posed:
+    """One view as the tracker sees it; rotation and centre are None until they are known."""
+
+    time: float
+    ids: NDArray[np.int64]
+    pixels: Array
+    motion_px: float
+    state: State
+    rotation: Array | None = None
+    centre: Array | None = None
+    inliers: float = 0.0
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The outcome of aligning one view with known points."""
+
+    rotation: Array
+    centre: Array
+    inliers: float
+    points: int
+
+
+BOOT_VIEWS = 10
+MIN_POINTS = 15
+GLOBAL_VIEWS = 100
+"""At most so many views enter the adjustment of the whole path."""
+KNOT_ERROR_PX = 0.12
+"""A spline that departs from the free poses by less than this is fine enough."""
+
+
+@dataclass
+class Odometry:
+    """Feed views in order with `add`; `spline` is the path so far (None before the bootstrap), in frames."""
+
+    intrinsics: Intrinsics
+    hop: int
+    seed: int = 0
+    state: State = State.BOOT
+    reason: str = "waiting for the first frames"
+    views: list[Posed] = field(default_factory=list)
+    points: Array = field(default_factory=lambda: np.full((0, 3), np.nan))
+    """Position of every track by id, NaN where unknown."""
+    spline: Spline | None = None
+    changes: list[tuple[float, State, str]] = field(default_factory=list)
+    """(time in frames, state, reason) of each change of state."""
+
+    def __post_init__(self) -> None:
+        self._tracks = Tracks()
+        self._boot_start = 0
+        self._boot_parallax = 3.0
+        self._next_global = 0
+
+    def add(self, time: float, picture: Picture) -> Posed:
+        """Track one view and pose it if possible."""
+        motion = self._tracks.add(len(self.views), picture)
+        posed = Posed(time, self._tracks.ids.copy(), self._tracks.at.copy(), motion, self.state)
+        self.views.append(posed)
+        missing = self._tracks.next_id - len(self.points)
+        self.points = np.concatenate([self.points, np.full((missing, 3), np.nan)])
+        if self.state is State.BOOT:
+            self._try_bootstrap()
+        else:
+            self._pose_newest()
+        posed.state = self.state
+        return posed
+
+    def _become(self, state: State, reason: str) -> None:
+        if state is not self.state or reason != self.reason:
+            self.changes.append((self.views[-1].time, state, reason))
+        self.state, self.reason = state, reason
+
+    def _try_bootstrap(self) -> None:
+        newest = self.views[-1]
+        start = self.views[self._boot_start]
+        common = np.intersect1d(start.ids, newest.ids)
+        while len(common) < 60 and self._boot_start < len(self.views) - BOOT_VIEWS:
+            self._boot_start += 1
+            start = self.views[self._boot_start]
+            common = np.intersect1d(start.ids, newest.ids)
+        count = len(self.views) - self._boot_start
+        if count < BOOT_VIEWS or count % 3:
+            return
+        chosen = self._equal_flow()
+        for k in chosen[1:-1]:
+            common = np.intersect1d(common, self.views[k].ids)
+        pixels = np.stack([_pick(self.views[k], common) for k in chosen])
+        verdict = bootstrap(Views(pixels, common, self.intrinsics), self.seed, self._boot_parallax)
+        if verdict.winner is None:
+            if verdict.tried:
+                self._boot_parallax = 1.3 * max(self._boot_parallax, verdict.tried[0].parallax_px)
+            self._become(State.BOOT, verdict.reason)
+            return
+        bundle = verdict.winner.bundle
+        error = np.linalg.norm(bundle.residuals().reshape(len(chosen), -1, 2), axis=2)
+        good = np.median(error, 0) < INLIER_PX
+        self.points[common[good]] = bundle.points[good]
+        for k, rotation, centre in zip(chosen, bundle.rotations, bundle.centres, strict=True):
+            self.views[k].rotation, self.views[k].centre = rotation, centre
+        self._pose_between(chosen)
+        self._become(State.TRACK, f"bootstrap from {count} views, {verdict.winner.inliers:.0%} of the tracks agree")
+        self._triangulate(range(self._boot_start, len(self.views)))
+        self.settle()
+
+    def _equal_flow(self) -> list[int]:
+        """BOOT_VIEWS views from the first to the newest with about equal motion between them."""
+        motion = np.array([v.motion_px for v in self.views[self._boot_start :]])
+        motion[0] = 0
+        path = np.cumsum(motion + 1e-3)
+        at = np.searchsorted(path, np.linspace(path[0], path[-1], BOOT_VIEWS)).clip(0, len(path) - 1)
+        return [self._boot_start + int(k) for k in np.unique(at)]
+
+    def _pose_between(self, chosen: list[int]) -> None:
+        for k in range(self._boot_start, len(self.views)):
+            view = self.views[k]
+            if view.rotation is None:
+                near = self.views[chosen[int(np.argmin(np.abs(np.array(chosen) - k)))]]
+                assert near.rotation is not None and near.centre is not None
+                self._accept(view, self._fit(view, near.rotation, near.centre))
+
+    def _accept(self, view: Posed, fit: Fit) -> None:
+        view.rotation, view.centre, view.inliers = fit.rotation, fit.centre, fit.inliers
+
+    def _pose_newest(self) -> None:
+        view = self.views[-1]
+        known = [v for v in self.views[-40:-1] if v.rotation is not None]
+        if not known:
+            known = [v for v in self.views if v.rotation is not None][-2:]
+        fit = self._fit(view, *predict(known[-2:], view.time))
+        if fit.points < MIN_POINTS or fit.inliers < 0.35:
+            self._become(State.LOST, f"{fit.points} known points in view, {fit.inliers:.0%} agree with one pose")
+            return
+        self._accept(view, fit)
+        if fit.inliers < 0.6 or fit.points < 2 * MIN_POINTS:
+            self._become(State.DEGRADED, f"{fit.points} known points in view, {fit.inliers:.0%} agree with one pose")
+        elif self.state is not State.TRACK:
+            self._become(State.TRACK, "enough points agree again")
+        count = len(self.views)
+        if count % 4 == 0:
+            self._triangulate(range(max(0, count - 48), count))
+        if count % 8 == 0:
+            self._adjust_recent()
+        if count >= self._next_global:
+            self.settle()
+
+    def _fit(self, view: Posed, rotation: Array, centre: Array) -> Fit:
+        """Robust Gauss-Newton of one pose on the known points."""
+        points = self.points[view.ids]
+        known = np.isfinite(points[:, 0])
+        points, pixels = points[known], view.pixels[known]
+        if len(points) < 6:
+            return Fit(rotation, centre, 0.0, len(points))
+        k = self.intrinsics
+        error = np.zeros((len(points), 2))
+        for scale in (4.0, 2.0, 1.0, *[SCALE_PX] * 5):
+            local = (points - centre) @ rotation
+            z = np.maximum(local[:, 2], 1e-6)
+            error = np.stack([k.fx * local[:, 0] / z + k.cx, k.fy * local[:, 1] / z + k.cy], 1) - pixels
+            error[local[:, 2] <= 1e-6] = 1e3
+            zero = np.zeros_like(z)
+            rows = np.stack(
+                [
+                    np.stack([k.fx / z, zero, -k.fx * local[:, 0] / z**2], 1),
+                    np.stack([zero, k.fy / z, -k.fy * local[:, 1] / z**2], 1),
+                ],
+                1,
+            )
+            by_point = rows @ rotation.T
+            jacobian = np.concatenate([by_point @ hat(points - centre), -by_point], 2)
+            weight = 1 / (1 + (error**2).sum(1) / scale**2)
+            weighted = jacobian * weight[:, None, None]
+            hessian = np.einsum("mki,mkj->ij", weighted, jacobian)
+            gradient = np.einsum("mki,mk->i", weighted, error)
+            step = -np.linalg.solve(hessian + 1e-9 * np.eye(6) * np.trace(hessian), gradient)
+            rotation, centre = exp_so3(step[:3]) @ rotation, centre + step[3:]
+        inliers = float(np.mean(np.linalg.norm(error, axis=1) < 1.5 * INLIER_PX))
+        return Fit(rotation, centre, inliers, len(points))
+
+    def _triangulate(self, span: range) -> None:
+        """Positions for tracks that have none, from the posed views of `span`."""
+        rotations, _, rays, ids, centres, pixels = self._gather(span, known=False)
+        if len(ids) == 0:
+            return
+        unique, row = np.unique(ids, return_inverse=True)
+        outer = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+        lhs, rhs = np.zeros((len(unique), 3, 3)), np.zeros((len(unique), 3))
+        np.add.at(lhs, row, outer)
+        np.add.at(rhs, row, np.einsum("mij,mj->mi", outer, centres))
+        seen = np.bincount(row)
+        # The smallest eigenvalue is the sum of squared sines of the angles between the rays and their mean direction.
+        spread = np.sqrt(np.maximum(np.linalg.eigvalsh(lhs)[:, 0], 0) / np.maximum(seen, 1)) * self.intrinsics.fx
+        wide = (seen >= 5) & (spread > 0.5)
+        position = np.linalg.solve(lhs + 1e-12 * np.eye(3), rhs[..., None])[..., 0]
+        local = np.einsum("mji,mj->mi", rotations, position[row] - centres)
+        k = self.intrinsics
+        z = np.where(local[:, 2] > 1e-3, local[:, 2], np.nan)
+        error = np.hypot(k.fx * local[:, 0] / z + k.cx - pixels[:, 0], k.fy * local[:, 1] / z + k.cy - pixels[:, 1])
+        worst = np.zeros(len(unique))
+        np.maximum.at(worst, row, np.nan_to_num(error, nan=1e3))
+        good = wide & (worst < 2.0)
+        self.points[unique[good]] = position[good]
+
+    def _gather(
+        self, span: range, known: bool
+    ) -> tuple[Array, NDArray[np.int64], Array, NDArray[np.int64], Array, Array]:
+        """Observations in the posed views of `span` of tracks with (or without) a position:
+        rotations, view number, unit world rays, ids, centres, pixels."""
+        k = self.intrinsics
+        columns: list[tuple[Array, ...]] = []
+        for number in span:
+            view = self.views[number]
+            if view.rotation is None or view.centre is None:
+                continue
+            keep = np.isfinite(self.points[view.ids, 0]) == known
+            pixels = view.pixels[keep]
+            rays = np.column_stack([(pixels - [k.cx, k.cy]) / [k.fx, k.fy], np.ones(len(pixels))]) @ view.rotation.T
+            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+            n = len(pixels)
+            columns.append(
+                (
+                    np.tile(view.rotation, (n, 1, 1)),
+                    np.full(n, number),
+                    rays,
+                    view.ids[keep],
+                    np.tile(view.centre, (n, 1)),
+                    pixels,
+                )
+            )
+        if not columns:
+            return (
+                np.zeros((0, 3, 3)),
+                np.zeros(0, int),
+                np.zeros((0, 3)),
+                np.zeros(0, int),
+                np.zeros((0, 3)),
+                np.zeros((0, 2)),
+            )
+        a, b, c, d, e, f = (np.concatenate(column) for column in zip(*columns, strict=True))
+        return a, b, c, d, e, f
+
+    def _bundle(self, numbers: list[int]) -> tuple[Bundle, NDArray[np.int64]] | None:
+        """A bundle of the posed views `numbers` and all points seen twice or more in them, with those points' ids."""
+        columns = [(v, i, p) for n in numbers for v, i, p in [self._known(n)]]
+        ids = np.concatenate([i for _, i, _ in columns])
+        unique, row, seen = np.unique(ids, return_inverse=True, return_counts=True)
+        keep = seen[row] >= 3
+        if keep.sum() < 60:
+            return None
+        unique, point = np.unique(ids[keep], return_inverse=True)
+        camera = np.repeat(np.arange(len(numbers)), [len(i) for _, i, _ in columns])[keep]
+        pixels = np.concatenate([p for _, _, p in columns])[keep]
+        rotations = np.stack([v.rotation for v, _, _ in columns if v.rotation is not None])
+        centres = np.stack([v.centre for v, _, _ in columns if v.centre is not None])
+        return Bundle(rotations, centres, self.points[unique], camera, point, pixels, self.intrinsics), unique
+
+    def _known(self, number: int) -> tuple[Posed, NDArray[np.int64], Array]:
+        view = self.views[number]
+        keep = np.isfinite(self.points[view.ids, 0])
+        return view, view.ids[keep], view.pixels[keep]
+
+    def _adjust_recent(self, span: int = 14, fixed: int = 4) -> None:
+        numbers = [
+            n for n in range(max(0, len(self.views) - span), len(self.views)) if self.views[n].rotation is not None
+        ]
+        made = self._bundle(numbers) if len(numbers) > fixed + 2 else None
+        if made is None:
+            return
+        bundle, ids = made
+        frozen = np.zeros(len(numbers), bool)
+        frozen[:fixed] = True
+        bundle.optimise(4, SCALE_PX, frozen)
+        self._take(bundle, ids, numbers)
+
+    def _take(self, bundle: Bundle, ids: NDArray[np.int64], numbers: list[int]) -> None:
+        """Poses and points from an adjusted bundle; points that do not fit are forgotten."""
+        for n, rotation, centre in zip(numbers, bundle.rotations, bundle.centres, strict=True):
+            self.views[n].rotation, self.views[n].centre = rotation, centre
+        error = np.linalg.norm(bundle.residuals(), axis=1)
+        bad = np.bincount(bundle.point, error > 2 * INLIER_PX, len(ids)) > 0.3 * np.bincount(
+            bundle.point, minlength=len(ids)
+        )
+        self.points[ids] = np.where(bad[:, None], np.nan, bundle.points)
+
+    def settle(self) -> None:
+        """Adjust the whole path: freely first, then on the coarsest spline that follows it."""
+        posed = [n for n, v in enumerate(self.views) if v.rotation is not None]
+        self._next_global = max(len(self.views) + 12, int(1.5 * len(self.views)))
+        if len(posed) < BOOT_VIEWS:
+            return
+        step = -(-len(posed) // GLOBAL_VIEWS)
+        numbers = sorted({*posed[::step], posed[-1]})
+        made = self._bundle(numbers)
+        if made is None:
+            return
+        bundle, ids = made
+        bundle.optimise(8, SCALE_PX, tolerance=1e-3)
+        times = np.array([self.views[n].time for n in numbers])
+        start = self._coarsest(times, bundle)
+        self.spline, _ = bundle.optimise_spline(start, times, 8, SCALE_PX / 2, tolerance=1e-3)
+        self._take(bundle, ids, numbers)
+        others = [n for n in posed if n not in set(numbers)]
+        if others:
+            rotations, centres = self.spline.poses([self.views[n].time for n in others])
+            for n, rotation, centre in zip(others, rotations, centres, strict=True):
+                self.views[n].rotation, self.views[n].centre = rotation, centre
+        self._triangulate(range(max(0, len(self.views) - 200), len(self.views)))
+
+    def _coarsest(self, times: Array, bundle: Bundle) -> Spline:
+        depth = _median_depth(bundle)
+        spline = None
+        for spacing in (8, 4, 2, 1):
+            spline = Spline.fit(times, bundle.rotations, bundle.centres, spacing * self.hop)
+            rotations, centres = spline.poses(times)
+            turned = np.linalg.norm(log_so3(rotations @ bundle.rotations.swapaxes(1, 2)), axis=1)
+            moved = np.linalg.norm(centres - bundle.centres, axis=1) / depth
+            error = self.intrinsics.fx * np.hypot(turned, moved)
+            if np.sqrt(np.mean(error**2)) < KNOT_ERROR_PX:
+                break
+        assert spline is not None
+        return spline
+
+
+def _median_depth(bundle: Bundle) -> float:
+    ray = bundle.points[bundle.point] - bundle.centres[bundle.camera]
+    z = np.einsum("mj,mj->m", bundle.rotations[bundle.camera][:, :, 2], ray)
+    return float(np.median(z))
+
+
+def _pick(view: Posed, ids: NDArray[np.int64]) -> Array:
+    order = np.argsort(view.ids)
+    return np.asarray(view.pixels[order[np.searchsorted(view.ids, ids, sorter=order)]])
+
+
+def predict(last: list[Posed], time: float) -> tuple[Array, Array]:
+    """The pose at `time` from the last one or two posed views at constant velocity."""
+    b = last[-1]
+    assert b.rotation is not None and b.centre is not None
+    if len(last) == 1:
+        return b.rotation, b.centre
+    a = last[-2]
+    assert a.rotation is not None and a.centre is not None
+    u = (time - b.time) / max(b.time - a.time, 1e-9)
+    return b.rotation @ exp_so3(u * log_so3(a.rotation.T @ b.rotation)), b.centre + u * (b.centre - a.centre)

@@ -1,0 +1,96 @@
+"""From frames as they arrive to views: spike-aligned rate images of short windows, with the noise of each pixel."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.blocks import Window, aligned_window
+from spiked.sensor import Mosaic, Sensor
+
+Image = NDArray[np.float32]
+
+MARGIN = 24
+"""Frames looked at on both sides of a window for the spikes nearest to its edges."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What the camera saw in the frames [begin, end); images are upright [H, W]."""
+
+    begin: int
+    end: int
+    rate: Image
+    """Spikes a frame; where no whole interval was seen, half of the rate's upper bound."""
+    deviation: Image
+    """Standard deviation of `rate`."""
+    delay: NDArray[np.float16]
+    """Frames from the middle of the window to the middle of the charge that `rate` was measured from."""
+    spikes_a_pixel: float
+    """Mean plain count."""
+    after_gap: bool = False
+    """Frames are missing between the view before and this one."""
+
+    @property
+    def time(self) -> float:
+        """The middle of the window in frames."""
+        return 0.5 * (self.begin + self.end)
+
+
+def make_view(window: Window, after_gap: bool) -> View:
+    """The view of a spike-aligned window."""
+    rate = window.rate(fill=True)
+    variance = np.nan_to_num(window.variance(jitter=1.2e-3), nan=0.0)
+    deviation = np.where(window.valid, np.sqrt(variance), window.rate_bound()).astype(np.float32)
+    middle = 0.5 * (window.begin + window.end)
+    delay = np.nan_to_num(window.centre() - middle, nan=0.0).astype(np.float16)
+    return View(window.begin, window.end, rate, deviation, delay, float(window.count.mean()), after_gap)
+
+
+class Windows:
+    """Cuts a stream of frames into views of `length` frames, one every `hop` frames. Windows never span a gap."""
+
+    def __init__(self, sensor: Sensor, length: int, hop: int) -> None:
+        self.sensor, self.length, self.hop = sensor, length, hop
+        self._frames = np.zeros((0, sensor.frame_bytes), np.uint8)
+        self._first = 0
+        self._next = 0
+        self._gap = False
+
+    def feed(self, first_frame: int, frames: NDArray[np.uint8]) -> Iterator[View]:
+        """Take frames uint8 [n, frame_bytes] in stored layout and yield the views that they complete."""
+        expected = self._first + len(self._frames)
+        if first_frame != expected:
+            yield from self._cut(final=True)
+            self._gap = self._gap or expected > 0
+            self._frames, self._first, self._next = self._frames[:0], first_frame, first_frame
+        self._frames = np.concatenate([self._frames, frames]) if len(self._frames) else frames
+        yield from self._cut(final=False)
+
+    def flush(self) -> Iterator[View]:
+        """The last views, whose right margin never came."""
+        yield from self._cut(final=True)
+
+    def _cut(self, final: bool) -> Iterator[View]:
+        stop = self._first + len(self._frames)
+        while self._next + self.length + (0 if final else MARGIN) <= stop:
+            begin, end = self._next, self._next + self.length
+            low = max(self._first, begin - MARGIN)
+            high = min(stop, end + MARGIN)
+            part = self._frames[low - self._first : high - self._first]
+            view = make_view(aligned_window(part, self.sensor, low, begin, end), self._gap)
+            self._gap = False
+            self._next += self.hop
+            yield view
+        keep = max(self._first, min(self._next - MARGIN, stop))
+        self._frames, self._first = self._frames[keep - self._first :].copy(), keep
+
+
+def luminance(rate: Image, mosaic: Mosaic | None) -> Image:
+    """A grey image of raw sites: a 3x3 binomial mean sees every colour in the same proportion at every pixel."""
+    if mosaic is None:
+        return rate
+    row = np.array([0.25, 0.5, 0.25], np.float32)
+    return np.asarray(cv2.sepFilter2D(rate, cv2.CV_32F, row, row, borderType=cv2.BORDER_REFLECT_101), np.float32)

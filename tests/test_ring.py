@@ -1,0 +1,392 @@
+"""The ring inside one process: order, policies, accounting, and what it refuses."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spiked.ring import (
+    Cause,
+    Condition,
+    DeviceState,
+    End,
+    EndReason,
+    Frames,
+    Gap,
+    Item,
+    Policy,
+    Ring,
+    RingError,
+    RingReader,
+    RingWriter,
+    clean_stale,
+)
+from spiked.sensor import Layout, Mosaic, Sensor
+
+SENSOR = Sensor(64, 8, 20_000.0)
+"""64 bytes a frame: room for the frame's own index, so that content can be checked."""
+
+
+def put(writer: RingWriter, frames: int) -> None:
+    """Commit a block whose frames hold their own index."""
+    view = writer.acquire()
+    view[:frames].view(np.int64)[:] = np.arange(writer.next_frame, writer.next_frame + frames)[:, None]
+    writer.commit(frames)
+
+
+def drain(reader: RingReader) -> list[Item]:
+    """All that is there now, each block released at once."""
+    items: list[Item] = []
+    while (item := reader.next(0)) is not None:
+        if isinstance(item, Frames):
+            check_content(item)
+        items.append(item)
+        if isinstance(item, End):
+            break
+    return items
+
+
+def check_content(frames: Frames) -> None:
+    expected = np.arange(frames.first, frames.first + frames.count)
+    copy = np.array(frames.data).view(np.int64)
+    if frames.release():
+        np.testing.assert_array_equal(copy, np.broadcast_to(expected[:, None], copy.shape))
+
+
+def spans(items: list[Item]) -> list[tuple[int, int]]:
+    return [(item.first, item.count) for item in items if not isinstance(item, End)]
+
+
+def assert_contiguous(items: list[Item]) -> int:
+    """Every frame came once, in order; returns the next frame's index."""
+    expected = 0
+    for first, count in spans(items):
+        assert first == expected
+        expected += count
+    return expected
+
+
+@pytest.fixture
+def writer() -> Iterator[RingWriter]:
+    with RingWriter.create(SENSOR, slots=16) as writer:
+        yield writer
+
+
+def attach(writer: RingWriter, policy: Policy = Policy.LOSSLESS) -> RingReader:
+    return RingReader.attach(writer.name, policy, "test")
+
+
+def test_frames_and_gaps_come_in_order(writer: RingWriter) -> None:
+    reader = attach(writer)
+    put(writer, 8)
+    put(writer, 5)
+    writer.gap(100, Cause.USB)
+    writer.gap(7, Cause.DEVICE)
+    put(writer, 8)
+    writer.end(EndReason.FINISHED)
+    items = drain(reader)
+    assert spans(items) == [(0, 8), (8, 5), (13, 100), (113, 7), (120, 8)]
+    assert items[2:4] == [Gap(13, 100, Cause.USB), Gap(113, 7, Cause.DEVICE)]
+    assert items[-1] == End(128, EndReason.FINISHED)
+
+
+def test_the_end_comes_again_and_ending_twice_keeps_the_first_reason(writer: RingWriter) -> None:
+    reader = attach(writer)
+    writer.end(EndReason.STOPPED)
+    writer.end(EndReason.FAILED)
+    assert [reader.next(0), reader.next(0)] == [End(0, EndReason.STOPPED)] * 2
+
+
+def test_views_are_of_the_ring_itself_and_read_only(writer: RingWriter) -> None:
+    reader = attach(writer)
+    view = writer.acquire()
+    view[:] = 7
+    writer.commit(8)
+    frames = reader.next(0)
+    assert isinstance(frames, Frames)
+    assert not frames.data.flags.writeable
+    assert frames.data.shape == (8, SENSOR.frame_bytes)
+    view[0, 0] = 9  # what no writer does: it shows that the reader sees the same memory
+    assert frames.data[0, 0] == 9
+
+
+def test_attaching_needs_only_the_name() -> None:
+    sensor = Sensor(400, 250, 20_000.0, Layout.ROW_TAGGED, mosaic=Mosaic.RGGB)
+    with RingWriter.create(sensor, slots=8, block_frames=4) as writer:
+        reader = attach(writer)
+        assert reader.geometry.sensor == sensor.compact()
+        assert (reader.geometry.slots, reader.geometry.block_frames) == (8, 4)
+
+
+def test_a_lossless_reader_gets_everything_within_half_of_the_ring(writer: RingWriter) -> None:
+    reader = attach(writer)
+    for _ in range(8):
+        put(writer, 8)
+    assert spans(drain(reader)) == [(8 * i, 8) for i in range(8)]
+    assert not writer.status().readers[0].lagging
+
+
+def test_an_overrun_lossless_reader_gets_a_gap_and_is_marked_until_it_catches_up(writer: RingWriter) -> None:
+    reader = attach(writer)
+    put(writer, 8)
+    drain(reader)
+    for _ in range(9):
+        put(writer, 8)
+    gap = reader.next(0)
+    assert isinstance(gap, Gap)
+    assert (gap.first, gap.cause) == (8, Cause.RING)
+    status = writer.status().readers[0]
+    assert status.lagging
+    assert (status.overruns, status.lost) == (1, gap.count)
+    drain(reader)
+    assert not writer.status().readers[0].lagging
+
+
+def test_a_priority_reader_has_the_deeper_lease(writer: RingWriter) -> None:
+    lossless, priority = attach(writer), attach(writer, Policy.PRIORITY)
+    for _ in range(14):
+        put(writer, 8)
+    assert isinstance(lossless.next(0), Gap)
+    assert spans(drain(priority)) == [(8 * i, 8) for i in range(14)]
+
+
+def test_the_latest_policy_skips_to_the_newest_block_and_says_how_much(writer: RingWriter) -> None:
+    reader = attach(writer, Policy.LATEST)
+    for _ in range(5):
+        put(writer, 8)
+    gap = reader.next(0)
+    put(writer, 8)  # the block promised by the gap comes, even if a newer one is there by now
+    frames = reader.next(0)
+    assert gap == Gap(0, 32, Cause.RING)
+    assert isinstance(frames, Frames)
+    assert frames.first == 32
+
+
+def test_joining_late_is_a_gap_but_no_overrun(writer: RingWriter) -> None:
+    for _ in range(40):
+        put(writer, 8)
+    reader = attach(writer)
+    items = drain(reader)
+    assert isinstance(items[0], Gap)
+    assert assert_contiguous(items) == 320
+    assert writer.status().readers[0].overruns == 0
+
+
+def test_a_view_tells_when_it_was_overwritten_and_its_frames_count_as_lost(writer: RingWriter) -> None:
+    reader = attach(writer)
+    put(writer, 8)
+    frames = reader.next(0)
+    assert isinstance(frames, Frames)
+    for _ in range(15):
+        put(writer, 8)
+    assert frames.valid()
+    writer.acquire()
+    writer.commit(1)
+    assert not frames.valid()
+    assert not frames.release()
+    gap = reader.next(0)
+    assert isinstance(gap, Gap)
+    assert (gap.first, gap.cause) == (0, Cause.RING)
+
+
+def test_a_view_overwritten_at_the_end_of_the_capture_is_told_of_before_the_end(writer: RingWriter) -> None:
+    reader = attach(writer, Policy.LATEST)
+    put(writer, 8)
+    frames = reader.next(0)
+    assert isinstance(frames, Frames)
+    for _ in range(16):
+        put(writer, 8)
+    writer.end(EndReason.FINISHED)
+    items = drain(reader)
+    assert assert_contiguous(items) == 17 * 8
+    assert items[0] == Gap(0, 128, Cause.RING)
+
+
+def test_as_context_manager_frames_say_afterwards_whether_they_were_whole(writer: RingWriter) -> None:
+    reader = attach(writer)
+    put(writer, 8)
+    frames = reader.next(0)
+    assert isinstance(frames, Frames)
+    with frames as data:
+        assert data[3].view(np.int64)[0] == 3
+    assert frames.intact
+    assert writer.status().readers[0].received == 8
+
+
+def test_a_storm_of_gaps_without_frames_keeps_the_account(writer: RingWriter) -> None:
+    reader = attach(writer)
+    for _ in range(1000):
+        writer.gap(3, Cause.DEVICE)
+    writer.end(EndReason.STOPPED)
+    items = drain(reader)
+    assert assert_contiguous(items) == 3000
+
+
+def test_slots_acquired_ahead_are_committed_in_order_with_gaps_between(writer: RingWriter) -> None:
+    reader = attach(writer)
+    first, second = writer.acquire(), writer.acquire()
+    second[:] = 2
+    first[:] = 1
+    writer.commit(8)
+    writer.gap(8, Cause.USB)
+    writer.commit(8)
+    values = []
+    while (item := reader.next(0)) is not None:
+        values.append(int(item.data[0, 0]) if isinstance(item, Frames) else item)
+    assert values == [1, Gap(8, 8, Cause.USB), 2]
+
+
+def test_a_writer_that_can_wait_has_room_while_no_reader_would_lose(writer: RingWriter) -> None:
+    reader, skipping = attach(writer), attach(writer, Policy.LATEST)
+    for _ in range(8):
+        assert writer.has_room()
+        put(writer, 8)
+    assert not writer.wait_for_room(0.01)
+    reader.next(0)
+    assert not writer.has_room()  # the block is being read
+    reader.next(0)
+    assert writer.has_room()
+    reader.close()
+    for _ in range(20):
+        assert writer.has_room()
+        put(writer, 8)
+    skipping.close()
+
+
+def test_status_is_visible_from_outside_and_outlives_the_name() -> None:
+    with RingWriter.create(SENSOR, slots=8) as writer:
+        ring = Ring.attach(writer.name)
+        reader = attach(writer)
+        writer.publish_condition(Condition(DeviceState.STREAMING, "as it should"))
+        put(writer, 8)
+        writer.gap(4, Cause.USB)
+        put(writer, 8)
+        drain(reader)
+        before = ring.status()
+    after = ring.status()
+    assert before.writer.condition == Condition(DeviceState.STREAMING, "as it should")
+    assert (before.writer.committed, before.writer.next_frame, before.writer.end) == (16, 20, None)
+    assert before.writer.lost == {Cause.DEVICE: 0, Cause.USB: 4, Cause.RING: 0, Cause.DISK: 0}
+    (row,) = before.readers
+    assert (row.consumer, row.received, row.lost, row.lag_frames, row.alive) == ("test", 16, 4, 0, True)
+    assert after.writer.end is EndReason.STOPPED
+
+
+def test_the_name_is_gone_after_closing_and_readers_read_on() -> None:
+    with RingWriter.create(SENSOR, slots=8) as writer:
+        reader = attach(writer)
+        put(writer, 8)
+    assert not Path("/dev/shm", writer.name).exists()
+    assert spans(drain(reader)) == [(0, 8)]
+    with pytest.raises(RingError, match="there is no ring"):
+        attach(writer)
+
+
+def test_a_name_is_given_once() -> None:
+    with RingWriter.create(SENSOR, slots=8, ring_id=f"test-{os.getpid()}") as writer:
+        with pytest.raises(RingError, match="already"):
+            RingWriter.create(SENSOR, slots=8, ring_id=f"test-{os.getpid()}")
+        put(writer, 8)
+        assert spans(drain(attach(writer))) == [(0, 8)]
+
+
+def test_a_ring_that_does_not_fit_is_refused_before_anything_is_written() -> None:
+    with pytest.raises(RingError, match="are free"):
+        RingWriter.create(Sensor(4000, 4000, 1000.0), slots=1 << 20)
+
+
+def test_impossible_calls_are_refused(writer: RingWriter) -> None:
+    with pytest.raises(RingError, match="no slot"):
+        writer.commit(1)
+    writer.acquire()
+    writer.acquire()
+    with pytest.raises(RingError, match="not committed"):
+        writer.acquire()
+    with pytest.raises(RingError, match="9"):
+        writer.commit(9)
+    with pytest.raises(RingError, match="gap of 0"):
+        writer.gap(0, Cause.USB)
+    writer.end(EndReason.STOPPED)
+    with pytest.raises(RingError, match="ended"):
+        writer.commit(1)
+
+
+def test_there_are_places_for_sixteen_readers_and_a_closed_one_is_free_again(writer: RingWriter) -> None:
+    readers = [attach(writer) for _ in range(16)]
+    with pytest.raises(RingError, match="16 readers"):
+        attach(writer)
+    readers[3].close()
+    attach(writer)
+    assert len(writer.status().readers) == 16
+
+
+def test_a_foreign_file_with_the_name_of_a_ring_is_neither_attached_nor_cleaned() -> None:
+    path = Path("/dev/shm", f"spiked-foreign-{os.getpid()}")
+    path.write_bytes(b"not a ring")
+    try:
+        with pytest.raises(RingError):
+            RingReader.attach(path.name, Policy.LATEST, "test")
+        assert path.name not in clean_stale()
+        assert path.exists()
+    finally:
+        path.unlink()
+
+
+def test_the_ring_of_a_dead_creator_is_cleaned_and_that_of_a_living_one_is_not(writer: RingWriter) -> None:
+    code = "from spiked.ring import *; from spiked.sensor import *; import os; "
+    code += "print(RingWriter.create(Sensor(64, 8, 1.0), slots=8).name, flush=True); os._exit(1)"
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    name = done.stdout.strip()
+    assert Path("/dev/shm", name).exists()
+    assert name in clean_stale()
+    assert not Path("/dev/shm", name).exists()
+    assert Path("/dev/shm", writer.name).exists()
+
+
+Step = tuple[str, int]
+steps = st.lists(
+    st.one_of(
+        st.tuples(st.just("put"), st.integers(1, 8)),
+        st.tuples(st.just("gap"), st.integers(1, 50)),
+        st.tuples(st.just("stall"), st.integers(1, 30)),
+        st.tuples(st.just("read"), st.integers(0, 2)),
+        st.tuples(st.just("hold"), st.integers(0, 2)),
+    ),
+    max_size=60,
+)
+
+
+@settings(max_examples=100, deadline=None)
+@given(steps)
+def test_whatever_happens_each_frame_is_received_or_lost_once(script: list[Step]) -> None:
+    with RingWriter.create(SENSOR, slots=8) as writer:
+        readers = [attach(writer, policy) for policy in Policy]
+        taken: list[list[Item]] = [[] for _ in readers]
+        for kind, number in script:
+            if kind == "put":
+                put(writer, number)
+            elif kind == "gap":
+                writer.gap(number, Cause.DEVICE)
+            elif kind == "stall":
+                for _ in range(number):
+                    put(writer, 8)
+            elif (item := readers[number].next(0)) is not None:
+                taken[number].append(item)
+                if kind == "read" and isinstance(item, Frames):
+                    check_content(item)
+            for row in writer.status().readers:
+                assert row.received + row.lost == row.next_frame
+        writer.end(EndReason.FINISHED)
+        for reader, items in zip(readers, taken, strict=True):
+            items.extend(drain(reader))
+            assert items[-1] == End(writer.next_frame, EndReason.FINISHED)
+            told = [item for item in items if isinstance(item, Gap) or (isinstance(item, Frames) and item.intact)]
+            assert assert_contiguous(told) == writer.next_frame
+        for row in writer.status().readers:
+            assert row.received + row.lost == row.next_frame == writer.next_frame

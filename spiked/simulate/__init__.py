@@ -1,0 +1,24 @@
+"""A spike camera without hardware: a sensor with every noise term, a furnished room, hand-held motion, and the truth."""
+
+from spiked.simulate.camera import SimulatedCamera
+from spiked.simulate.motion import Motion, MotionKind, Stage, look_at, make_motion
+from spiked.simulate.room import Room
+from spiked.simulate.sensor import GainStep, Lighting, PixelMaps, SensorNoise, SpikeSensor
+from spiked.simulate.view import View, ViewableScene
+
+__all__ = [
+    "GainStep",
+    "Lighting",
+    "Motion",
+    "MotionKind",
+    "PixelMaps",
+    "Room",
+    "SensorNoise",
+    "SimulatedCamera",
+    "SpikeSensor",
+    "Stage",
+    "View",
+    "ViewableScene",
+    "look_at",
+    "make_motion",
+]

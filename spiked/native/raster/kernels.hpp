@@ -1,0 +1,130 @@
+// The interface between the renderer and the vector kernels. Plain data and pointers only: the kernels are compiled
+// once for each instruction set, and a template or inline function shared with the rest of the module could be linked
+// from the wrong one.
+#pragma once
+#include <stdint.h>
+
+namespace raster {
+
+constexpr int kTile = 16;                    // pixels on a side
+constexpr int kBlocks = 16;                  // blocks of 4x4 pixels in a tile
+constexpr int kTilePixels = kTile * kTile;   // stored block by block, each block row by row
+constexpr int kMaxParts = 4;                 // native vectors in a block, at most
+constexpr int kGroup = 16;                   // splats are projected in whole groups; a multiple of every vector width
+constexpr int kMaxSide = 4096;               // pixels; tile numbers then fit in 16 bits
+constexpr uint32_t kCulled = 0xffffffffu;    // as a depth key, and as a rank
+constexpr float kStopTransmittance = 1e-4f;  // a block is finished when none of its pixels lets more through
+
+struct Lens {
+    float fx, fy, cx, cy;
+    float limit_x, limit_y;  // x/z and y/z beyond these are clamped in the Jacobian
+    float near;
+    int width, height, tiles_x, tiles_y;
+};
+
+// World to camera: p = rotation (mean - centre); the centre is split in two floats to keep the precision of a double.
+struct View {
+    float rotation[9];
+    float centre_high[3], centre_low[3];
+};
+
+// What does not depend on the view, as arrays of `stride` floats (a multiple of kGroup).
+struct Prepared {
+    const float* mean[3];
+    const float* spread[9];     // rotation of the splat times diag(scales), row-major
+    const float* log2_opacity;  // log2(sigmoid(logit))
+};
+
+// A projected splat. With d the offset from its mean (px), u = p dx + q dy and w = r dy,
+// log2(alpha) = log2_opacity - u^2 - w^2: the Cholesky factor of the conic, scaled so that no constant is left over.
+struct Record {
+    float x, y;
+    float p, q, r;
+    float log2_opacity;
+    float z;
+    float radius;  // px, largest half axis of the ellipse where alpha reaches 1/255
+    float colour[3];
+    float unused[5];
+};
+static_assert(sizeof(Record) == 64, "a record is a cache line");
+
+// A splat seen by a tile. `slot` is the pair's number in order of emission, which is depth order, then tile order.
+struct Entry {
+    uint32_t slot, rank, blocks;
+};
+
+struct Pair {
+    uint32_t tile_blocks;  // tile << 16 | blocks
+    uint32_t rank;
+};
+
+// Sums over a tile's pixels for one pair; v = alpha dL/dalpha, and alpha T is the pixel's share of the splat.
+enum Sum { kV, kVu, kVw, kVuu, kVuw, kVww, kShare, kColour0, kColour1, kColour2, kSums };
+static constexpr int slot_floats(int colours) { return colours == 1 ? 8 : 16; }
+
+struct Tile {
+    const Lens* lens;
+    const Record* records;
+    const Entry* entries;
+    int count;
+    int tile_x, tile_y;
+    float* local;      // scratch, 16 floats an entry
+    uint32_t* listed;  // scratch, an integer an entry
+};
+
+// Of one tile of one sub-pose, kept for the backward pass. Pixels in tile order.
+struct TileState {
+    float* colour;  // [colours][kTilePixels], background included
+    int32_t* ends;  // [kBlocks * kMaxParts] entries composited before that part of the block was full
+};
+
+struct Planes {
+    const float* weight;  // [height][width], or null for `uniform_weight`
+    float uniform_weight;
+    const uint8_t* channels;  // [height][width], or null when a pixel sees every colour
+};
+
+// Sums over sub-poses; written back to images when the tile is done.
+struct TileImage {
+    float value[3][kTilePixels];
+    float weight[kTilePixels], alpha[kTilePixels], depth[kTilePixels];
+};
+
+struct SplatGradients {  // arrays of `stride` floats; summed over sub-poses
+    float* mean[3];
+    float* spread[9];
+    float* log_opacity;
+    float* colour[3];
+    float* share;
+};
+
+struct Kernels {
+    const char* name;
+    // means [n][3], quats [n][4], log_scales [n][3], logits [n] to the arrays of Prepared; a whole group at a time.
+    void (*prepare)(const float* means, const float* quats, const float* log_scales, const float* logits, int count,
+                    int first, int last, float* const mean[3], float* const spread[9], float* log2_opacity);
+    // Writes records[first..last) and keys (bits of z, or kCulled).
+    void (*project)(const Prepared&, const Lens&, const View&, int count, int first, int last, Record* records,
+                    uint32_t* keys);
+    // Appends the pairs of one splat, at most `tiles_x * tiles_y`, to `out`; returns their number.
+    // `columns` is scratch, 2 * (blocks in a column of the image + kGroup) integers.
+    int (*emit)(const Record&, uint32_t rank, const Lens&, int32_t* columns, Pair* out);
+    void (*forward)(const Tile&, int colours, const float background[3], const Planes&, const TileState&, TileImage*);
+    void (*store)(const Tile&, const TileImage*, int colours, const Planes&, float* values, float* alpha, float* depth);
+    // d_values [height][width] or [height][width][3]; slots are slot_floats(colours) floats each.
+    void (*backward)(const Tile&, int colours, const float* d_values, const Planes&, const TileState&, float* slots);
+    // Adds one view's gradients of the group [first, first + kGroup); sums [kSums][kGroup] are zero where not visible.
+    // pose: 3 of rotation, then 3 of the mean, added up.
+    void (*unproject)(const Prepared&, const Lens&, const View&, int first, const float* sums, const uint8_t* visible,
+                      int colours, const SplatGradients&, double pose[6]);
+};
+
+extern const Kernels kBaseline;
+#if defined(__x86_64__)
+extern const Kernels kAvx2;
+extern const Kernels kAvx512;
+#endif
+
+const Kernels& choose_kernels();  // throws std::invalid_argument for an unknown or unsupported SPIKED_SIMD
+
+}  // namespace raster

@@ -1,0 +1,17 @@
+#include <immintrin.h>
+
+#include "kernels.hpp"
+
+namespace raster {
+namespace {
+// Each part uses the ones before it.
+// clang-format off
+#include "vector.inl"
+#include "project.inl"
+#include "emit.inl"
+#include "raster.inl"
+// clang-format on
+}  // namespace
+
+const Kernels kAvx2 = {"avx2", prepare, project, emit, forward, store_tile, backward, unproject};
+}  // namespace raster

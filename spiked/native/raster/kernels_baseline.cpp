@@ -1,0 +1,19 @@
+#include "kernels.hpp"
+
+#if defined(__SSE2__)
+#include <immintrin.h>
+#endif
+
+namespace raster {
+namespace {
+// Each part uses the ones before it.
+// clang-format off
+#include "vector.inl"
+#include "project.inl"
+#include "emit.inl"
+#include "raster.inl"
+// clang-format on
+}  // namespace
+
+const Kernels kBaseline = {"baseline", prepare, project, emit, forward, store_tile, backward, unproject};
+}  // namespace raster

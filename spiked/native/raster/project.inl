@@ -1,0 +1,184 @@
+// Splats to screen and gradients back. Notation as in the pose gradient of the design: W world to camera, p = W (mu -
+// c), J the Jacobian of the projection, M = J W (splat spread), Sigma2D = M M^T + 0.3 I.
+
+constexpr float kDilation = 0.3f;           // px^2, added to the projected covariance
+constexpr float kLog2Cut = 7.994353437f;    // log2(255)
+constexpr float kHalfLog2e = 0.721347520f;  // log2(e) / 2
+constexpr float kLog2e = 1.442695041f;
+
+static void prepare(const float* means, const float* quats, const float* log_scales, const float* logits, int count,
+                    int first, int last, float* const mean[3], float* const spread[9], float* log2_opacity) {
+    alignas(64) float in[11][kLanes];
+    for (int base = first; base < last; base += kLanes) {
+        for (int i = 0; i < kLanes; ++i) {
+            int n = base + i < count ? base + i : count - 1;
+            for (int k = 0; k < 3; ++k) in[k][i] = means[3 * n + k];
+            for (int k = 0; k < 4; ++k) in[3 + k][i] = quats[4 * n + k];
+            for (int k = 0; k < 3; ++k) in[7 + k][i] = log_scales[3 * n + k];
+            in[10][i] = logits[n];
+        }
+        for (int k = 0; k < 3; ++k) store(mean[k] + base, load(in[k]));
+        Vec w = load(in[3]), x = load(in[4]), y = load(in[5]), z = load(in[6]);
+        Vec scale = 1.0f / root(max(w * w + x * x + y * y + z * z, splat(1e-24f)));
+        w *= scale, x *= scale, y *= scale, z *= scale;
+        Vec rotation[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z),     2 * (x * z + w * y),
+                           2 * (x * y + w * z),     1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+                           2 * (x * z - w * y),     2 * (y * z + w * x),     1 - 2 * (x * x + y * y)};
+        for (int k = 0; k < 3; ++k) {
+            Vec s = exp2_fine(clamp(load(in[7 + k]), splat(-30.0f), splat(30.0f)) * kLog2e);
+            for (int row = 0; row < 3; ++row) store(spread[3 * row + k] + base, rotation[3 * row + k] * s);
+        }
+        Vec logit = clamp(load(in[10]), splat(-30.0f), splat(30.0f));
+        store(log2_opacity + base, 0.0f - log2_fine(1.0f + exp2_fine(-kLog2e * logit)));
+    }
+}
+
+struct Projection {
+    Vec offset[3];  // mu - c, world
+    Vec x, y, z, over_z;
+    Vec slope_x, slope_y;  // x/z and y/z, clamped
+    Vec raw_x, raw_y;      // x/z and y/z
+    Vec b[9];              // W times spread
+    Vec m0[3], m1[3];
+    Vec xx, xy, yy, determinant;
+    Vec p, q, r;
+};
+
+static inline Projection project_lanes(const Prepared& s, const Lens& lens, const View& view, int base) {
+    Projection o;
+    for (int k = 0; k < 3; ++k) o.offset[k] = (load(s.mean[k] + base) - view.centre_high[k]) - view.centre_low[k];
+    const float* w = view.rotation;
+    auto turn = [&](int row, Vec a, Vec b, Vec c) { return w[3 * row] * a + w[3 * row + 1] * b + w[3 * row + 2] * c; };
+    o.x = turn(0, o.offset[0], o.offset[1], o.offset[2]);
+    o.y = turn(1, o.offset[0], o.offset[1], o.offset[2]);
+    o.z = turn(2, o.offset[0], o.offset[1], o.offset[2]);
+    for (int k = 0; k < 3; ++k) {
+        Vec a = load(s.spread[k] + base), b = load(s.spread[3 + k] + base), c = load(s.spread[6 + k] + base);
+        for (int row = 0; row < 3; ++row) o.b[3 * row + k] = turn(row, a, b, c);
+    }
+    o.over_z = 1.0f / o.z;
+    o.raw_x = o.x * o.over_z;
+    o.raw_y = o.y * o.over_z;
+    o.slope_x = clamp(o.raw_x, splat(-lens.limit_x), splat(lens.limit_x));
+    o.slope_y = clamp(o.raw_y, splat(-lens.limit_y), splat(lens.limit_y));
+    Vec jx = lens.fx * o.over_z, jy = lens.fy * o.over_z;
+    for (int k = 0; k < 3; ++k) {
+        o.m0[k] = jx * (o.b[k] - o.slope_x * o.b[6 + k]);
+        o.m1[k] = jy * (o.b[3 + k] - o.slope_y * o.b[6 + k]);
+    }
+    Vec* a = o.m0;
+    Vec* b = o.m1;
+    Vec aa = a[0] * a[0] + a[1] * a[1] + a[2] * a[2], bb = b[0] * b[0] + b[1] * b[1] + b[2] * b[2];
+    o.xx = aa + kDilation;
+    o.yy = bb + kDilation;
+    o.xy = a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    // |a x b|^2 is the determinant without the dilation, free of the cancellation in xx yy - xy^2.
+    Vec c0 = a[1] * b[2] - a[2] * b[1], c1 = a[2] * b[0] - a[0] * b[2], c2 = a[0] * b[1] - a[1] * b[0];
+    o.determinant = c0 * c0 + c1 * c1 + c2 * c2 + kDilation * (aa + bb) + kDilation * kDilation;
+    o.p = root(kHalfLog2e * o.yy / o.determinant);
+    o.q = -kHalfLog2e * o.xy / (o.determinant * o.p);
+    o.r = root(kHalfLog2e / o.yy);
+    return o;
+}
+
+static void project(const Prepared& splats, const Lens& lens, const View& view, int count, int first, int last,
+                    Record* records, uint32_t* keys) {
+    alignas(64) float out[8][kLanes];
+    alignas(64) int32_t seen[kLanes];
+    for (int base = first; base < last; base += kLanes) {
+        Projection o = project_lanes(splats, lens, view, base);
+        Vec u = o.raw_x * lens.fx + lens.cx, v = o.raw_y * lens.fy + lens.cy;
+        Vec log2_opacity = load(splats.log2_opacity + base);
+        Vec reach = log2_opacity + kLog2Cut;  // u^2 + w^2 at the rim
+        Vec half_x = root(max(reach, splat(0.0f)) * o.xx / kHalfLog2e);
+        Vec half_y = root(max(reach, splat(0.0f)) * o.yy / kHalfLog2e);
+        Vec middle = 0.5f * (o.xx + o.yy), spread = 0.5f * (o.xx - o.yy);
+        Vec largest = middle + root(spread * spread + o.xy * o.xy);
+        Vec radius = root(max(reach, splat(0.0f)) * largest / kHalfLog2e);
+        Int inside = (u + half_x >= 0.5f) & (u - half_x <= lens.width - 0.5f) & (v + half_y >= 0.5f) &
+                     (v - half_y <= lens.height - 0.5f);
+        Int sound = is_finite(u + v) & is_finite(o.determinant) & is_finite(radius) & (o.p > 0.0f) & is_finite(o.q);
+        Int visible = inside & sound & (o.z >= lens.near) & (reach >= 0.0f);
+        const Vec fields[8] = {u, v, o.p, o.q, o.r, log2_opacity, o.z, radius};
+        for (int k = 0; k < 8; ++k) store(out[k], fields[k]);
+        __builtin_memcpy(seen, &visible, sizeof seen);
+        for (int i = 0; i < kLanes && base + i < count; ++i) {
+            keys[base + i] = kCulled;
+            if (!seen[i]) continue;
+            __builtin_memcpy(&keys[base + i], &out[6][i], 4);
+            Record& record = records[base + i];
+            record.x = out[0][i], record.y = out[1][i];
+            record.p = out[2][i], record.q = out[3][i], record.r = out[4][i];
+            record.log2_opacity = out[5][i];
+            record.z = out[6][i];
+            record.radius = out[7][i];
+        }
+    }
+}
+
+static inline void add(float* p, Vec v) { store(p, load(p) + v); }
+
+static void unproject(const Prepared& splats, const Lens& lens, const View& view, int first, const float* sums,
+                      const uint8_t* visible, int colours, const SplatGradients& out, double pose[6]) {
+    for (int at = 0; at < kGroup; at += kLanes) {
+        int base = first + at;
+        Int seen;
+        for (int i = 0; i < kLanes; ++i) seen[i] = visible[at + i] ? -1 : 0;
+        auto sum = [&](int which) { return load(sums + which * kGroup + at); };
+        add(out.log_opacity + base, sum(kV));
+        add(out.share + base, sum(kShare));
+        for (int k = 0; k < colours; ++k) add(out.colour[k] + base, sum(kColour0 + k));
+
+        Projection o = project_lanes(splats, lens, view, base);
+        // Offsets times the conic are (p u, q u + r w) / kHalfLog2e, so nothing has to be inverted.
+        constexpr float scale = 1.0f / kHalfLog2e;
+        Vec su = sum(kVu), sw = sum(kVw), suu = sum(kVuu), suw = sum(kVuw), sww = sum(kVww);
+        Vec g_u = scale * o.p * su, g_v = scale * (o.q * su + o.r * sw);
+        Vec c_xx = scale * scale * o.p * o.p * suu;  // twice dL/dSigma2D
+        Vec c_xy = scale * scale * o.p * (o.q * suu + o.r * suw);
+        Vec c_yy = scale * scale * (o.q * (o.q * suu + 2 * o.r * suw) + o.r * o.r * sww);
+
+        Vec jx = lens.fx * o.over_z, jy = lens.fy * o.over_z;
+        Vec d_spread[9], d_jx{}, d_jy{}, d_jxz{}, d_jyz{};
+        for (int k = 0; k < 3; ++k) {
+            Vec d0 = c_xx * o.m0[k] + c_xy * o.m1[k], d1 = c_xy * o.m0[k] + c_yy * o.m1[k];
+            d_jx += d0 * o.b[k];
+            d_jy += d1 * o.b[3 + k];
+            d_jxz += d0 * o.b[6 + k];
+            d_jyz += d1 * o.b[6 + k];
+            Vec b0 = jx * d0, b1 = jy * d1, b2 = -(jx * o.slope_x * d0 + jy * o.slope_y * d1);
+            for (int row = 0; row < 3; ++row) {
+                const float* w = view.rotation + row;
+                d_spread[3 * row + k] = choose(seen, w[0] * b0 + w[3] * b1 + w[6] * b2, Vec{});
+            }
+        }
+        Vec over_z2 = o.over_z * o.over_z;
+        // Where the slope is clamped, jxz = -fx slope / z depends on z only.
+        Vec free_x = choose(o.slope_x == o.raw_x, splat(1.0f), Vec{});
+        Vec free_y = choose(o.slope_y == o.raw_y, splat(1.0f), Vec{});
+        Vec gx = jx * g_u - free_x * lens.fx * over_z2 * d_jxz;
+        Vec gy = jy * g_v - free_y * lens.fy * over_z2 * d_jyz;
+        Vec gz = lens.fx * over_z2 * (o.slope_x * d_jxz + free_x * o.raw_x * d_jxz - d_jx - o.x * g_u) +
+                 lens.fy * over_z2 * (o.slope_y * d_jyz + free_y * o.raw_y * d_jyz - d_jy - o.y * g_v);
+        Vec d_mean[3];
+        for (int k = 0; k < 3; ++k) {
+            const float* w = view.rotation + k;
+            d_mean[k] = choose(seen, w[0] * gx + w[3] * gy + w[6] * gz, Vec{});
+            add(out.mean[k] + base, d_mean[k]);
+        }
+        for (int k = 0; k < 9; ++k) add(out.spread[k] + base, d_spread[k]);
+
+        for (int k = 0; k < 3; ++k) {
+            int a = (k + 1) % 3, b = (k + 2) % 3;
+            Vec turn = d_mean[a] * o.offset[b] - d_mean[b] * o.offset[a];
+            for (int j = 0; j < 3; ++j)
+                turn -= d_spread[3 * b + j] * load(splats.spread[3 * a + j] + base) -
+                        d_spread[3 * a + j] * load(splats.spread[3 * b + j] + base);
+            turn = choose(seen, turn, Vec{});
+            for (int i = 0; i < kLanes; ++i) {
+                pose[k] += turn[i];
+                pose[3 + k] += d_mean[k][i];
+            }
+        }
+    }
+}

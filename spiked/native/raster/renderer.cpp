@@ -1,0 +1,300 @@
+#include "renderer.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <utility>
+
+namespace raster {
+
+namespace {
+
+constexpr int kChunk = 1024;  // splats a task; fixed, so that sums do not depend on the number of threads
+
+int chunks_of(int count) { return (count + kChunk - 1) / kChunk; }
+
+View view_of(const double* rotation, const double* centre) {
+    View view;
+    for (int i = 0; i < 3; ++i) {
+        for (int j = 0; j < 3; ++j) view.rotation[3 * i + j] = static_cast<float>(rotation[3 * j + i]);
+        view.centre_high[i] = static_cast<float>(centre[i]);
+        view.centre_low[i] = static_cast<float>(centre[i] - view.centre_high[i]);
+    }
+    return view;
+}
+
+}  // namespace
+
+Renderer::Renderer(const Lens& lens, int threads)
+    : kernels_(choose_kernels()), lens_(lens), pool_(threads), emissions_(threads), scratch_(threads) {}
+
+void Renderer::forward(const SplatArrays& splats, const double* rotations, const double* centres, int count,
+                       const float* weights, const uint8_t* channels, const float background[3], float* values,
+                       float* alpha, float* depth) {
+    splats_ = splats;
+    sub_poses_ = count;
+    weights_ = weights;
+    channels_ = channels;
+    if (static_cast<int>(views_.size()) < count) views_.resize(count);
+    prepare();
+    for (int i = 0; i < count; ++i) {
+        SubPose& sub = views_[i];
+        std::copy_n(rotations + 9 * i, 9, sub.rotation);
+        sub.view = view_of(rotations + 9 * i, centres + 3 * i);
+        project(sub);
+        sort(sub);
+        bin(sub);
+        const size_t tiles = static_cast<size_t>(lens_.tiles_x) * lens_.tiles_y;
+        sub.colour.grow(tiles * splats.colours * kTilePixels);
+        sub.ends.grow(tiles * kBlocks * kMaxParts);
+    }
+    pool_.run(lens_.tiles_x * lens_.tiles_y, [&](int tile, int thread) {
+        TileImage* image = scratch_[thread].image.grow(1);
+        std::memset(static_cast<void*>(image), 0, sizeof *image);
+        for (int i = 0; i < count; ++i)
+            kernels_.forward(tile_of(views_[i], tile, thread), splats.colours, background, planes_of(i),
+                             state_of(views_[i], tile), image);
+        kernels_.store(tile_of(views_[0], tile, thread), image, splats.colours, planes_of(0), values, alpha, depth);
+    });
+}
+
+void Renderer::prepare() {
+    stride_ = (splats_.count + kGroup - 1) / kGroup * kGroup;
+    float* at = prepared_store_.grow(static_cast<size_t>(stride_) * 13);
+    float *mean[3], *spread[9], *log2_opacity;
+    for (int k = 0; k < 3; ++k, at += stride_) prepared_.mean[k] = mean[k] = at;
+    for (int k = 0; k < 9; ++k, at += stride_) prepared_.spread[k] = spread[k] = at;
+    prepared_.log2_opacity = log2_opacity = at;
+    pool_.run(chunks_of(stride_), [&](int chunk, int) {
+        kernels_.prepare(splats_.means, splats_.quats, splats_.log_scales, splats_.opacity_logits, splats_.count,
+                         chunk * kChunk, std::min(stride_, (chunk + 1) * kChunk), mean, spread, log2_opacity);
+    });
+}
+
+void Renderer::project(SubPose& sub) {
+    raw_.grow(stride_);
+    keys_.grow(stride_);
+    pool_.run(chunks_of(stride_), [&](int chunk, int) {
+        kernels_.project(prepared_, lens_, sub.view, splats_.count, chunk * kChunk,
+                         std::min(stride_, (chunk + 1) * kChunk), raw_.data(), keys_.data());
+    });
+}
+
+// Visible splats by depth, equal depths by number: a radix sort of the bits of z, which order like z for z > 0.
+void Renderer::sort(SubPose& sub) {
+    constexpr int kBits = 11, kDigits = 3, kBins = 1 << kBits;
+    Item *from = items_.grow(splats_.count), *to = spare_.grow(splats_.count);
+    uint32_t histogram[kDigits][kBins] = {};
+    int visible = 0;
+    for (int i = 0; i < splats_.count; ++i) {
+        const uint32_t key = keys_[i];
+        if (key == kCulled) continue;
+        from[visible++] = {key, static_cast<uint32_t>(i)};
+        for (int digit = 0; digit < kDigits; ++digit) ++histogram[digit][key >> (kBits * digit) & (kBins - 1)];
+    }
+    for (int digit = 0; digit < kDigits; ++digit) {
+        uint32_t sum = 0;
+        for (uint32_t& bin : histogram[digit]) sum += std::exchange(bin, sum);
+        for (int i = 0; i < visible; ++i)
+            to[histogram[digit][from[i].key >> (kBits * digit) & (kBins - 1)]++] = from[i];
+        std::swap(from, to);
+    }
+    sub.visible = visible;
+    sub.records.grow(visible);
+    std::fill_n(sub.rank_of.grow(splats_.count), splats_.count, kCulled);
+    pool_.run(chunks_of(visible), [&](int chunk, int) {
+        for (int rank = chunk * kChunk; rank < std::min(visible, (chunk + 1) * kChunk); ++rank) {
+            const uint32_t splat = from[rank].splat;
+            sub.rank_of[splat] = rank;
+            Record& record = sub.records[rank] = raw_[splat];
+            for (int k = 0; k < splats_.colours; ++k) record.colour[k] = splats_.colour[splats_.colours * splat + k];
+        }
+    });
+}
+
+// Lists the splats of every tile in order of depth: pairs are emitted splat by splat, then sorted by tile by counting.
+void Renderer::bin(SubPose& sub) {
+    const int tiles = lens_.tiles_x * lens_.tiles_y, runs = pool_.threads();
+    const size_t rows = static_cast<size_t>(lens_.tiles_y) * 4 + kGroup;
+    uint32_t* counts = sub.first_slot.grow(sub.visible + 1);
+    auto first_rank = [&](int run) { return static_cast<int>(static_cast<int64_t>(sub.visible) * run / runs); };
+    pool_.run(runs, [&](int run, int) {
+        Emission& emission = emissions_[run];
+        int32_t* columns = emission.columns.grow(2 * rows);
+        uint32_t* tile_counts = emission.tile_counts.grow(tiles);
+        std::fill_n(tile_counts, tiles, 0u);
+        uint32_t size = 0;
+        for (int rank = first_rank(run); rank < first_rank(run + 1); ++rank) {
+            if (emission.pairs.size() < size + static_cast<size_t>(tiles))
+                emission.pairs.resize(2 * size + static_cast<size_t>(tiles));
+            Pair* pairs = emission.pairs.data() + size;
+            const int emitted = kernels_.emit(sub.records[rank], rank, lens_, columns, pairs);
+            for (int i = 0; i < emitted; ++i) ++tile_counts[pairs[i].tile_blocks >> 16];
+            counts[rank] = emitted;
+            size += emitted;
+        }
+        emission.size = size;
+    });
+
+    uint32_t sum = 0;
+    for (int rank = 0; rank < sub.visible; ++rank) sum += std::exchange(counts[rank], sum);
+    counts[sub.visible] = sum;
+    sub.pairs = sum;
+    uint32_t* tile_start = sub.tile_start.grow(tiles + 1);
+    sum = 0;
+    for (int tile = 0; tile < tiles; ++tile) {
+        tile_start[tile] = sum;
+        for (int run = 0; run < runs; ++run) sum += std::exchange(emissions_[run].tile_counts[tile], sum);
+    }
+    tile_start[tiles] = sum;
+
+    Entry* entries = sub.entries.grow(sum);
+    pool_.run(runs, [&](int run, int) {
+        Emission& emission = emissions_[run];
+        uint32_t slot = sub.first_slot[first_rank(run)];
+        for (uint32_t i = 0; i < emission.size; ++i, ++slot) {
+            const Pair pair = emission.pairs[i];
+            entries[emission.tile_counts[pair.tile_blocks >> 16]++] = {slot, pair.rank, pair.tile_blocks & 0xffffu};
+        }
+    });
+}
+
+Tile Renderer::tile_of(const SubPose& sub, int tile, int thread) {
+    const uint32_t start = sub.tile_start[tile];
+    const int count = static_cast<int>(sub.tile_start[tile + 1] - start);
+    // One more than listed: the listing writes ahead of what it keeps.
+    return {&lens_,
+            sub.records.data(),
+            sub.entries.data() + start,
+            count,
+            tile % lens_.tiles_x,
+            tile / lens_.tiles_x,
+            scratch_[thread].local.grow(static_cast<size_t>(count) * 16),
+            scratch_[thread].listed.grow(static_cast<size_t>(count) + kGroup)};
+}
+
+TileState Renderer::state_of(const SubPose& sub, int tile) const {
+    return {sub.colour.data() + static_cast<size_t>(tile) * splats_.colours * kTilePixels,
+            sub.ends.data() + static_cast<size_t>(tile) * kBlocks * kMaxParts};
+}
+
+Planes Renderer::planes_of(int sub_pose) const {
+    const size_t plane = static_cast<size_t>(lens_.width) * lens_.height;
+    return {weights_ ? weights_ + sub_pose * plane : nullptr, 1.0f / static_cast<float>(sub_poses_), channels_};
+}
+
+void Renderer::backward(const float* d_values, const GradientArrays& out) {
+    for (int i = 0; i < sub_poses_; ++i)
+        views_[i].slots.grow(static_cast<size_t>(views_[i].pairs) * slot_floats(splats_.colours));
+    pool_.run(lens_.tiles_x * lens_.tiles_y, [&](int tile, int thread) {
+        for (int i = 0; i < sub_poses_; ++i)
+            kernels_.backward(tile_of(views_[i], tile, thread), splats_.colours, d_values, planes_of(i),
+                              state_of(views_[i], tile), views_[i].slots.data());
+    });
+
+    const int chunks = chunks_of(stride_);
+    const size_t pose_doubles = static_cast<size_t>(sub_poses_) * 6;
+    std::fill_n(poses_.grow(chunks * pose_doubles), chunks * pose_doubles, 0.0);
+    pool_.run(chunks, [&](int chunk, int thread) {
+        const int first = chunk * kChunk, last = std::min(stride_, first + kChunk);
+        float* store = scratch_[thread].gradients.grow(17 * kChunk);
+        std::fill_n(store, 17 * kChunk, 0.0f);
+        store -= first;  // the kernels index by splat
+        SplatGradients sums;
+        for (float*& p : sums.mean) p = store, store += kChunk;
+        for (float*& p : sums.spread) p = store, store += kChunk;
+        for (float*& p : sums.colour) p = store, store += kChunk;
+        sums.log_opacity = store;
+        sums.share = store + kChunk;
+        alignas(64) float group[kSums * kGroup];
+        uint8_t visible[kGroup];
+        for (int i = 0; i < sub_poses_; ++i) {
+            double* pose = poses_.data() + chunk * pose_doubles + 6 * i;
+            for (int at = first; at < last; at += kGroup) {
+                gather(views_[i], at, group, visible);
+                if (std::any_of(visible, visible + kGroup, [](uint8_t v) { return v != 0; }))
+                    kernels_.unproject(prepared_, lens_, views_[i].view, at, group, visible, splats_.colours, sums,
+                                       pose);
+            }
+        }
+        finish(first, std::min(last, splats_.count), sums, out);
+    });
+
+    for (int i = 0; i < sub_poses_; ++i) {
+        double sum[6] = {};
+        for (int chunk = 0; chunk < chunks; ++chunk)
+            for (int k = 0; k < 6; ++k) sum[k] += poses_[chunk * pose_doubles + 6 * i + k];
+        for (int k = 0; k < 3; ++k) {
+            out.rotation[3 * i + k] = sum[k];
+            out.centre[3 * i + k] = -sum[3 + k];
+        }
+    }
+}
+
+// The sums of a group's splats over their tiles, in order of emission.
+void Renderer::gather(const SubPose& sub, int first, float* sums, uint8_t* visible) const {
+    const int stride = slot_floats(splats_.colours), used = kColour0 + splats_.colours;
+    for (int lane = 0; lane < kGroup; ++lane) {
+        const int splat = first + lane;
+        const uint32_t rank = splat < splats_.count ? sub.rank_of[splat] : kCulled;
+        visible[lane] = rank != kCulled;
+        float sum[16] = {};
+        if (rank != kCulled) {
+            const float* slot = sub.slots.data() + static_cast<size_t>(sub.first_slot[rank]) * stride;
+            for (uint32_t n = sub.first_slot[rank + 1] - sub.first_slot[rank]; n > 0; --n, slot += stride)
+                for (int k = 0; k < used; ++k) sum[k] += slot[k];
+        }
+        for (int k = 0; k < used; ++k) sums[k * kGroup + lane] = sum[k];
+    }
+}
+
+// From the gradients of spread, log opacity and so on to those of the parameters.
+void Renderer::finish(int first, int last, const SplatGradients& sums, const GradientArrays& out) const {
+    for (int n = first; n < last; ++n) {
+        float radius = 0;
+        for (int i = 0; i < sub_poses_; ++i)
+            if (const uint32_t rank = views_[i].rank_of[n]; rank != kCulled)
+                radius = std::max(radius, views_[i].records[rank].radius);
+        out.radius_px[n] = radius;
+        out.contribution[n] = sums.share[n] / static_cast<float>(sub_poses_);
+        for (int k = 0; k < splats_.colours; ++k) out.colour[splats_.colours * n + k] = sums.colour[k][n];
+        for (int k = 0; k < 3; ++k) out.means[3 * n + k] = sums.mean[k][n];
+        out.opacity_logits[n] = 0;
+        std::fill_n(out.log_scales + 3 * n, 3, 0.0f);
+        std::fill_n(out.quats + 4 * n, 4, 0.0f);
+        if (radius == 0) continue;  // never seen, and possibly not even finite
+
+        out.opacity_logits[n] = sums.log_opacity[n] / (1 + std::exp(splats_.opacity_logits[n]));
+        float d[9];  // with respect to the rotation, times the scales
+        for (int j = 0; j < 3; ++j) {
+            float along = 0;
+            const float scale = std::exp(std::clamp(splats_.log_scales[3 * n + j], -30.0f, 30.0f));
+            for (int i = 0; i < 3; ++i) {
+                along += sums.spread[3 * i + j][n] * prepared_.spread[3 * i + j][n];
+                d[3 * i + j] = sums.spread[3 * i + j][n] * scale;
+            }
+            out.log_scales[3 * n + j] = along;
+        }
+        const float* quat = splats_.quats + 4 * n;
+        const float over =
+            1 /
+            std::sqrt(std::max(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3], 1e-24f));
+        const float w = quat[0] * over, x = quat[1] * over, y = quat[2] * over, z = quat[3] * over;
+        const float unit[4] = {w, x, y, z};
+        const float g[4] = {2 * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1])),
+                            2 * (w * (d[7] - d[5]) + y * (d[1] + d[3]) + z * (d[2] + d[6]) - 2 * x * (d[4] + d[8])),
+                            2 * (w * (d[2] - d[6]) + x * (d[1] + d[3]) + z * (d[5] + d[7]) - 2 * y * (d[0] + d[8])),
+                            2 * (w * (d[3] - d[1]) + x * (d[2] + d[6]) + y * (d[5] + d[7]) - 2 * z * (d[0] + d[4]))};
+        float radial = 0;
+        for (int k = 0; k < 4; ++k) radial += unit[k] * g[k];
+        for (int k = 0; k < 4; ++k) out.quats[4 * n + k] = (g[k] - unit[k] * radial) * over;
+    }
+}
+
+double Renderer::mean_pairs() const {
+    double sum = 0;
+    for (int i = 0; i < sub_poses_; ++i) sum += views_[i].pairs;
+    return sub_poses_ ? sum / sub_poses_ : 0;
+}
+
+}  // namespace raster

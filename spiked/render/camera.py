@@ -1,0 +1,26 @@
+"""The camera that the renderers see: pinhole intrinsics and an image size."""
+
+from dataclasses import dataclass
+
+from spiked.errors import ConfigurationError
+from spiked.sensor import Intrinsics
+
+MAX_SIDE = 4096
+"""The largest image side, in pixels; tiles are numbered with 16 bits."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion."""
+
+    intrinsics: Intrinsics
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.width <= MAX_SIDE and 1 <= self.height <= MAX_SIDE):
+            raise ConfigurationError(f"cannot render {self.width}x{self.height}: sides are 1 to {MAX_SIDE} pixels")
+        if not (self.intrinsics.fx > 0 and self.intrinsics.fy > 0):
+            raise ConfigurationError(
+                f"focal lengths {self.intrinsics.fx:g}, {self.intrinsics.fy:g} px are not positive"
+            )

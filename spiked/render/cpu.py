@@ -1,0 +1,172 @@
+"""The CPU rasteriser: one Python face for the kernels of `spiked/native/raster`."""
+
+import os
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from spiked.errors import ConfigurationError
+from spiked.native._raster import Renderer
+from spiked.render.camera import Camera
+from spiked.render.splats import Floats, Gradients, Image, SplatArrays
+
+MAX_THREADS = 256
+
+
+def usable_cores() -> int:
+    """The number of cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Rasteriser:
+    """Renders splats from one or more sub-poses, and the gradients of the last image.
+
+    The image is the weighted sum over sub-poses of alpha-composited elliptical Gaussians (EWA splatting as in 3DGS,
+    with gsplat's constants): pixel centres at +0.5, 0.3 px^2 added to the projected covariance, alpha at most 0.99,
+    nothing below 1/255, the Jacobian taken at x/z and y/z clamped to 1.3 times the half field of view. A block of 4x4
+    pixels is finished when none of them lets 1e-4 of the light through. The number of threads changes no bit.
+
+    One object serves one thread at a time, and does not survive a fork. SPIKED_SIMD (avx512, avx2, baseline) forces an
+    instruction set, for tests and comparisons.
+    """
+
+    def __init__(self, camera: Camera, threads: int | None = None, near: float = 0.01) -> None:
+        """Threads default to the cores this process may use; splats with z below near (scene units) are not drawn."""
+        threads = usable_cores() if threads is None else threads
+        if not 1 <= threads <= MAX_THREADS:
+            raise ConfigurationError(f"cannot render with {threads} threads: use 1 to {MAX_THREADS}")
+        if not near > 0:
+            raise ConfigurationError(f"the near plane is at {near:g}: it must be positive")
+        self.camera = camera
+        k = camera.intrinsics
+        try:
+            self._native = Renderer(
+                fx=k.fx,
+                fy=k.fy,
+                cx=k.cx,
+                cy=k.cy,
+                width=camera.width,
+                height=camera.height,
+                near=near,
+                threads=threads,
+            )
+        except ValueError as error:
+            raise ConfigurationError(str(error)) from error
+        self._inputs: tuple[object, ...] | None = None
+        self._shapes: tuple[int, int, int] = (0, 0, 0)
+        self._values_shape: tuple[int, ...] = ()
+
+    @property
+    def instructions(self) -> str:
+        """The instruction set in use: avx512, avx2 or baseline."""
+        return str(self._native.instructions)
+
+    def forward(
+        self,
+        splats: SplatArrays,
+        rotations: ArrayLike,
+        centres: ArrayLike,
+        *,
+        weights: Floats | None = None,
+        channels: NDArray[np.uint8] | None = None,
+        background: float | Sequence[float] = 0.0,
+    ) -> Image:
+        """Render sum_s weights_s C_s.
+
+        rotations [S, 3, 3] camera to world and centres [S, 3] are the S sub-poses. weights [S, H, W], float32, not
+        negative, default to 1/S each. With channels [H, W] of 0, 1, 2 (`Mosaic.channels`) and splats of three colours,
+        a pixel sees its own channel only. background is one radiance, or one for each colour. The splats' arrays must
+        not change until backward() has run. Raises ConfigurationError for shapes that do not fit.
+        """
+        rotations = np.ascontiguousarray(rotations, np.float64)
+        centres = np.ascontiguousarray(centres, np.float64)
+        arrays = _checked_splats(splats)
+        count, colours = arrays[4].shape
+        if rotations.ndim != 3 or rotations.shape[1:] != (3, 3) or centres.shape != (len(rotations), 3):
+            raise ConfigurationError(
+                f"sub-poses are rotations [S, 3, 3] and centres [S, 3], not {rotations.shape} and {centres.shape}"
+            )
+        if len(rotations) == 0:
+            raise ConfigurationError("a render needs at least one sub-pose")
+        if not (np.isfinite(rotations).all() and np.isfinite(centres).all()):
+            raise ConfigurationError("a sub-pose is not finite: the trajectory that it comes from is broken")
+        size = (self.camera.height, self.camera.width)
+        if weights is not None:
+            weights = np.ascontiguousarray(weights, np.float32)
+            if weights.shape != (len(rotations), *size):
+                raise ConfigurationError(f"weights are {weights.shape}, expected {(len(rotations), *size)}")
+        if channels is not None:
+            channels = np.ascontiguousarray(channels, np.uint8)
+            if channels.shape != size or colours != 3 or (channels > 2).any():
+                raise ConfigurationError(
+                    f"a mosaic needs channels 0 to 2 of shape {size} and splats of three colours, "
+                    f"not shape {channels.shape} and {colours} colour(s)"
+                )
+        backgrounds = np.array(np.broadcast_to(np.asarray(background, np.float32), 3))
+        values = np.empty(size if colours == 1 or channels is not None else (*size, 3), np.float32)
+        alpha = np.empty(size, np.float32)
+        depth = np.empty(size, np.float32)
+        self._native.forward(*arrays, rotations, centres, weights, channels, backgrounds, values, alpha, depth)
+        self._inputs = (*arrays, weights, channels)
+        self._shapes = (count, colours, len(rotations))
+        self._values_shape = values.shape
+        return Image(values, alpha, depth)
+
+    def backward(self, d_values: Floats) -> Gradients:
+        """Gradients of sum(d_values * values) for the last forward(); d_values has the shape of its values.
+
+        Raises ConfigurationError before any forward() and for another shape.
+        """
+        d_values = np.ascontiguousarray(d_values, np.float32)
+        if self._inputs is None:
+            raise ConfigurationError("backward() differentiates the last forward(), and there was none")
+        if d_values.shape != self._values_shape:
+            raise ConfigurationError(f"d_values is {d_values.shape}, expected {self._values_shape} as rendered")
+        n, colours, s = self._shapes
+        out = Gradients(
+            means=np.empty((n, 3), np.float32),
+            quats=np.empty((n, 4), np.float32),
+            log_scales=np.empty((n, 3), np.float32),
+            opacity_logits=np.empty(n, np.float32),
+            colours=np.empty((n, colours), np.float32),
+            rotation=np.empty((s, 3)),
+            centre=np.empty((s, 3)),
+            contribution=np.empty(n, np.float32),
+            radius_px=np.empty(n, np.float32),
+        )
+        self._native.backward(
+            d_values,
+            out.means,
+            out.quats,
+            out.log_scales,
+            out.opacity_logits,
+            out.colours,
+            out.rotation,
+            out.centre,
+            out.contribution,
+            out.radius_px,
+        )
+        return out
+
+
+def _checked_splats(splats: SplatArrays) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    arrays = tuple(
+        np.ascontiguousarray(array, np.float32)
+        for array in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.colours)
+    )
+    means, quats, log_scales, opacity_logits, colours = arrays
+    n = len(means)
+    if (
+        means.shape != (n, 3)
+        or quats.shape != (n, 4)
+        or log_scales.shape != (n, 3)
+        or opacity_logits.shape != (n,)
+        or colours.ndim != 2
+        or colours.shape not in ((n, 1), (n, 3))
+    ):
+        raise ConfigurationError(
+            "splats are means [N, 3], quats [N, 4], log_scales [N, 3], opacity_logits [N] and colours [N, 1 or 3], not "
+            + ", ".join(str(array.shape) for array in arrays)
+        )
+    return means, quats, log_scales, opacity_logits, colours

@@ -1,0 +1,152 @@
+"""The oracle: the same renderer in float64 torch with automatic differentiation, for tiny scenes.
+
+It states the model without regard for speed: every splat is evaluated at every pixel. Two things differ from the CPU
+renderer. It never stops at a low transmittance, which changes an image by at most 1e-4 of its brightest splat; and the
+rounding of a float64 decides which side of 1/255 an alpha falls on. Formulas: Zwicker et al., EWA splatting (2001), as
+used by 3D Gaussian splatting (Kerbl et al. 2023).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from spiked.render.camera import Camera
+from spiked.render.splats import SplatArrays
+
+DILATION_PX2 = 0.3
+ALPHA_CAP = 0.99
+ALPHA_CUT = 1 / 255
+SLOPE_LIMIT = 1.3
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Leaves of the differentiation, float64 with gradients; shapes as in `Splats`, S sub-poses."""
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
+    colours: Tensor
+    turns: Tensor
+    """phi in R <- Exp(phi) R, zeros [S, 3]."""
+    centres: Tensor
+    """[S, 3]"""
+
+    @classmethod
+    def of(cls, splats: SplatArrays, centres: ArrayLike) -> "Parameters":
+        """The splats and camera centres as leaves."""
+
+        def leaf(array: ArrayLike) -> Tensor:
+            return torch.tensor(np.asarray(array, np.float64), requires_grad=True)
+
+        positions = np.asarray(centres, np.float64)
+        return cls(
+            leaf(splats.means),
+            leaf(splats.quats),
+            leaf(splats.log_scales),
+            leaf(splats.opacity_logits),
+            leaf(splats.colours),
+            leaf(np.zeros_like(positions)),
+            leaf(positions),
+        )
+
+
+def render(
+    parameters: Parameters,
+    camera: Camera,
+    rotations: ArrayLike,
+    *,
+    weights: ArrayLike | None = None,
+    channels: NDArray[np.uint8] | None = None,
+    background: float = 0.0,
+    near: float = 0.01,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Values, alpha and depth as in `spiked.render.Image`, differentiable in the parameters."""
+    turns = torch.tensor(np.asarray(rotations, np.float64))
+    count = len(turns)
+    shape = (count, camera.height, camera.width)
+    weight = torch.full(shape, 1 / count, dtype=torch.float64)
+    if weights is not None:
+        weight = torch.tensor(np.asarray(weights, np.float64))
+    values = torch.zeros(camera.height, camera.width, parameters.colours.shape[1], dtype=torch.float64)
+    alpha = torch.zeros(shape[1:], dtype=torch.float64)
+    depth = torch.zeros(shape[1:], dtype=torch.float64)
+    for s in range(count):
+        rotation = torch.linalg.matrix_exp(_cross(parameters.turns[s])) @ turns[s]
+        one_values, one_alpha, one_depth = _render_one(
+            parameters, camera, (rotation, parameters.centres[s]), background, near
+        )
+        values = values + weight[s, :, :, None] * one_values
+        alpha = alpha + weight[s] * one_alpha
+        depth = depth + weight[s] * one_depth
+    depth = torch.where(alpha > 0, depth / torch.where(alpha > 0, alpha, 1.0), 0.0)
+    total = weight.sum(0)
+    alpha = torch.where(total > 0, alpha / torch.where(total > 0, total, 1.0), 0.0)
+    if channels is not None:
+        values = torch.gather(values, 2, torch.tensor(channels.astype(np.int64))[:, :, None])
+    return (values[:, :, 0] if values.shape[2] == 1 else values), alpha, depth
+
+
+def _render_one(
+    parameters: Parameters, camera: Camera, pose: tuple[Tensor, Tensor], background: float, near: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    rotation, centre = pose
+    k = camera.intrinsics
+    to_camera = rotation.T
+    points = (parameters.means - centre) @ rotation
+    order = torch.argsort(points[:, 2].detach(), stable=True)
+    order = order[points[order, 2].detach() >= near]
+    points = points[order]
+    x, y, z = points.unbind(1)
+    limit_x = SLOPE_LIMIT * 0.5 * camera.width / k.fx
+    limit_y = SLOPE_LIMIT * 0.5 * camera.height / k.fy
+    zero = torch.zeros_like(z)
+    slope_x = (x / z).clamp(-limit_x, limit_x)
+    slope_y = (y / z).clamp(-limit_y, limit_y)
+    jacobian = torch.stack([k.fx / z, zero, -k.fx * slope_x / z, zero, k.fy / z, -k.fy * slope_y / z], 1).view(-1, 2, 3)
+    spread = _rotations(parameters.quats[order]) * torch.exp(parameters.log_scales[order])[:, None, :]
+    projected = jacobian @ to_camera @ spread
+    covariance = projected @ projected.transpose(1, 2) + DILATION_PX2 * torch.eye(2, dtype=torch.float64)
+    conic = torch.linalg.inv(covariance)
+
+    rows = torch.arange(camera.height, dtype=torch.float64) + 0.5
+    columns = torch.arange(camera.width, dtype=torch.float64) + 0.5
+    dx = columns[None, None, :] - (k.fx * x / z + k.cx)[:, None, None]
+    dy = rows[None, :, None] - (k.fy * y / z + k.cy)[:, None, None]
+    a, b, c = (conic[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+    power = -0.5 * (a * dx**2 + c * dy**2) - b * dx * dy
+    alpha = torch.sigmoid(parameters.opacity_logits[order])[:, None, None] * torch.exp(power)
+    alpha = torch.where(alpha >= ALPHA_CUT, alpha.clamp(max=ALPHA_CAP), 0.0)
+
+    through = torch.cumprod(1 - alpha, 0)
+    before = torch.cat([torch.ones_like(through[:1]), through[:-1]])
+    share = alpha * before
+    left = through[-1] if len(through) else torch.ones(camera.height, camera.width, dtype=torch.float64)
+    values = torch.einsum("nhw,nc->hwc", share, parameters.colours[order]) + background * left[:, :, None]
+    return values, 1 - left, torch.einsum("nhw,n->hw", share, z)
+
+
+def _cross(v: Tensor) -> Tensor:
+    zero = torch.zeros_like(v[0])
+    return torch.stack([zero, -v[2], v[1], v[2], zero, -v[0], -v[1], v[0], zero]).view(3, 3)
+
+
+def _rotations(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions wxyz [N, 4] of any length."""
+    w, x, y, z = (quats / torch.linalg.norm(quats, dim=1, keepdim=True)).unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
+    return torch.stack(rows, 1).view(-1, 3, 3)

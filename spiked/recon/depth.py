@@ -1,0 +1,112 @@
+"""Dense depth of one view by plane sweep against posed neighbours: the starting geometry of the map.
+
+(R. Collins, "A space-sweep approach to true multi-image matching", CVPR 1996.) Rates are radiometrically consistent
+across views, so plain differences in units of their noise are the cost.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.pose import Array
+from spiked.recon.views import Image
+from spiked.sensor import Intrinsics
+
+
+@dataclass(frozen=True)
+class Shot:
+    """An image with its pose (camera-to-world)."""
+
+    image: Image
+    rotation: Array
+    centre: Array
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """`inverse_depth` [H, W] and `confidence` [H, W] in 0..1: how much the best plane beats a distant one."""
+
+    inverse_depth: Image
+    confidence: Image
+
+
+def neighbours(centres: Array, forward: Array, reference: int, count: int) -> NDArray[np.int64]:
+    """The views with about the right baseline: spread from half of the widest down, seen from `reference`.
+
+    centres [V, 3]; forward [V, 3] viewing directions, to leave out views that look elsewhere.
+    """
+    baseline = np.linalg.norm(centres - centres[reference], axis=1)
+    usable = np.flatnonzero((forward @ forward[reference] > np.cos(np.radians(25))) & (baseline > 1e-9))
+    if len(usable) <= count:
+        return usable
+    ordered = usable[np.argsort(baseline[usable])]
+    first = np.searchsorted(baseline[ordered], 0.3 * baseline[ordered[-1]])
+    first = min(first, len(ordered) - count)
+    return ordered[np.linspace(first, len(ordered) - 1, count).round().astype(int)]
+
+
+def sweep(
+    reference: Shot, others: list[Shot], intrinsics: Intrinsics, near_far: tuple[float, float], noise: Image
+) -> Sweep:
+    """Inverse depth of `reference` between `near_far` (inverse depths: largest, smallest). `noise` [H, W] is the standard
+    deviation of a difference between two images."""
+    height, width = reference.image.shape
+    k = intrinsics.matrix()
+    baseline = max(np.linalg.norm(o.centre - reference.centre) for o in others)
+    largest, smallest = near_far
+    planes = int(np.clip((largest - smallest) * intrinsics.fx * baseline / 0.6, 16, 96))
+    inverse = np.linspace(smallest, largest, planes, dtype=np.float32)
+    weight = 1 / np.maximum(noise, 1e-6)
+    cost = np.empty((planes, height, width), np.float32)
+    for p, q in enumerate(inverse):
+        total = np.zeros((height, width), np.float32)
+        for other in others:
+            warped = _through_plane(other, reference, k, float(q))
+            difference = np.abs(warped - reference.image) * weight
+            total += np.where(np.isfinite(warped), np.minimum(difference, 4.0), 2.0)
+        total /= len(others)
+        cost[p] = cv2.boxFilter(total, -1, (3, 3)) + cv2.boxFilter(total, -1, (9, 9)) + cv2.boxFilter(total, -1, (21, 21))
+    return _winner(cost, inverse)
+
+
+def _through_plane(other: Shot, reference: Shot, k: Array, inverse_depth: float) -> Image:
+    """`other` as seen from `reference` if all lay on the plane at that inverse depth; NaN outside."""
+    rotation = other.rotation.T @ reference.rotation
+    shift = other.rotation.T @ (reference.centre - other.centre)
+    homography = k @ (rotation + inverse_depth * np.outer(shift, [0.0, 0.0, 1.0])) @ np.linalg.inv(k)
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV's warp counts pixel centres from 0
+    mapping = np.linalg.inv(half) @ homography @ half
+    height, width = reference.image.shape
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    warped = cv2.warpPerspective(
+        other.image, mapping, (width, height), flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan")
+    )
+    return np.asarray(warped, np.float32)
+
+
+def _winner(cost: Image, inverse: Image) -> Sweep:
+    """Best plane, refined by a parabola through its neighbours; the runner-up two or more planes away gives confidence."""
+    planes = len(inverse)
+    best = np.argmin(cost, 0)
+    inner = np.clip(best, 1, planes - 2)
+    a, b, c = (np.take_along_axis(cost, (inner + d)[None], 0)[0] for d in (-1, 0, 1))
+    bend = a - 2 * b + c
+    offset = np.where((best == inner) & (bend > 1e-6), 0.5 * (a - c) / np.maximum(bend, 1e-6), 0.0)
+    step = inverse[1] - inverse[0]
+    value = inverse[best] + np.clip(offset, -0.5, 0.5) * step
+    rivals = np.where(np.abs(np.arange(planes)[:, None, None] - best) > max(2, planes // 12), cost, np.inf)
+    margin = rivals.min(0) / np.maximum(cost.min(0), 1e-6) - 1
+    confidence = np.clip(margin / 0.3, 0, 1).astype(np.float32)
+    return Sweep(_settled(value.astype(np.float32), confidence), confidence)
+
+
+def _settled(value: Image, confidence: Image) -> Image:
+    """Doubtful pixels take the confident mean around them, over ever larger neighbourhoods."""
+    trust = confidence**2 + 1e-4
+    out = np.asarray(cv2.medianBlur(value, 5), np.float32)
+    for size in (7, 15, 31):
+        mean = cv2.boxFilter(out * trust, -1, (size, size)) / cv2.boxFilter(trust, -1, (size, size))
+        out = confidence * out + (1 - confidence) * mean
+    return np.asarray(out, np.float32)

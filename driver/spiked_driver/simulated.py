@@ -1,25 +1,41 @@
 """The simulated camera as a source."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from spiked.errors import SourceError
 from spiked.ring import Condition, DeviceState, End, EndReason, Gap
-from spiked.sensor import Sensor
-from spiked.simulate import SimulatedCamera
+from spiked.sensor import Intrinsics, Sensor
+from spiked.simulate import MotionKind, SimulatedCamera
+from spiked.simulate.camera import DEFAULT_FOV_DEG
 from spiked_driver.source import Chunk, Pacer
 
 
 class SimulatedSource:
     """A hand-held camera in a procedural room; the same seed gives the same frames.
 
-    `frames` bounds the capture, None: no end. `pace` is a factor of the sensor's rate; a machine that cannot simulate
-    so fast delivers later, never less. With 0 frames come as fast as lossless consumers take them.
+    `flow_px` is the mean image motion a frame. `frames` bounds the capture, None: no end. `pace` is a factor of the
+    sensor's rate; a machine that cannot simulate so fast delivers later, never less. With 0 frames come as fast as
+    lossless consumers take them.
     """
 
-    def __init__(self, sensor: Sensor, *, seed: int = 0, frames: int | None = None, pace: float = 1.0) -> None:
-        self._sensor = sensor.compact()
+    def __init__(
+        self,
+        sensor: Sensor,
+        *,
+        seed: int = 0,
+        motion: MotionKind = MotionKind.HAND_SHAKE,
+        flow_px: float = 0.12,
+        frames: int | None = None,
+        pace: float = 1.0,
+    ) -> None:
+        intrinsics = sensor.intrinsics or Intrinsics.from_fov(sensor.width, sensor.height, DEFAULT_FOV_DEG)
+        self._sensor = replace(sensor.compact(), intrinsics=intrinsics)
         self._seed = seed
+        self._motion = motion
+        self._flow_px = flow_px
         self._frames = frames
         self._pace = pace
         self._camera: SimulatedCamera | None = None
@@ -29,7 +45,7 @@ class SimulatedSource:
 
     @property
     def sensor(self) -> Sensor:
-        """As given, with compact frames."""
+        """As given, with compact frames and the intrinsics it is drawn with."""
         return self._sensor
 
     @property
@@ -49,7 +65,7 @@ class SimulatedSource:
 
     def open(self) -> None:
         """Build the scene, which takes a moment, and start again at frame 0."""
-        self._camera = SimulatedCamera(self._sensor, self._seed)
+        self._camera = SimulatedCamera(self._sensor, self._seed, self._motion, flow_px=self._flow_px)
         self._pacer = Pacer(self._sensor.frame_rate_hz, self._pace)
         self._next = 0
         self._condition = Condition(DeviceState.ARMED)

@@ -73,14 +73,17 @@ class Pacer:
         self._frames_a_second = rate_hz * factor
         self._start_s: float | None = None
 
-    def wait_for(self, frame: int) -> bool:
-        """Wait until the frames before this index are due, at most READ_WAIT_S; false if they are not."""
+    def remaining_s(self, frame: int, now_s: float) -> float:
+        """Time until the frames before this index are due, never positive without a pace. The first call is time 0."""
         if not self._frames_a_second:
-            return True
-        now_s = time.monotonic()
+            return 0.0
         if self._start_s is None:
             self._start_s = now_s
-        remaining_s = self._start_s + frame / self._frames_a_second - now_s
+        return self._start_s + frame / self._frames_a_second - now_s
+
+    def wait_for(self, frame: int) -> bool:
+        """Wait until the frames before this index are due, at most READ_WAIT_S; false if they are not."""
+        remaining_s = self.remaining_s(frame, time.monotonic())
         if remaining_s > 0:
             time.sleep(min(remaining_s, READ_WAIT_S))
         return remaining_s <= READ_WAIT_S

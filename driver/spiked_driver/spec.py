@@ -9,6 +9,7 @@ from spiked.recording import open_recording
 from spiked.errors import SourceError
 from spiked.ring import Cause
 from spiked.sensor import Sensor
+from spiked.simulate import MotionKind
 from spiked_driver.faults import Faults, FaultySource, Loss, Stall
 from spiked_driver.replay import ReplaySource
 from spiked_driver.simulated import SimulatedSource
@@ -79,6 +80,9 @@ class SimulationOptions(SourceOptions):
     height: int = Field(180, gt=0)
     rate: float = Field(20_000.0, gt=0)
     """Frames a second."""
+    motion: MotionKind = MotionKind.HAND_SHAKE
+    flow_px: float = Field(0.12, gt=0)
+    """Image motion a frame."""
 
 
 _Kind = TypeVar("_Kind", bound=SourceOptions)
@@ -113,7 +117,14 @@ def _replay(path: str, options: ReplayOptions) -> Source:
 def _simulated(options: SimulationOptions) -> Source:
     sensor = Sensor(options.width, options.height, options.rate)
     frames = None if options.seconds is None else round(options.seconds * options.rate)
-    return SimulatedSource(sensor, seed=options.seed, frames=frames, pace=options.pace)
+    return SimulatedSource(
+        sensor,
+        seed=options.seed,
+        motion=options.motion,
+        flow_px=options.flow_px,
+        frames=frames,
+        pace=options.pace,
+    )
 
 
 def _many(values: Any) -> list[str]:

@@ -1,4 +1,4 @@
-"""A spike camera without hardware: a sensor with every noise term, a furnished room, hand-held motion, and the truth."""
+"""A spike camera without hardware: a sensor with every noise term, a furnished room, camera paths, and the truth."""
 
 from spiked.simulate.camera import SimulatedCamera
 from spiked.simulate.motion import Motion, MotionKind, Stage, look_at, make_motion

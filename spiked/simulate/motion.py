@@ -78,7 +78,7 @@ def look_at(centre: ArrayLike, target: ArrayLike, up: ArrayLike) -> Array:
 
 @dataclass(frozen=True)
 class Harmonics:
-    """A smooth random function of time: a sum of sines, periods incommensurate so that it never repeats. Zero at time 0."""
+    """A smooth random function of time, zero at time 0: a sum of sines whose periods never meet again."""
 
     amplitudes: Array  # [m, d]
     turns: Array  # [m, d] radians a frame
@@ -98,7 +98,7 @@ class Harmonics:
     def at(self, times: Array) -> Array:
         """Values [n, d] at times [n]."""
         angle = times[:, None, None] * self.turns + self.phases
-        return np.einsum("nmd,md->nd", np.sin(angle) - np.sin(self.phases), self.amplitudes)
+        return np.asarray(np.einsum("nmd,md->nd", np.sin(angle) - np.sin(self.phases), self.amplitudes))
 
 
 @dataclass(frozen=True)
@@ -163,14 +163,15 @@ class Forward:
 
     stage: Stage
     reach: float
-    """Length of the way there."""
+    """Length of the way; the start lies a seventh of it from the rear end, so that the camera moves at once."""
     period: float
     shake: HandShake
 
     def poses(self, frames: ArrayLike) -> tuple[Array, Array]:
         """See `Motion.poses`."""
         times = np.atleast_1d(np.asarray(frames, np.float64))
-        way = self.reach * np.sin(2 * np.pi * times / self.period)
+        angle = 2 * np.pi * times / self.period
+        way = 0.5 * self.reach * (np.sin(angle - np.pi / 4) + np.sqrt(0.5))
         centres = self.stage.centre + way[:, None] * self.stage.rotation[:, 2]
         return _shaken(np.broadcast_to(self.stage.rotation, (len(times), 3, 3)), centres, self.shake, times)
 
@@ -195,15 +196,15 @@ def arc(stage: Stage, seed: int = 0) -> Arc:
 
 
 def forward(stage: Stage, seed: int = 0) -> Forward:
-    """Forward motion that covers `parallax` of the depth in the first 1,280 frames; turns back after 40 % of the depth."""
+    """Forward motion that covers `parallax` of the depth in 1,280 frames at its fastest, over 40 % of the depth."""
     reach = 0.4 * stage.depth
-    period = 2 * np.pi * reach * 1280 / max(stage.parallax * stage.depth, 1e-9)
+    period = np.pi * reach * 1280 / max(stage.parallax * stage.depth, 1e-9)
     return Forward(stage, reach, float(period), _gentle(stage, seed))
 
 
 @dataclass(frozen=True)
 class Kinked:
-    """Another path known only every `every` frames and straight in between, as of interpolated video: a kink at each."""
+    """Another path known only every `every` frames and straight in between, like interpolated video."""
 
     base: Motion
     every: int = 8
@@ -247,7 +248,7 @@ class StandThenMove:
 
 @dataclass(frozen=True)
 class Recorded:
-    """A path given as poses, e.g. of a TUM file: the turn and the way between two of them are even, the ends stand still."""
+    """A path given as poses, e.g. of a TUM file: even turn and way between two of them, at rest beyond the ends."""
 
     frames: Array  # [n] increasing times in frames
     rotations: Array  # [n, 3, 3]

@@ -1,8 +1,8 @@
 """The built-in scene: a furnished room, textured everywhere, drawn by exact ray casting with filtered textures.
 
-Lengths are metres; x goes to the right, y into the room and z up from the floor. `native/simulate/room.cpp` draws it: one
-ray a pixel against the boxes, mean of the texture over the pixel's footprint from a pyramid of halved pictures, and sixteen
-rays in each pixel where two surfaces meet. So pictures are free of aliasing and depth is exact.
+Lengths are metres; x goes to the right, y into the room and z up from the floor. `native/simulate/room.cpp` draws it:
+one ray a pixel against the boxes, the mean of the texture over the pixel's footprint from a pyramid of halved pictures,
+and sixteen rays in each pixel where two surfaces meet. So pictures are free of aliasing and depth is exact.
 """
 
 from dataclasses import dataclass
@@ -152,13 +152,13 @@ def _build(seed: int, channels: int, texel_m: float) -> _simulate.Room:
     size = np.array(_SIZE)
     atlas = _Atlas(channels, texel_m, [], [])
     boxes = [np.concatenate([size / 2, np.eye(3).ravel(), size / 2])]
-    faces = [[_face(atlas, boxes[0], f, _SHELL[f], _SHELL_COLOURS[f], rng, -1.0) for f in range(6)]]
+    faces = [[_face(atlas, boxes[0], f, _SHELL[f], _SHELL_COLOURS[f], rng=rng, outward=-1.0) for f in range(6)]]
     for block in _FURNITURE:
         cos, sin = np.cos(np.radians(block.yaw_deg)), np.sin(np.radians(block.yaw_deg))
         axes = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
         box = np.concatenate([block.centre, axes.ravel(), np.array(block.size) / 2])
         materials = [block.front if f == 2 and block.front else block.material for f in range(6)]
-        faces.append([_face(atlas, box, f, materials[f], block.colour, rng, 1.0) for f in range(6)])
+        faces.append([_face(atlas, box, f, materials[f], block.colour, rng=rng, outward=1.0) for f in range(6)])
         boxes.append(box)
     return _simulate.make_room(
         channels,
@@ -176,6 +176,7 @@ def _face(
     face: int,
     material: Material,
     colour: tuple[float, float, float],
+    *,
     rng: np.random.Generator,
     outward: float,
 ) -> int:
@@ -203,4 +204,4 @@ def _light(points: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[
     to_lamp = _LAMP - points
     squared = (to_lamp**2).sum(-1) + 0.6
     direct = np.maximum(to_lamp @ normal, 0) / np.sqrt(squared) / (1 + 0.16 * squared)
-    return 0.62 + 0.10 * normal[2] + 0.08 * normal[0] + 0.75 * direct
+    return np.asarray(0.62 + 0.10 * normal[2] + 0.08 * normal[0] + 0.75 * direct)

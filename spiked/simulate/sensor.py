@@ -1,10 +1,11 @@
 """An integrate-and-fire sensor with the noise of a real one: radiance images in, packed binary frames out.
 
-The model is that of section E of the supplement of "3D Gaussian Splatting from Unposed Spike Streams" (CVPR 2026). Charge
-is counted in nominal thresholds, so that one unit of charge is one spike. Each frame a pixel receives
-`q = gain * radiance + dark` plus shot noise of variance `q / electrons_a_spike`; when its charge reaches its threshold it fires
-and the threshold is subtracted, so no charge is lost between frames. A pixel that crosses its threshold several times in
-one frame fires once: the latch holds one bit, and the charge of the further crossings is lost.
+The model is that of section E of the supplement of "3D Gaussian Splatting from Unposed Spike Streams" (CVPR 2026).
+Charge is counted in nominal thresholds, so that one unit of charge is one spike. Each frame a pixel receives
+`q = gain * radiance + dark` plus shot noise of variance `q / electrons_a_spike`; when its charge reaches its
+threshold it fires and the threshold is subtracted, so no charge is lost between frames. A pixel that crosses its
+threshold several times in one frame fires once: the latch holds one bit, and the charge of the further crossings is
+lost.
 """
 
 from dataclasses import dataclass, field
@@ -24,7 +25,7 @@ _ELEMENTARY_CHARGE_C = 1.602176634e-19
 
 
 def thermal_reset_noise(electrons_a_spike: float, swing_v: float = 1.0, temperature_k: float = 300.0) -> float:
-    """The kTC noise of a reset as a share of the threshold, `sqrt(k T C) / (C swing)` with C = electrons * e / swing."""
+    """The kTC noise of a reset as a share of the threshold: `sqrt(k T C) / (C swing)`, C = electrons * e / swing."""
     capacitance_f = electrons_a_spike * _ELEMENTARY_CHARGE_C / swing_v
     return float(np.sqrt(_BOLTZMANN_J_PER_K * temperature_k / capacitance_f) / swing_v)
 
@@ -68,7 +69,7 @@ class SensorNoise:
 
     @property
     def spike_jitter(self) -> float:
-        """Both draws of an interval in one: the noise of the reset it begins with and of the comparison that ends it."""
+        """Both draws of an interval in one: of the reset that begins it and of the comparison that ends it."""
         return float(np.hypot(self.reset_noise, self.threshold_jitter))
 
 
@@ -120,9 +121,9 @@ class PixelMaps:
     def read_calibration(cls, path: Path | str) -> "PixelMaps":
         """Maps from a camera's calibration (`.npz` with `Nl` and `Nd`, upright).
 
-        `Nl` is the light response, used relative to its median; `Nd` the interval in the dark in arbitrary units, used as
-        its inverse with a median of 0.002 spikes a frame. Both are clipped at 0.1 and 99.9 %: a ratio of nearly nothing says
-        no more than "dead" or "hot".
+        `Nl` is the light response, used relative to its median; `Nd` the interval in the dark in arbitrary units, whose
+        inverse is used with a median of 0.002 spikes a frame. Both are clipped at 0.1 and 99.9 %: a ratio of nearly
+        nothing says no more than "dead" or "hot".
         """
         with np.load(path) as table:
             if not {"Nl", "Nd"} <= set(table.files):
@@ -140,8 +141,8 @@ def _clipped(values: NDArray[np.float32]) -> NDArray[np.float64]:
 
 @dataclass
 class SpikeSensor:
-    """A sensor at work: holds each pixel's charge from call to call. The same seed gives the same bits on every machine, at
-    any number of threads and however the frames are divided into calls."""
+    """A sensor at work: holds each pixel's charge from call to call. The same seed gives the same bits on every
+    machine, at any number of threads and in calls of any size."""
 
     sensor: Sensor
     seed: int = 0
@@ -173,7 +174,7 @@ class SpikeSensor:
         self._dark = np.ascontiguousarray(dark * alive, np.float32)
         self._threshold = np.maximum(capacitance * bias, 0.1).astype(np.float32)
         self._noise_factor = np.full(shape, 1 / noise.electrons_a_spike, np.float32)
-        # The charge still missing to the next spike: a pixel found at a random moment has received a uniform part of it.
+        # Found at a random moment, a pixel has received a uniform part of the charge of its next spike.
         self._missing = (self._threshold * rng.uniform(2**-20, 1, shape)).astype(np.float32)
         # A dead pixel receives nothing, and a missing charge above zero then never falls to zero.
         self._key = int(rng.integers(0, 2**63))

@@ -1,4 +1,4 @@
-"""Surfaces for the built-in room: painted from random numbers, with detail at every scale from the wall to the texel."""
+"""Surfaces for the built-in room, painted from random numbers with detail at every scale from wall to texel."""
 
 from collections.abc import Callable
 from enum import Enum, auto
@@ -29,7 +29,7 @@ def paint(
     texel: float,
     rng: np.random.Generator,
 ) -> Albedo:
-    """An albedo picture float32 [height, width, 3] in [0.02, 0.95]; `size` is (height, width), `texel` its edge in metres."""
+    """Albedo float32 [height, width, 3] in [0.02, 0.95]; `size` is (height, width), `texel` its edge in metres."""
     base = np.array(colour, np.float32)
     albedo = _PAINTERS[material](base, size, texel, rng)
     return np.clip(albedo, 0.02, 0.95).astype(np.float32)
@@ -106,7 +106,7 @@ def _rug(base: Albedo, size: tuple[int, int], texel: float, rng: np.random.Gener
 
 
 def _books(base: Albedo, size: tuple[int, int], texel: float, rng: np.random.Generator) -> Albedo:
-    """Shelves along the first axis of the picture, with the spines of books; each has its own tone, height and title."""
+    """Shelves along the first axis of the picture, with the spines of books, each of its own tone and height."""
     out = np.empty((*size, 3), np.float32)
     out[:] = 0.05
     shelf, board = max(round(0.33 / texel), 8), max(round(0.025 / texel), 1)
@@ -147,7 +147,7 @@ def _picture(base: Albedo, size: tuple[int, int], texel: float, rng: np.random.G
     frame = np.ones(size, bool)
     frame[edge:-edge, edge:-edge] = False
     art[frame] = base
-    return art * (1 + 0.12 * pink_noise(size, rng, 0.1 / texel, 0.9))[..., None]
+    return np.asarray(art * (1 + 0.12 * pink_noise(size, rng, 0.1 / texel, 0.9))[..., None], np.float32)
 
 
 def _soften(picture: Albedo) -> Albedo:

@@ -19,8 +19,8 @@ class View:
     intensity: NDArray[np.float32]
     """Upright [height, width, channels], linear, 1 is white; grey has one channel and colour three."""
     depth: NDArray[np.float32]
-    """Along the optical axis at each pixel's centre [height, width], in the scene's length unit; infinite where there is
-    nothing."""
+    """Along the optical axis at each pixel's centre [height, width], in the scene's length unit; infinite where there
+    is nothing."""
 
 
 class ViewableScene(Protocol):

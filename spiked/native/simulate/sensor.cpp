@@ -1,7 +1,7 @@
 #include "sensor.hpp"
 
+#include <algorithm>
 #include <cmath>
-#include <cstring>
 #include <vector>
 
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
@@ -43,7 +43,7 @@ inline float normal(uint32_t bits) {
 struct Row {
     const float *first, *last, *gain, *dark, *threshold, *noise_factor;
     float* missing;
-    uint8_t* fired;
+    int32_t* fired;
 };
 
 SPIKED_CLONES void expose_row(const Row& row, int width, float weight, float global_gain, float jitter, uint32_t key,
@@ -55,30 +55,29 @@ SPIKED_CLONES void expose_row(const Row& row, int width, float weight, float glo
     const float* __restrict threshold = row.threshold;
     const float* __restrict noise_factor = row.noise_factor;
     float* __restrict missing = row.missing;
-    uint8_t* __restrict fired = row.fired;
+    int32_t* __restrict fired = row.fired;
     for (int x = 0; x < width; ++x) {
         const uint32_t bits = mix((first_pixel + static_cast<uint32_t>(x)) * 0x9e3779b1U ^ key);
         const float light = first[x] + weight * (last[x] - first[x]);
         const float charge = global_gain * gain[x] * light + dark[x];
         const float noise = std::sqrt(std::fabs(charge) * noise_factor[x]) * normal(bits);
         const float left = missing[x] - (charge + noise);
-        const bool spike = left <= 0.0f;
         // Crossings beyond the first within one frame reset the pixel too, but the latch holds one bit: they are lost.
-        const float excess = spike ? -left : 0.0f;
+        const float excess = std::max(-left, 0.0f);
         const float lost = static_cast<float>(static_cast<int>(excess / threshold[x])) * threshold[x];
         const float next = threshold[x] * (1.0f + jitter * normal(mix(bits ^ key2))) - (excess - lost);
-        missing[x] = spike ? next : left;
-        fired[x] = spike ? 1 : 0;
+        // Arithmetic instead of a choice: GCC 12 turns the choice into a branch, which cannot be vectorised.
+        const int32_t spike = left <= 0.0f;
+        missing[x] = left + static_cast<float>(spike) * (next - left);
+        fired[x] = spike;
     }
 }
 
-void pack_row(const uint8_t* fired, int width, bool msb_first, uint8_t* out) {
+void pack_row(const int32_t* fired, int width, bool msb_first, uint8_t* out) {
     for (int b = 0; b < width / 8; ++b) {
-        uint64_t eight;
-        std::memcpy(&eight, fired + 8 * b, 8);
-        // The product gathers the low bit of each byte into the top byte, first pixel lowest or highest.
-        const uint64_t gather = msb_first ? 0x8040201008040201ULL : 0x0102040810204080ULL;
-        out[b] = static_cast<uint8_t>((eight * gather) >> 56);
+        int byte = 0;
+        for (int bit = 0; bit < 8; ++bit) byte |= fired[8 * b + bit] << (msb_first ? 7 - bit : bit);
+        out[b] = static_cast<uint8_t>(byte);
     }
 }
 
@@ -86,7 +85,7 @@ void pack_row(const uint8_t* fired, int width, bool msb_first, uint8_t* out) {
 
 void expose_rows(const Exposure& exposure, const PixelMaps& maps, const FrameFormat& format, float jitter,
                  uint64_t seed, float* missing, uint8_t* out, int row_begin, int row_end) {
-    std::vector<uint8_t> fired(static_cast<size_t>(format.width));
+    std::vector<int32_t> fired(static_cast<size_t>(format.width));
     const int64_t frame_bytes = static_cast<int64_t>(format.stride) * format.height;
     for (int y = row_begin; y < row_end; ++y) {
         const int64_t at = static_cast<int64_t>(y) * format.width;

@@ -1,0 +1,271 @@
+"""How good a trajectory and its pictures are against the truth: ATE, RPE, coverage, PSNR, SSIM.
+
+Trajectories are camera-to-world rotations [n, 3, 3] and centres [n, 3] of the same frames. An estimate's length unit
+and world frame are its own, so the truth is carried over by a similarity before anything is compared.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.errors import ConfigurationError
+from spiked.pose import exp_so3, log_so3
+from spiked.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+Render = Callable[[Array, Array], NDArray[np.float32]]
+"""A picture [H, W] or [H, W, 3] from a camera-to-world rotation [3, 3] and centre [3]."""
+
+RPE_FRAMES = 32
+"""Frames between the two poses of a relative pose error."""
+
+MATCH_FRAMES = 0.6
+"""A pose belongs to a frame if their times lie less than this many frames apart."""
+
+_UNIT_POSES = 24
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x -> scale * rotation @ x + translation."""
+
+    scale: float
+    rotation: Array  # [3, 3]
+    translation: Array  # [3]
+
+    def points(self, points: Array) -> Array:
+        """Carries points [..., 3] over."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def poses(self, rotations: Array, centres: Array) -> tuple[Array, Array]:
+        """Carries camera-to-world poses [..., 3, 3], [..., 3] over."""
+        return self.rotation @ rotations, self.points(centres)
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Errors of a trajectory after the best similarity; zero is perfect."""
+
+    ate_percent: float
+    """Root mean square distance of the centres, in % of the truth's RMS radius."""
+    ate_unit: float
+    """The same for 24 poses after both paths are centred and scaled to unit Frobenius norm (the convention of the
+    CF-3DGS and InstantSplat tables; a camera that never moves scores 0.204)."""
+    rpe_r_deg: float
+    """Mean angle between true and estimated turn over 32 frames, in degrees."""
+    rpe_t_percent: float
+    """Mean difference between true and estimated way over 32 frames, in % of the truth's RMS radius."""
+
+
+@dataclass(frozen=True)
+class TrajectoryScore:
+    """How much of the truth has a pose, and how good those poses are."""
+
+    coverage: float
+    """Share of the true frames that have an estimated pose."""
+    errors: PoseErrors | None
+    """None where fewer than 48 frames have a pose."""
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """Likeness of held-out views, values in [0, 1] after one gain for all."""
+
+    psnr_db: list[float]
+    ssim: list[float]
+    gain: float
+
+    @property
+    def mean_psnr_db(self) -> float:
+        """Mean over the views of their PSNR in dB."""
+        return float(np.mean(self.psnr_db))
+
+    @property
+    def mean_ssim(self) -> float:
+        """Mean over the views of their SSIM."""
+        return float(np.mean(self.ssim))
+
+
+def umeyama(source: Array, target: Array) -> Similarity:
+    """The similarity that carries points `source` [n, 3] onto `target` [n, 3] with the least squares.
+
+    Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991.
+    """
+    source_mean, target_mean = source.mean(0), target.mean(0)
+    a, b = source - source_mean, target - target_mean
+    u, singular, vt = np.linalg.svd(b.T @ a)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = (u * signs) @ vt
+    spread = float((a**2).sum())
+    scale = float((singular * signs).sum() / spread) if spread > 0 else 1.0
+    return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
+
+
+def similarity_of_poses(truth_rotations: Array, truth_centres: Array, rotations: Array, centres: Array) -> Similarity:
+    """The similarity from the truth's world to the estimate's, its rotation from the orientations.
+
+    Positions alone leave a turn about a straight path undetermined; orientations do not. The rotation is the chordal
+    mean of the frames' own, scale and translation are least squares.
+    """
+    u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", rotations, truth_rotations))
+    rotation = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    turned = truth_centres @ rotation.T
+    g, e = turned - turned.mean(0), centres - centres.mean(0)
+    spread = float((g**2).sum())
+    scale = float((g * e).sum() / spread) if spread > 0 else 1.0
+    return Similarity(scale, rotation, centres.mean(0) - scale * turned.mean(0))
+
+
+def pose_errors(truth_rotations: Array, truth_centres: Array, rotations: Array, centres: Array) -> PoseErrors:
+    """Errors of an estimate [n] against the truth [n], n >= 2. Raises ConfigurationError for shapes that do not fit."""
+    n = len(truth_centres)
+    if n < 2 or any(len(array) != n for array in (truth_rotations, rotations, centres)):
+        raise ConfigurationError(
+            f"pose errors need the same two or more frames on both sides, got {n} and {len(centres)}"
+        )
+    radius = float(np.sqrt(((truth_centres - truth_centres.mean(0)) ** 2).sum(1).mean()))
+    if radius == 0:
+        raise ConfigurationError("the true camera never moves, so errors relative to the size of its path mean nothing")
+    fit = umeyama(centres, truth_centres)
+    ate = _rms(fit.points(centres) - truth_centres)
+    apart = min(RPE_FRAMES, n - 1)
+    turn, way = _relative(truth_rotations, truth_centres, apart)
+    turn_est, way_est = _relative(rotations, fit.scale * centres, apart)
+    angles = np.linalg.norm(log_so3(turn.swapaxes(-1, -2) @ turn_est), axis=1)
+    return PoseErrors(
+        ate_percent=100 * ate / radius,
+        ate_unit=_ate_unit(truth_centres, centres),
+        rpe_r_deg=float(np.degrees(angles).mean()),
+        rpe_t_percent=float(100 * np.linalg.norm(way_est - way, axis=1).mean() / radius),
+    )
+
+
+def score_trajectory(truth: Trajectory, estimate: Trajectory, frame_rate_hz: float) -> TrajectoryScore:
+    """Match an estimate to the truth by time stamp and score it."""
+    j = estimate.nearest(truth.times_s, MATCH_FRAMES / frame_rate_hz)
+    found = j >= 0
+    coverage = float(found.mean())
+    if found.sum() < 48:
+        return TrajectoryScore(coverage, None)
+    rows = j[found]
+    errors = pose_errors(truth.rotations[found], truth.centres[found], estimate.rotations[rows], estimate.centres[rows])
+    return TrajectoryScore(coverage, errors)
+
+
+def similarity_of_trajectories(truth: Trajectory, estimate: Trajectory, frame_rate_hz: float) -> Similarity:
+    """`similarity_of_poses` of the frames that both have.
+
+    Raises ConfigurationError where they have fewer than two frames in common.
+    """
+    j = estimate.nearest(truth.times_s, MATCH_FRAMES / frame_rate_hz)
+    found = j >= 0
+    if found.sum() < 2:
+        raise ConfigurationError("estimate and truth have fewer than two frames in common; do their time stamps agree?")
+    rows = j[found]
+    return similarity_of_poses(
+        truth.rotations[found], truth.centres[found], estimate.rotations[rows], estimate.centres[rows]
+    )
+
+
+def psnr(image: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
+    """Peak signal-to-noise ratio in dB of values in [0, 1]; equal images give 120."""
+    error = np.asarray(image, np.float64) - np.asarray(truth, np.float64)
+    return float(10 * np.log10(1 / max(float((error**2).mean()), 1e-12)))
+
+
+def ssim(image: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
+    """Mean structural similarity of values in [0, 1], Gaussian window of sigma 1.5 px over 11 x 11 (Wang et al.
+    2004)."""
+    a, b = np.asarray(image, np.float64), np.asarray(truth, np.float64)
+
+    def blur(x: Array) -> Array:
+        return np.asarray(cv2.GaussianBlur(x, (11, 11), 1.5, borderType=cv2.BORDER_REFLECT), np.float64)
+
+    mean_a, mean_b = blur(a), blur(b)
+    var_a, var_b, cov = blur(a * a) - mean_a**2, blur(b * b) - mean_b**2, blur(a * b) - mean_a * mean_b
+    c1, c2 = 0.01**2, 0.03**2
+    likeness = (2 * mean_a * mean_b + c1) * (2 * cov + c2) / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
+    return float(likeness.mean())
+
+
+def best_gain(images: Sequence[NDArray[np.floating]], truths: Sequence[NDArray[np.floating]]) -> float:
+    """The one factor for all images that brings them nearest to the truths by least squares."""
+    pairs = [(np.asarray(i, np.float64), np.asarray(t, np.float64)) for i, t in zip(images, truths, strict=True)]
+    return float(sum((i * t).sum() for i, t in pairs) / max(float(sum((i * i).sum() for i, _ in pairs)), 1e-12))
+
+
+def refine_pose(
+    render: Render, pose: tuple[Array, Array], truth: NDArray[np.float32], gain: float, *, length: float, steps: int = 8
+) -> tuple[Array, Array]:
+    """The pose whose picture is nearest to `truth`, the scene frozen: robust Gauss-Newton with a numeric Jacobian.
+
+    pose: rotation [3, 3] and centre [3] to start from; length: a typical depth in the scene's unit, which sets the
+    steps.
+    """
+    best, least = pose, np.inf
+    small = np.array([1e-3] * 3 + [1e-3 * length] * 3)
+    for _ in range(steps):
+        residual = (gain * render(*pose) - truth).ravel().astype(np.float64)
+        cost = float(residual @ residual)
+        if cost >= 0.999 * least:
+            return pose if cost < least else best
+        best, least = pose, cost
+        moved = (gain * render(*_moved(pose, step)) for step in np.diag(small))
+        jacobian = np.stack([((m - truth).ravel() - residual) for m in moved], 1) / small
+        weights = 1 / (1 + (residual / 0.1) ** 2)
+        normal = jacobian.T @ (jacobian * weights[:, None])
+        damped = normal + 1e-6 * np.diag(np.diag(normal)) + 1e-12 * np.eye(6)
+        pose = _moved(pose, -np.linalg.solve(damped, jacobian.T @ (weights * residual)))
+    return best
+
+
+def score_views(
+    render: Render,
+    poses: Sequence[tuple[Array, Array]],
+    truths: Sequence[NDArray[np.float32]],
+    length: float,
+    refine: bool = True,
+) -> ViewScore:
+    """Score renders of held-out poses, already carried into the scene's frame, against pictures in [0, 1].
+
+    With `refine`, each pose is first refined on its picture, so that the score is the scene's and not the similarity's.
+    """
+    at = list(poses)
+    gain = best_gain([render(*pose) for pose in at], truths)
+    if refine:
+        at = [refine_pose(render, pose, truth, gain, length=length) for pose, truth in zip(at, truths, strict=True)]
+    images = [render(*pose) for pose in at]
+    gain = best_gain(images, truths)
+    shown = [np.clip(gain * image, 0, 1) for image in images]
+    pairs = list(zip(shown, truths, strict=True))
+    return ViewScore([psnr(i, t) for i, t in pairs], [ssim(i, t) for i, t in pairs], gain)
+
+
+def _rms(differences: Array) -> float:
+    return float(np.sqrt((differences**2).sum(1).mean()))
+
+
+def _relative(rotations: Array, centres: Array, apart: int) -> tuple[Array, Array]:
+    """Turn [m, 3, 3] and way [m, 3] from each pose to the one `apart` later, in the earlier camera's axes."""
+    back = rotations[:-apart].swapaxes(-1, -2)
+    return back @ rotations[apart:], np.einsum("nij,nj->ni", back, centres[apart:] - centres[:-apart])
+
+
+def _ate_unit(truth_centres: Array, centres: Array) -> float:
+    rows = np.linspace(0, len(centres) - 1, _UNIT_POSES).round().astype(int)
+
+    def unit(x: Array) -> Array:
+        centred = x - x.mean(0)
+        return np.asarray(centred / max(float(np.linalg.norm(centred)), 1e-12))
+
+    a, b = unit(centres[rows]), unit(truth_centres[rows])
+    return _rms(umeyama(a, b).points(a) - b)
+
+
+def _moved(pose: tuple[Array, Array], step: Array) -> tuple[Array, Array]:
+    """Turned by step[:3] and shifted by step[3:], both in the camera's own axes."""
+    rotation, centre = pose
+    return rotation @ exp_so3(step[:3]), centre + rotation @ step[3:]

@@ -278,6 +278,14 @@ def test_status_is_visible_from_outside_and_outlives_the_name() -> None:
     assert after.writer.end is EndReason.STOPPED
 
 
+def test_texts_too_long_for_shared_memory_are_cut_between_characters(writer: RingWriter) -> None:
+    writer.publish_condition(Condition(DeviceState.LOST, "x" + "é" * 200))
+    with RingReader.attach(writer.name, Policy.LATEST, "x" + "é" * 40):
+        status = writer.status()
+    assert status.writer.condition.reason == "x" + "é" * 95
+    assert status.readers[0].consumer == "x" + "é" * 23
+
+
 def test_the_name_is_gone_after_closing_and_readers_read_on() -> None:
     with RingWriter.create(SENSOR, slots=8) as writer:
         reader = attach(writer)

@@ -144,6 +144,10 @@ def test_stalling_readers_of_an_impatient_writer_account_for_every_frame(seed: i
         name = start("write", seed, 1000, 3, 0).line()
         readers = [start("read", name, policy, seed, stalls) for policy in Policy]
         ring = Ring.attach(name)
+        while any(reader.process.poll() is None for reader in readers):
+            told = ring.status()
+            assert told.writer.committed + sum(told.writer.lost.values()) == told.writer.next_frame
+            assert all(row.received + row.lost == row.next_frame for row in told.readers)
         accounts = [reader.account() for reader in readers]
         assert {account["frames"] for account in accounts} == {ring.status().writer.next_frame}
 

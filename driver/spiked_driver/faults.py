@@ -64,7 +64,7 @@ class FaultySource:
 
     def __init__(self, inner: Source, faults: Faults) -> None:
         self.inner = inner
-        self._faults = faults
+        self.faults = faults
         self._losses: deque[Loss] = deque()
         self._stalls: deque[Stall] = deque()
         self._told: deque[Gap | End] = deque()
@@ -122,9 +122,9 @@ class FaultySource:
     def _restart(self) -> None:
         self._next = 0
         self._lost_first = 0
-        self._losses = deque(sorted(self._faults.losses, key=lambda loss: loss.first))
-        self._stalls = deque(sorted(self._faults.stalls, key=lambda stall: stall.frame))
-        self._random = np.random.default_rng(self._faults.seed)
+        self._losses = deque(sorted(self.faults.losses, key=lambda loss: loss.first))
+        self._stalls = deque(sorted(self.faults.stalls, key=lambda stall: stall.frame))
+        self._random = np.random.default_rng(self.faults.seed)
         self._next_drop = self._draw_drop()
         self._loss = None
         self._told.clear()
@@ -132,9 +132,9 @@ class FaultySource:
 
     def _draw_drop(self) -> int | None:
         """Where the next random loss begins: after a geometric number of frames whose mean gives the fraction."""
-        if not self._faults.drop:
+        if not self.faults.drop:
             return None
-        chance = self._faults.drop / (self._faults.drop_run * (1 - self._faults.drop) + self._faults.drop)
+        chance = self.faults.drop / (self.faults.drop_run * (1 - self.faults.drop) + self.faults.drop)
         return self._next + int(self._random.geometric(chance)) - 1
 
     def _loss_at(self, frame: int) -> Loss | None:
@@ -143,7 +143,7 @@ class FaultySource:
         if self._losses and self._losses[0].first <= frame:
             loss = self._losses.popleft()
         elif self._next_drop is not None and self._next_drop <= frame:
-            loss = Loss(frame, self._faults.drop_run)
+            loss = Loss(frame, self.faults.drop_run)
         else:
             return None
         self._lost_first = frame

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.native._ring import NAME_BYTES, READER_PLACES, Control, Entry, ReaderCounters, ReaderPlace, WriterCounters
+from spiked.native._ring import READER_PLACES, Control, Entry, ReaderCounters, ReaderPlace, WriterCounters
 from spiked.ring.items import Cause, End, EndReason, Gap, Policy, RingError, decode, encode
 from spiked.ring.process import is_alive, own_identity
 from spiked.ring.segment import Geometry, Segment, attach_segment
@@ -235,8 +235,7 @@ class RingReader:
             if (owner and is_alive(owner)) or not place.claim(owner, self._owner):
                 continue
             place.publish(self._counters)
-            name = consumer.encode()[:NAME_BYTES]
-            place.describe(encode(self._policy), self._lease_slots, name.decode(errors="ignore"))
+            place.describe(encode(self._policy), self._lease_slots, consumer)
             self._control.progress.ring()
             return place
         raise RingError(f"ring {self._segment.name} has {READER_PLACES} readers, no more fit: end one of them")

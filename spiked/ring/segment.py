@@ -130,13 +130,11 @@ def clean_stale() -> list[str]:
     """Unlink the rings whose creator is dead, and return their names. Rings of other users are left to them."""
     removed = []
     for path in sorted(FOLDER.glob(PREFIX + "*")):
-        if not os.access(path, os.R_OK):
-            continue
         try:
             with _opened(path) as file:
                 owner, _ = _read_header(file, path.name)
         except RingError:
-            continue  # it vanished meanwhile, or somebody else's file only looks like a ring by its name
+            continue  # vanished meanwhile, of another user, or only named like a ring
         if not is_alive(owner):
             path.unlink(missing_ok=True)
             removed.append(path.name)

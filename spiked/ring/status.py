@@ -105,7 +105,7 @@ def read_places(segment: Segment) -> Iterator[ReaderPlace]:
         policy, lease_slots, consumer = place.label()
         counters = place.counters()
         if place.owner() == owner:
-            text = consumer.decode(errors="replace")
+            text = consumer.decode(errors="ignore")
             yield ReaderPlace(owner, text, decode(Policy, policy), lease_slots, counters)
 
 
@@ -117,7 +117,7 @@ def read_status(segment: Segment) -> RingStatus:
     writer = WriterStatus(
         pid_of(segment.owner),
         is_alive(segment.owner),
-        Condition(decode(DeviceState, code), reason.decode(errors="replace")),
+        Condition(decode(DeviceState, code), reason.decode(errors="ignore")),
         counters.committed,
         {cause: counters.lost[encode(cause) - 1] for cause in Cause},
         counters.next_frame,

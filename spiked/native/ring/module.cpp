@@ -77,8 +77,6 @@ class Control {
 
 NB_MODULE(_ring, m) {
     m.attr("READER_PLACES") = reader_places;
-    m.attr("REASON_BYTES") = sizeof(Condition::reason);
-    m.attr("NAME_BYTES") = sizeof(ReaderLabel::name);
 
     nb::class_<Entry>(m, "Entry")
         .def(

@@ -1,0 +1,153 @@
+"""Recordings played as a camera, and sources named by a line of text."""
+
+import json
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from spiked.recording import open_recording
+from spiked_driver import Chunk, Faults, FaultySource, Loss, Source, Stall, acquire
+from spiked_driver.replay import ReplaySource
+from spiked_driver.simulated import SimulatedSource
+from spiked_driver.spec import open_source
+
+from spiked.errors import SourceError, SpikedError
+from spiked.ring import Cause, DeviceState, End, EndReason, Frames, Policy, RingReader, RingWriter
+
+SHARED = Path(__file__).resolve().parents[2].parent / "shared"
+FRAMES = 50
+FRAME_BYTES = 64 * 48 // 8
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """50 frames of random bits at 1 kHz with their sidecar."""
+    path = tmp_path / "clip.dat"
+    bits().tofile(path)
+    sidecar = {
+        "format": "compact",
+        "width": 64,
+        "height": 48,
+        "frame_rate": 1000,
+        "frames": FRAMES,
+        "bit_order": "lsb",
+        "flipped": True,
+        "cfa": None,
+    }
+    path.with_suffix(".json").write_text(json.dumps(sidecar))
+    return path
+
+
+def bits() -> np.ndarray:
+    return np.random.default_rng(1).integers(0, 256, (FRAMES, FRAME_BYTES), np.uint8)
+
+
+def play(source: Source, block: int = 8) -> np.ndarray:
+    """Everything the source delivers, uint8 [frames, frame_bytes]; checks that the indices run on."""
+    source.open()
+    chunks: list[np.ndarray] = []
+    expected = 0
+    view = np.zeros((block, source.sensor.frame_bytes), np.uint8)
+    while not isinstance(item := source.read_into(view), End):
+        if isinstance(item, Chunk):
+            assert item.first == expected
+            chunks.append(view[: item.frames].copy())
+            expected += item.frames
+    assert item == End(expected, EndReason.FINISHED)
+    source.close()
+    return np.concatenate(chunks)
+
+
+def test_a_replay_delivers_the_recording(recording: Path) -> None:
+    source = ReplaySource(open_recording(recording), pace=0)
+    assert source.waits
+    assert source.frames == FRAMES
+    np.testing.assert_array_equal(play(source), bits())
+
+
+def test_ranges_and_repeats_run_on_without_renumbering(recording: Path) -> None:
+    source = open_source(f"replay:{recording}?pace=max&range=10:30&repeat=3")
+    assert source.frames == 60
+    np.testing.assert_array_equal(play(source), np.tile(bits()[10:30], (3, 1)))
+
+
+def test_a_source_can_be_opened_again(recording: Path) -> None:
+    source = open_source(f"replay:{recording}?pace=0&range=:20")
+    np.testing.assert_array_equal(play(source), play(source))
+    assert source.condition.state is DeviceState.IDLE
+
+
+def test_a_paced_replay_does_not_wait_for_readers(recording: Path) -> None:
+    source = open_source(f"replay:{recording}?pace=20")
+    assert not source.waits
+    np.testing.assert_array_equal(play(source), bits())
+
+
+def test_faults_are_options_of_every_source(recording: Path) -> None:
+    line = "pace=0&drop=0.1&drop_run=2&fault_seed=4&gap=5:3&gap=10:2:disk&unplug=20:5&stall=30:0.5"
+    losses = (Loss(5, 3), Loss(10, 2, Cause.DISK), Loss(20, 5, Cause.DEVICE, unplugged=True))
+    expected = Faults(losses, (Stall(30, 0.5),), drop=0.1, drop_run=2, seed=4)
+    for spec, kind in ((f"replay:{recording}?{line}", ReplaySource), (f"sim:?{line}", SimulatedSource)):
+        source = open_source(spec)
+        assert isinstance(source, FaultySource)
+        assert isinstance(source.inner, kind)
+        assert source.faults == expected
+
+
+def test_a_simulation_is_described_by_its_options() -> None:
+    source = open_source("sim:?seed=4&seconds=0.01&width=64&height=48&rate=10000&pace=0&motion=arc")
+    assert (source.sensor.width, source.sensor.height, source.sensor.frame_rate_hz) == (64, 48, 10_000)
+    assert source.sensor.intrinsics is not None
+    assert source.frames == 100
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("camera", "names no kind"),
+        ("usb9:", "no kind 'usb9'"),
+        ("sim:room.ply", "options only"),
+        ("sim:?sead=1", "no option sead.*seed"),
+        ("sim:?width=wide", "width=wide"),
+        ("sim:?seed=1&seed=2", "seed"),
+        ("sim:?drop=1", "drop=1"),
+        ("sim:?gap=5", "gap=5"),
+        ("sim:?gap=5:3&gap=6:1", "overlap"),
+        ("sim:?gap=5:0", "at least one frame"),
+        ("sim:?pace=-1", "pace=-1"),
+        ("replay:{}?range=40:60", "range 40:60"),
+        ("replay:{}?range=7", "range=7"),
+        ("replay:{}?repeat=0", "repeat=0"),
+        ("replay:{}.missing", "missing"),
+    ],
+)
+def test_a_wrong_line_is_refused_in_one_line_that_says_what(recording: Path, spec: str, message: str) -> None:
+    with pytest.raises(SpikedError, match=message) as caught:
+        open_source(spec.format(recording))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_real_stream_goes_through_the_ring_unchanged() -> None:
+    path = SHARED / "streams/living/living.dat"
+    if not path.exists():
+        pytest.skip(f"{path} is not on this machine")
+    expected = np.fromfile(path, np.uint8).reshape(-1, 12_500)
+    source = open_source(f"replay:{path}?pace=0&range=100:500")
+    with RingWriter.create(source.sensor, slots=16) as writer:
+        reader = RingReader.attach(writer.name, Policy.LOSSLESS, "test")
+        assert reader.geometry.sensor.intrinsics is not None
+        thread = threading.Thread(target=acquire, args=(source, writer, threading.Event()))
+        thread.start()
+        received = []
+        while not isinstance(item := reader.next(10.0), End):
+            assert isinstance(item, Frames)
+            received.append(item.data.copy())
+            assert item.release()
+        thread.join()
+    np.testing.assert_array_equal(np.concatenate(received), expected[100:500])
+
+
+def test_a_range_outside_the_recording_is_refused(recording: Path) -> None:
+    with pytest.raises(SourceError, match="50 frames"):
+        ReplaySource(open_recording(recording), first=10, stop=10)

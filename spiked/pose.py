@@ -110,3 +110,9 @@ def rotation_of(wxyz: ArrayLike) -> Array:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def mean_rotation(rotations: Array) -> Array:
+    """The chordal mean of rotations: [n, 3, 3] -> [3, 3]."""
+    u, _, vt = np.linalg.svd(rotations.sum(0))
+    return np.asarray(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt)

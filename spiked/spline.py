@@ -31,13 +31,22 @@ class Spline:
     degree: int = 3
 
     @classmethod
-    def fit(cls, times: ArrayLike, rotations: Array, centres: Array, spacing: float, degree: int = 3) -> "Spline":
-        """A spline through poses at increasing `times` [m] (frames), knots every `spacing` frames; before and after
-        the given times it continues at constant velocity. Least squares for centres; rotations start interpolated."""
+    def fit(
+        cls,
+        times: ArrayLike,
+        rotations: Array,
+        centres: Array,
+        spacing: float,
+        degree: int = 3,
+        span: tuple[float, float] | None = None,
+    ) -> "Spline":
+        """A spline through poses at increasing `times` [m] (frames), knots every `spacing` frames, defined over `span`
+        (default: the given times); where no pose is near it continues at constant velocity. Least squares."""
         t = np.asarray(times, float)
+        low, high = (t[0], t[-1]) if span is None else (min(span[0], t[0]), max(span[1], t[-1]))
         pad = (degree - 1) / 2
-        count = int(np.ceil(max(t[-1] - t[0], 1e-6) / spacing)) + degree + 1
-        first = t[0] - pad * spacing - 1e-6
+        count = int(np.ceil(max(high - low, 1e-6) / spacing)) + degree + 1
+        first = low - pad * spacing - 1e-6
         knots = first + spacing * np.arange(count)
         spline = cls(first, spacing, interpolate_rotations(t, rotations, knots), np.zeros((count, 3)), degree)
         basis = spline.basis_matrix(t)

@@ -1,0 +1,7 @@
+"""Spikes to trajectory and scene: views, sparse odometry, depth, mapping and refinement behind one `Reconstructor`."""
+
+from spiked.recon.odometry import State
+from spiked.recon.options import MapOptions, Options
+from spiked.recon.reconstructor import Reconstructor, Sample, Status
+
+__all__ = ["MapOptions", "Options", "Reconstructor", "Sample", "State", "Status"]

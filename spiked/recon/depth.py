@@ -67,7 +67,9 @@ def sweep(
             difference = np.abs(warped - reference.image) * weight
             total += np.where(np.isfinite(warped), np.minimum(difference, 4.0), 2.0)
         total /= len(others)
-        cost[p] = cv2.boxFilter(total, -1, (3, 3)) + cv2.boxFilter(total, -1, (9, 9)) + cv2.boxFilter(total, -1, (21, 21))
+        cost[p] = (
+            cv2.boxFilter(total, -1, (3, 3)) + cv2.boxFilter(total, -1, (9, 9)) + cv2.boxFilter(total, -1, (21, 21))
+        )
     return _winner(cost, inverse)
 
 

@@ -9,10 +9,10 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.pose import Array, exp_so3, hat, log_so3
+from spiked.pose import Array, exp_so3, hat, log_so3, mean_rotation
 from spiked.recon.bootstrap import INLIER_PX, SCALE_PX, Views, bootstrap
 from spiked.recon.bundle import Bundle
-from spiked.recon.tracks import Picture, Tracks
+from spiked.recon.tracks import Picture, Tracks, search
 from spiked.sensor import Intrinsics
 from spiked.spline import Spline
 
@@ -32,6 +32,8 @@ class Posed:
     """One view as the tracker sees it; rotation and centre are None until they are known."""
 
     time: float
+    length: int
+    """Frames of the window."""
     ids: NDArray[np.int64]
     pixels: Array
     motion_px: float
@@ -53,8 +55,12 @@ class Fit:
 
 BOOT_VIEWS = 10
 MIN_POINTS = 15
+KEY_EVERY = 8
+"""Every eighth posed view is kept for relocalisation."""
 GLOBAL_VIEWS = 100
 """At most so many views enter the adjustment of the whole path."""
+KNOT_SPACINGS = (128, 64, 32, 16, 8)
+"""Frames between knots, tried from the coarsest."""
 KNOT_ERROR_PX = 0.12
 """A spline that departs from the free poses by less than this is fine enough."""
 
@@ -64,7 +70,6 @@ class Odometry:
     """Feed views in order with `add`; `spline` is the path so far (None before the bootstrap), in frames."""
 
     intrinsics: Intrinsics
-    hop: int
     seed: int = 0
     state: State = State.BOOT
     reason: str = "waiting for the first frames"
@@ -80,18 +85,26 @@ class Odometry:
         self._boot_start = 0
         self._boot_parallax = 3.0
         self._next_global = 0
+        self._keys: dict[int, Picture] = {}
 
-    def add(self, time: float, picture: Picture) -> Posed:
-        """Track one view and pose it if possible."""
+    def add(self, time: float, length: int, picture: Picture, known: tuple[Array, Array] | None = None) -> Posed:
+        """Track one view of `length` frames around `time` and pose it if possible; `known` gives its pose."""
         motion = self._tracks.add(len(self.views), picture)
-        posed = Posed(time, self._tracks.ids.copy(), self._tracks.at.copy(), motion, self.state)
+        posed = Posed(time, length, self._tracks.ids.copy(), self._tracks.at.copy(), motion, self.state)
         self.views.append(posed)
         missing = self._tracks.next_id - len(self.points)
         self.points = np.concatenate([self.points, np.full((missing, 3), np.nan)])
-        if self.state is State.BOOT:
+        if known is not None:
+            posed.rotation, posed.centre = known
+            if len(self.views) % 8 == 0:
+                self._triangulate(range(max(0, len(self.views) - 48), len(self.views)))
+            self._become(State.TRACK, "poses are given")
+        elif self.state is State.BOOT:
             self._try_bootstrap()
         else:
-            self._pose_newest()
+            self._pose_newest(picture)
+        if posed.rotation is not None and (len(self.views) - 1) % KEY_EVERY == 0:
+            self._keys[len(self.views) - 1] = picture
         posed.state = self.state
         return posed
 
@@ -151,15 +164,18 @@ class Odometry:
     def _accept(self, view: Posed, fit: Fit) -> None:
         view.rotation, view.centre, view.inliers = fit.rotation, fit.centre, fit.inliers
 
-    def _pose_newest(self) -> None:
+    def _pose_newest(self, picture: Picture) -> None:
         view = self.views[-1]
         known = [v for v in self.views[-40:-1] if v.rotation is not None]
         if not known:
             known = [v for v in self.views if v.rotation is not None][-2:]
         fit = self._fit(view, *predict(known[-2:], view.time))
         if fit.points < MIN_POINTS or fit.inliers < 0.35:
-            self._become(State.LOST, f"{fit.points} known points in view, {fit.inliers:.0%} agree with one pose")
-            return
+            found = self._relocalise(picture)
+            if found is None:
+                self._become(State.LOST, f"{fit.points} known points in view, {fit.inliers:.0%} agree with one pose")
+                return
+            fit = found
         self._accept(view, fit)
         if fit.inliers < 0.6 or fit.points < 2 * MIN_POINTS:
             self._become(State.DEGRADED, f"{fit.points} known points in view, {fit.inliers:.0%} agree with one pose")
@@ -205,6 +221,27 @@ class Odometry:
             rotation, centre = exp_so3(step[:3]) @ rotation, centre + step[3:]
         inliers = float(np.mean(np.linalg.norm(error, axis=1) < 1.5 * INLIER_PX))
         return Fit(rotation, centre, inliers, len(points))
+
+    def _relocalise(self, picture: Picture) -> Fit | None:
+        """Find known points of earlier key views in this one; on success they become tracks again."""
+        view = self.views[-1]
+        numbers = sorted(self._keys)
+        tried = numbers[-3:] + numbers[:-3][:: max(1, len(numbers) // 12)]
+        for number in reversed(tried):
+            key, ids, pixels = self._known(number)
+            if len(ids) < MIN_POINTS or key.rotation is None or key.centre is None:
+                continue
+            at, good = search(self._keys[number], picture, pixels)
+            if good.sum() < MIN_POINTS:
+                continue
+            view.ids, view.pixels = ids[good], at[good]
+            fit = self._fit(view, key.rotation, key.centre)
+            if fit.inliers > 0.6 and fit.points >= MIN_POINTS:
+                self._tracks.resume(len(self.views) - 1, view.ids, view.pixels)
+                self._become(State.RELOC, f"found again by {fit.points} points of an earlier view")
+                return fit
+        view.ids, view.pixels = self._tracks.ids.copy(), self._tracks.at.copy()
+        return None
 
     def _triangulate(self, span: range) -> None:
         """Positions for tracks that have none, from the posed views of `span`."""
@@ -311,6 +348,10 @@ class Odometry:
         )
         self.points[ids] = np.where(bad[:, None], np.nan, bundle.points)
 
+    def triangulate_all(self) -> None:
+        """Positions for all tracks, for paths that are known from elsewhere."""
+        self._triangulate(range(len(self.views)))
+
     def settle(self) -> None:
         """Adjust the whole path: freely first, then on the coarsest spline that follows it."""
         posed = [n for n, v in enumerate(self.views) if v.rotation is not None]
@@ -326,7 +367,8 @@ class Odometry:
         bundle.optimise(8, SCALE_PX, tolerance=1e-3)
         times = np.array([self.views[n].time for n in numbers])
         start = self._coarsest(times, bundle)
-        self.spline, _ = bundle.optimise_spline(start, times, 8, SCALE_PX / 2, tolerance=1e-3)
+        spline, _ = bundle.optimise_spline(start, times, 8, SCALE_PX / 2, tolerance=1e-3)
+        self.spline = self._in_old_frame(spline, bundle, numbers)
         self._take(bundle, ids, numbers)
         others = [n for n in posed if n not in set(numbers)]
         if others:
@@ -335,11 +377,30 @@ class Odometry:
                 self.views[n].rotation, self.views[n].centre = rotation, centre
         self._triangulate(range(max(0, len(self.views) - 200), len(self.views)))
 
+    def _in_old_frame(self, spline: Spline, bundle: Bundle, numbers: list[int]) -> Spline:
+        """The adjusted path and points, carried by a similarity to where they were, so that a map stays valid."""
+        views = [self.views[n] for n in numbers]
+        old_centres = np.stack([v.centre for v in views if v.centre is not None])
+        old_rotations = np.stack([v.rotation for v in views if v.rotation is not None])
+        rotation = mean_rotation(old_rotations @ bundle.rotations.swapaxes(1, 2))
+        a, b = bundle.centres @ rotation.T, old_centres
+        middle_a, middle_b = a.mean(0), b.mean(0)
+        scale = ((a - middle_a) * (b - middle_b)).sum() / max(((a - middle_a) ** 2).sum(), 1e-12)
+
+        def carry(points: Array) -> Array:
+            return np.asarray(scale * (points @ rotation.T - middle_a) + middle_b)
+
+        bundle.points, bundle.centres = carry(bundle.points), carry(bundle.centres)
+        bundle.rotations = rotation @ bundle.rotations
+        return Spline(spline.first, spline.spacing, rotation @ spline.rotations, carry(spline.centres), spline.degree)
+
     def _coarsest(self, times: Array, bundle: Bundle) -> Spline:
         depth = _median_depth(bundle)
         spline = None
-        for spacing in (8, 4, 2, 1):
-            spline = Spline.fit(times, bundle.rotations, bundle.centres, spacing * self.hop)
+        margin = 0.5 * max(v.length for v in self.views)
+        span = (self.views[0].time - margin, self.views[-1].time + margin)
+        for spacing in KNOT_SPACINGS:
+            spline = Spline.fit(times, bundle.rotations, bundle.centres, spacing, span=span)
             rotations, centres = spline.poses(times)
             turned = np.linalg.norm(log_so3(rotations @ bundle.rotations.swapaxes(1, 2)), axis=1)
             moved = np.linalg.norm(centres - bundle.centres, axis=1) / depth

@@ -22,7 +22,7 @@ def picture(rate: NDArray[np.float32], white: float) -> Picture:
 
 @dataclass
 class Tracks:
-    """Positions of tracks over the windows seen so far; `observations` lists (track, window, u, v)."""
+    """The live tracks: `ids` [live] and where they are in the newest window."""
 
     target: int = 400
     """How many live tracks are kept."""
@@ -36,8 +36,6 @@ class Tracks:
     birthplace: Array = field(default_factory=lambda: np.zeros((0, 2)))
     pictures: dict[int, Picture] = field(default_factory=dict)
     newest: int = -1
-    log: list[tuple[NDArray[np.int64], int, Array]] = field(default_factory=list)
-    """(ids, window, positions) of each window."""
 
     def add(self, window: int, image: Picture) -> float:
         """Follow all tracks into a window and start new ones; returns the median motion in px (0 without tracks)."""
@@ -48,10 +46,18 @@ class Tracks:
         self.pictures[window] = image
         if len(self.ids) < 0.7 * self.target:
             self._start(window, image)
-        self.log.append((self.ids.copy(), window, self.at.copy()))
         for old in set(self.pictures) - set(self.born.tolist()) - {window}:
             del self.pictures[old]
         return motion
+
+    def resume(self, window: int, ids: NDArray[np.int64], at: Array) -> None:
+        """Continue tracks that were found again in the newest window."""
+        fresh = ~np.isin(self.ids, ids)
+        count = len(ids)
+        self.ids = np.concatenate([ids, self.ids[fresh]])
+        self.at = np.concatenate([at, self.at[fresh]])
+        self.born = np.concatenate([np.full(count, window), self.born[fresh]])
+        self.birthplace = np.concatenate([at, self.birthplace[fresh]])
 
     def _follow(self, image: Picture) -> float:
         before = self.pictures[self.newest]
@@ -105,3 +111,17 @@ def _flow(
     back, ok2, _ = cv2.calcOpticalFlowPyrLK(b, a, forth, p.copy(), **options)
     close = np.linalg.norm(back[:, 0] - p[:, 0], axis=1) < reach_px
     return forth[:, 0].astype(float) + 0.5, (ok[:, 0] == 1) & (ok2[:, 0] == 1) & close
+
+
+def search(a: Picture, b: Picture, points: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Where `points` [n, 2] of picture `a` are in `b`, possibly far away: a shift from phase correlation of thumbnails
+    (Hann window), then the flow from there; and which of them came back."""
+    small = [cv2.resize(p, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(np.float32) for p in (a, b)]
+    shift, _ = cv2.phaseCorrelate(small[0], small[1], cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F))
+    best = points, np.zeros(len(points), bool)
+    for guess in (4.0 * np.array(shift), np.zeros(2)):
+        at, good = _flow(a, b, points, points + guess, 0.6, levels=4)
+        good &= (at > 4).all(1) & (at < np.array(b.shape[::-1]) - 4).all(1)
+        if good.sum() > best[1].sum():
+            best = at, good
+    return best

@@ -1,0 +1,150 @@
+"""The map: Gaussians fitted to views by gradient descent, added where the map is empty or wrong, moved where they are dead."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.pose import Array
+from spiked.recon.depth import Sweep
+from spiked.recon.options import MapOptions
+from spiked.recon.views import Image, View
+from spiked.recon.adam import Adam
+from spiked.render import Camera, Gradients, Rasteriser
+from spiked.scene import Scene
+from spiked.sensor import Sensor
+
+Rows = NDArray[np.int64]
+
+
+class Mapper:
+    """Holds the scene and improves it, a view at a time."""
+
+    def __init__(
+        self, sensor: Sensor, camera: Camera, options: MapOptions, seed: int, threads: int | None = None
+    ) -> None:
+        self.options = options
+        self.camera = camera
+        self.colours = 1 if sensor.mosaic is None else 3
+        self.channels = None if sensor.mosaic is None else sensor.mosaic.channels(sensor.height, sensor.width)
+        self.scene = Scene.empty(self.colours)
+        self.white = 1.0
+        self.rasteriser = Rasteriser(camera, threads)
+        self.adam = Adam(self.scene.arrays())
+        self.steps = 0
+        self._rng = np.random.default_rng(seed)
+        self._residuals: dict[int, float] = {}
+
+    @property
+    def cap(self) -> int:
+        """Most splats that the map may hold."""
+        return int(self.options.splats_a_pixel * self.camera.width * self.camera.height)
+
+    def weights(self, view: View) -> Image:
+        """Weight of each pixel's squared error, 1 for a noiseless one."""
+        floor = (self.options.floor * self.white) ** 2
+        return np.asarray(floor / (view.deviation**2 + floor), np.float32)
+
+    def seed_from(self, view: View, rotation: Array, centre: Array, swept: Sweep) -> int:
+        """Splats from the pixels of a swept view that the map does not cover yet; returns how many."""
+        height, width = view.rate.shape
+        if len(self.scene):
+            empty = self.rasteriser.forward(self.scene, rotation[None], centre[None]).alpha < 0.5
+        else:
+            self.white = float(np.percentile(view.rate, 99.5))
+            empty = np.ones((height, width), bool)
+        step = self.options.stride_px
+        v, u = (
+            g.ravel().astype(int)
+            for g in np.meshgrid(np.arange(step / 2, height, step), np.arange(step / 2, width, step), indexing="ij")
+        )
+        keep = empty[v, u]
+        u, v = u[keep][: self.cap - len(self.scene)], v[keep][: self.cap - len(self.scene)]
+        if len(u) < 20:
+            return 0
+        smooth = fill_mosaic(view.rate, self.channels)
+        self._append(u + 0.5, v + 0.5, 1 / swept.inverse_depth[v, u], smooth[v, u], step, rotation, centre)
+        return len(u)
+
+    def _append(
+        self, u: Array, v: Array, depth: Image, colour: Image, size_px: float, rotation: Array, centre: Array
+    ) -> None:
+        """Round splats of `size_px` pixels spacing at pixels (u, v) of a camera."""
+        k = self.camera.intrinsics
+        rays = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones_like(u)], 1)
+        n = len(u)
+        log_scale = np.log(0.6 * size_px * depth / k.fx)
+        quats = np.zeros((n, 4), np.float32)
+        quats[:, 0] = 1
+        fresh = Scene(
+            np.ascontiguousarray((rays * depth[:, None]) @ rotation.T + centre, np.float32),
+            quats,
+            np.repeat(log_scale[:, None], 3, 1).astype(np.float32),
+            np.full(n, 0.5, np.float32),
+            np.ascontiguousarray(colour, np.float32),
+        )
+        self.scene = self.scene.join(fresh)
+        self.adam.grow(n)
+
+    def step(self, key: int, view: View, rotation: Array, centre: Array, decay: float = 1.0) -> Gradients:
+        """One gradient step on a view; `decay` scales the rate of the means. Returns the gradients (for its pose)."""
+        image = self.rasteriser.forward(self.scene, rotation[None], centre[None], channels=self.channels)
+        error = image.values - view.rate
+        weight = self.weights(view)
+        scale = np.float32(1 / (self.white**2 * error.size))
+        gradients = self.rasteriser.backward(2 * scale * weight * error)
+        self._residuals[key] = float(np.mean(weight * error * error)) / self.white**2
+        self.steps += 1
+        o = self.options
+        rates = (o.rate_means * decay, o.rate_quats, o.rate_scales, o.rate_opacities, o.rate_colours * self.white)
+        slopes = (gradients.means, gradients.quats, gradients.log_scales, gradients.opacity_logits, gradients.colours)
+        self.adam.step(self.scene.arrays(), slopes, rates, gradients.radius_px > 0)
+        return gradients
+
+    @property
+    def loss(self) -> float | None:
+        """Mean over the views of the last weighted squared error, in units of white squared; None before any step."""
+        return float(np.mean(list(self._residuals.values()))) if self._residuals else None
+
+    def forget_residuals(self) -> None:
+        """Views are numbered anew."""
+        self._residuals.clear()
+
+    def densify(self, view: View, rotation: Array, centre: Array, share: float = 0.03) -> None:
+        """Give splats to what is rendered worst: dead ones are moved there first, then new ones are made up to the cap."""
+        image = self.rasteriser.forward(self.scene, rotation[None], centre[None], channels=self.channels)
+        error = (view.rate - image.values) * self.weights(view)
+        badness = cv2.GaussianBlur(np.abs(cv2.GaussianBlur(error, (0, 0), 0.7)), (0, 0), 1.0)
+        badness = np.maximum(badness - np.median(badness), 0)
+        dead = np.flatnonzero(self.scene.opacity_logits < -4.0)
+        if len(dead):
+            alive = np.ones(len(self.scene), bool)
+            alive[dead] = False
+            self.scene = self.scene.select(alive)
+            self.adam.keep(alive)
+        wanted = min(int(share * self.cap) + len(dead), self.cap - len(self.scene))
+        total = float(badness.sum())
+        if wanted < 1 or total <= 0:
+            return
+        place = self._rng.choice(
+            badness.size, min(wanted, badness.size // 4), replace=False, p=(badness / total).ravel()
+        )
+        v, u = np.divmod(place, self.camera.width)
+        depth = np.where(image.depth > 0, image.depth, 1.0)[v, u]
+        colour = fill_mosaic(view.rate, self.channels)[v, u]
+        self._append(u + 0.5, v + 0.5, depth, colour, 1.0, rotation, centre)
+
+    def render(self, rotation: Array, centre: Array) -> Image:
+        """What the map looks like from a pose, radiance [H, W] or [H, W, 3]."""
+        return self.rasteriser.forward(self.scene, rotation[None], centre[None]).values
+
+
+def fill_mosaic(rate: Image, channels: NDArray[np.uint8] | None) -> Image:
+    """Colours [H, W, C] of an observed image, for display and first guesses: each colour is the normalised average of its
+    own sites nearby; grey passes through."""
+    if channels is None:
+        return rate[..., None]
+    planes = []
+    for c in range(3):
+        here = (channels == c).astype(np.float32)
+        planes.append(cv2.GaussianBlur(rate * here, (5, 5), 0) / np.maximum(cv2.GaussianBlur(here, (5, 5), 0), 1e-6))
+    return np.stack(planes, -1)

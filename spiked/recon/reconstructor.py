@@ -1,0 +1,400 @@
+"""Frames in, trajectory and scene out, at any time: the one object that the command line and the daemon hold."""
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.errors import ConfigurationError
+from spiked.pose import Array, log_so3
+from spiked.recon.depth import Shot, neighbours, sweep
+from spiked.recon.mapping import Mapper, fill_mosaic
+from spiked.recon.odometry import Odometry, State
+from spiked.recon.options import Options
+from spiked.recon.refine import align_spline
+from spiked.recon.tracks import picture
+from spiked.recon.views import Image, View, Windows, luminance
+from spiked.render import Camera
+from spiked.scene import Scene
+from spiked.sensor import Sensor
+from spiked.spline import Spline
+from spiked.trajectory import Trajectory
+
+FIRST_WINDOW = 16
+WINDOWS = (8, 16, 32, 64)
+WINDOW_MOTION_PX = (0.45, 1.2)
+"""A view gets twice as long when the image moves less than the first in it, and half as long above twice the second."""
+SEED_VIEWS = 5
+"""Views swept for depth when the map begins."""
+SWEEP_NEIGHBOURS = 5
+ALIGN_EVERY = 500
+"""Steps of the refinement between alignments of the whole path with the map."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """Where a reconstruction stands."""
+
+    state: State
+    reason: str
+    stage: str
+    """waiting, tracking, mapping, refining or done."""
+    frames: int
+    splats: int
+    loss: float | None
+    """Mean squared error of the views in units of white squared, weighted by the noise."""
+    version: int
+    """Grows whenever the scene or the trajectory changed."""
+    progress: float
+    """Share of the final refinement done, 0 to 1."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One view's observed and rendered image [H, W, C], radiance, for people to compare."""
+
+    time_s: float
+    observed: Image
+    rendered: Image
+
+
+class Reconstructor:
+    """Feed frames as they come (`feed`, `gap`), let it map in spare time (`improve`), end with `finish`.
+
+    Poses are camera-to-world; the length unit is the median depth of the first views, or the unit of given poses.
+    """
+
+    def __init__(self, sensor: Sensor, options: Options | None = None) -> None:
+        """Raises ConfigurationError when the sensor has no intrinsics."""
+        if sensor.intrinsics is None:
+            raise ConfigurationError("the focal length is not known: give --fov DEGREES or --intrinsics fx,fy,cx,cy")
+        self.sensor = sensor
+        self.options = options or Options()
+        self.camera = Camera(sensor.intrinsics, sensor.width, sensor.height)
+        length = self.options.window_frames or FIRST_WINDOW
+        self._windows = Windows(sensor, length, length)
+        self._odometry = Odometry(sensor.intrinsics, self.options.seed)
+        self._mapper = Mapper(sensor, self.camera, self.options.mapping, self.options.seed, self.options.threads)
+        self._rng = np.random.default_rng(self.options.seed)
+        self._views: list[View] = []
+        self._queue: list[int] = []
+        self._seeded: list[float] = []
+        self._gaps: list[tuple[int, int]] = []
+        self._frames = 0
+        self._version = 0
+        self._stage = "waiting"
+        self._progress = 0.0
+        self._refined: Spline | None = None
+        self._unit = 1.0
+        self._spent = {"tracking": 0.0, "mapping": 0.0, "refining": 0.0}
+        self._curve: list[tuple[float, float]] = []
+
+    def feed(self, first_frame: int, frames: NDArray[np.uint8]) -> None:
+        """Take stored frames uint8 [n, frame_bytes] that begin at absolute index `first_frame`."""
+        begin = time.perf_counter()
+        for view in self._windows.feed(first_frame, frames):
+            self._add(view)
+        self._frames = first_frame + len(frames)
+        self._spent["tracking"] += time.perf_counter() - begin
+
+    def gap(self, first_frame: int, count: int) -> None:
+        """Frames [first_frame, first_frame + count) were lost."""
+        self._gaps.append((first_frame, count))
+
+    def _add(self, view: View) -> None:
+        grey = luminance(view.rate, self.sensor.mosaic)
+        white = float(np.percentile(grey, 99.5))
+        posed = self._odometry.add(view.time, view.end - view.begin, picture(grey, max(white, 1e-6)), self._given(view))
+        self._views.append(view)
+        if self._stage == "waiting":
+            self._stage = "tracking"
+        if posed.rotation is not None:
+            self._version += 1
+        if self.options.window_frames is None:
+            self._follow_motion(posed.motion_px, view)
+        if len(self._views) > self.options.max_views:
+            self._thin()
+
+    def _given(self, view: View) -> tuple[Array, Array] | None:
+        poses = self.options.poses
+        if poses is None:
+            return None
+        frames = poses.times_s * self.sensor.frame_rate_hz
+        near = min(max(int(np.searchsorted(frames, view.time)), 1), len(frames) - 1)
+        around = slice(max(0, near - 2), near + 2)
+        spline = Spline.fit(frames[around], poses.rotations[around], poses.centres[around], 1e9, degree=1)
+        rotation, centre = spline.poses([view.time])
+        return rotation[0], centre[0]
+
+    def _follow_motion(self, motion_px: float, view: View) -> None:
+        """Views as long as the motion allows: long ones are less noisy, short ones less blurred."""
+        if len(self._views) < 2 or motion_px == 0:
+            return
+        elapsed = view.time - self._views[-2].time
+        length = self._windows.length
+        in_window = motion_px / elapsed * length
+        index = WINDOWS.index(length)
+        if in_window > 2 * WINDOW_MOTION_PX[1] and index > 0:
+            length = WINDOWS[index - 1]
+        elif in_window < WINDOW_MOTION_PX[0] and index < len(WINDOWS) - 1:
+            length = WINDOWS[index + 1]
+        self._windows.length = self._windows.hop = length
+
+    def _thin(self) -> None:
+        """Let go of every second of the older half of the views."""
+        half = len(self._views) // 2
+        self._views = self._views[:half:2] + self._views[half:]
+        self._queue = []
+        self._mapper.forget_residuals()
+
+    @property
+    def spline(self) -> Spline | None:
+        """The path so far in frames and map units; None before the bootstrap."""
+        return self._refined or self._odometry.spline
+
+    def improve(self, seconds: float) -> None:
+        """Map for about this long: seed the map where the camera has been, then gradient steps."""
+        begin = time.perf_counter()
+        if not self._ready():
+            return
+        self._stage = "mapping"
+        if len(self._mapper.scene) == 0 or self._wants_seed():
+            self._seed(self._newest_seed())
+        while time.perf_counter() - begin < seconds:
+            self._step(1.0)
+        self._spent["mapping"] += time.perf_counter() - begin
+        self._note()
+
+    def _ready(self) -> bool:
+        return self._odometry.spline is not None and len(self._mappable()) >= 10
+
+    def _mappable(self) -> list[int]:
+        """Views whose pose is known: inside the path, and seen while tracking was good."""
+        spline = self.spline
+        if spline is None:
+            return []
+        good = {v.time for v in self._odometry.views if v.rotation is not None and v.state is not State.LOST}
+        return [i for i, v in enumerate(self._views) if spline.begin <= v.time <= spline.end and v.time in good]
+
+    def _wants_seed(self) -> bool:
+        times = [self._views[i].time for i in self._mappable()]
+        return len(times) > 12 and times[-1] - self._seeded[-1] > 0.3 * (times[-1] - times[0])
+
+    def _newest_seed(self) -> list[int]:
+        usable = self._mappable()
+        return [usable[len(usable) // 2]] if len(self._mapper.scene) == 0 else [usable[-3]]
+
+    def _seed(self, numbers: list[int]) -> None:
+        """Sweep depth at some views and fill what the map does not cover."""
+        spline, usable = self.spline, self._mappable()
+        assert spline is not None and self.sensor.intrinsics is not None
+        rotations, centres = spline.poses([self._views[i].time for i in usable])
+        points = self._odometry.points[np.isfinite(self._odometry.points[:, 0])]
+        for number in numbers:
+            reference = usable.index(number)
+            depth = (points - centres[reference]) @ rotations[reference][:, 2]
+            if (depth > 0).sum() < 10:
+                continue
+            low, high = np.percentile(1 / depth[depth > 0], [1, 99.5])
+            view = self._views[number]
+
+            def shot(row: int) -> Shot:
+                image = luminance(self._views[usable[row]].rate, self.sensor.mosaic)
+                return Shot(image, rotations[row], centres[row])
+
+            others = [shot(r) for r in neighbours(centres, rotations[:, :, 2], reference, SWEEP_NEIGHBOURS)]
+            swept = sweep(
+                shot(reference), others, self.sensor.intrinsics, (1.3 * high, 0.5 * low), 1.5 * view.deviation
+            )
+            self._mapper.seed_from(view, rotations[reference], centres[reference], swept)
+            self._seeded.append(view.time)
+        self._version += 1
+
+    def _step(self, decay: float, densify: bool = True) -> None:
+        """One gradient step on the next view of a random order."""
+        spline = self.spline
+        assert spline is not None
+        if not self._queue:
+            self._queue = [int(i) for i in self._rng.permutation(self._mappable())]
+        view = self._views[number := self._queue.pop()]
+        rotation, centre = spline.poses([view.time])
+        self._mapper.step(number, view, rotation[0], centre[0], decay)
+        if densify and self._mapper.steps % 100 == 0:
+            self._mapper.densify(view, rotation[0], centre[0])
+        self._version += self._mapper.steps % 20 == 0
+
+    def finish(
+        self, progress: Callable[[Status], None] | None = None, cancelled: Callable[[], bool] = lambda: False
+    ) -> None:
+        """Use what is left in the buffers and refine path and map together. Stops early when `cancelled` says so."""
+        begin = time.perf_counter()
+        for view in self._windows.flush():
+            self._add(view)
+        if self.options.poses is None:
+            self._odometry.settle()
+        else:
+            self._take_given_poses()
+        self._spent["tracking"] += time.perf_counter() - begin
+        begin = time.perf_counter()
+        if self._ready():
+            self._refine(progress, cancelled)
+        self._spent["refining"] += time.perf_counter() - begin
+        self._stage = "done"
+        if progress:
+            progress(self.status())
+
+    def _take_given_poses(self) -> None:
+        poses = self.options.poses
+        assert poses is not None
+        self._odometry.triangulate_all()
+        points = self._odometry.points[np.isfinite(self._odometry.points[:, 0])]
+        frames = poses.times_s * self.sensor.frame_rate_hz
+        span = (0.0, float(self._frames))
+        spline = Spline.fit(frames, poses.rotations, poses.centres, 8, span=span)
+        middle = spline.poses([0.5 * self._frames])
+        depth = (points - middle[1][0]) @ middle[0][0][:, 2]
+        if (depth > 0).sum() < 10:
+            self._odometry.reason = "the given poses do not explain the tracks: no point could be triangulated"
+            return
+        self._unit = float(np.median(depth[depth > 0]))
+        self._odometry.points = self._odometry.points / self._unit
+        self._odometry.spline = replace(spline, centres=spline.centres / self._unit)
+
+    def _refine(self, progress: Callable[[Status], None] | None, cancelled: Callable[[], bool]) -> None:
+        self._stage = "refining"
+        usable = self._mappable()
+        self._queue = []
+        order = np.linspace(0, len(usable) - 1, SEED_VIEWS).round().astype(int)
+        self._seed([usable[i] for i in order[np.argsort(np.abs(order - order.mean()))]])
+        steps = self.options.steps
+        for done in range(steps):
+            if cancelled():
+                break
+            self._step(10 ** (-done / steps), densify=done < 0.7 * steps)
+            if self._aligns(done, steps):
+                self._align()
+            if done % 50 == 49:
+                self._progress = (done + 1) / steps
+                self._note()
+                if progress:
+                    progress(self.status())
+        self._version += 1
+
+    def _aligns(self, done: int, steps: int) -> bool:
+        wanted = self.options.refine_poses and self.options.poses is None
+        return wanted and (done + 1) % ALIGN_EVERY == 0 and done < 0.9 * steps
+
+    def _align(self) -> None:
+        spline = self.spline
+        assert spline is not None
+        views = [self._views[i] for i in self._mappable()]
+        self._refined = align_spline(spline, views, self._mapper)
+
+    def _note(self) -> None:
+        loss = self._mapper.loss
+        if loss is not None:
+            self._curve.append((sum(self._spent.values()), float(-10 * np.log10(loss))))
+
+    def status(self) -> Status:
+        """Where the work stands."""
+        o, m = self._odometry, self._mapper
+        return Status(o.state, o.reason, self._stage, self._frames, len(m.scene), m.loss, self._version, self._progress)
+
+    def trajectory(self) -> Trajectory:
+        """A pose for the middle of every frame whose surroundings were tracked; empty before the bootstrap."""
+        spline = self.spline
+        frames = np.arange(self._frames) + 0.5
+        if spline is None:
+            return Trajectory(np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+        frames = frames[(frames >= spline.begin) & (frames <= spline.end)]
+        posed = [v for v in self._odometry.views if v.rotation is not None]
+        times = np.array([v.time for v in posed])
+        reach = np.array([v.length for v in posed])
+        near = np.clip(np.searchsorted(times, frames), 1, len(times) - 1)
+        near = np.where(np.abs(times[near - 1] - frames) < np.abs(times[near] - frames), near - 1, near)
+        frames = frames[np.abs(times[near] - frames) <= 1.5 * reach[near]]
+        rotations, centres = spline.poses(frames)
+        return Trajectory(frames / self.sensor.frame_rate_hz, rotations, centres * self._unit)
+
+    def scene(self) -> Scene:
+        """A copy of the map as it is now, in the trajectory's unit."""
+        scene = self._mapper.scene.select(np.arange(len(self._mapper.scene)))
+        scene.means *= np.float32(self._unit)
+        scene.log_scales += np.float32(np.log(self._unit))
+        return scene
+
+    @property
+    def white(self) -> float:
+        """The radiance (spikes a frame) that should be shown as white."""
+        return self._mapper.white
+
+    def view(self, rotation: Array, centre: Array) -> Image:
+        """The map from a pose (camera-to-world, trajectory's unit): radiance [H, W, C], float32."""
+        values = self._mapper.render(rotation, centre / self._unit)
+        return values[..., None] if values.ndim == 2 else values
+
+    def samples(self, count: int = 4) -> list[Sample]:
+        """Observed and rendered images at some times over the recording; empty before there is a map."""
+        usable = self._mappable()
+        if not usable or not len(self._mapper.scene):
+            return []
+        out = []
+        for i in np.linspace(0, len(usable) - 1, count).round().astype(int):
+            view = self._views[usable[i]]
+            spline = self.spline
+            assert spline is not None
+            rotation, centre = spline.poses([view.time])
+            observed = fill_mosaic(view.rate, self._mapper.channels)
+            rendered = self._mapper.render(rotation[0], centre[0])
+            rendered = rendered[..., None] if rendered.ndim == 2 else rendered
+            out.append(Sample(view.time / self.sensor.frame_rate_hz, observed, rendered))
+        return out
+
+    def report(self) -> dict[str, object]:
+        """Versions, parameters, states with reasons, timings and gaps, ready for JSON."""
+        try:
+            release = version("spiked")
+        except PackageNotFoundError:
+            release = "unknown"
+        rate = self.sensor.frame_rate_hz
+        odometry = self._odometry
+        options = asdict(replace(self.options, poses=None)) | {"poses": self.options.poses is not None}
+        return {
+            "spiked": release,
+            "sensor": {"width": self.sensor.width, "height": self.sensor.height, "frame_rate_hz": rate},
+            "options": options,
+            "frames": self._frames,
+            "gaps": [{"first_frame": f, "frames": n} for f, n in self._gaps],
+            "state": str(odometry.state),
+            "reason": odometry.reason,
+            "states": [{"time_s": t / rate, "state": str(s), "reason": r} for t, s, r in odometry.changes],
+            "views": [
+                {
+                    "time_s": v.time / rate,
+                    "frames": v.length,
+                    "motion_px": round(v.motion_px, 3),
+                    "inliers": round(v.inliers, 3),
+                    "state": str(v.state),
+                }
+                for v in odometry.views
+            ],
+            "knot_spacing_frames": self.spline.spacing if self.spline else None,
+            "splats": len(self._mapper.scene),
+            "steps": self._mapper.steps,
+            "loss": self._mapper.loss,
+            "psnr_of_views_over_seconds": [[round(s, 2), round(p, 2)] for s, p in self._curve],
+            "seconds": {k: round(s, 3) for k, s in self._spent.items()},
+            "correction_deg": self._correction(),
+        }
+
+    def _correction(self) -> float | None:
+        """How far the map turned the path of the sparse tracks, RMS in degrees."""
+        if self._refined is None or self._odometry.spline is None:
+            return None
+        times = np.array([v.time for v in self._odometry.views if v.rotation is not None])
+        a, _ = self._refined.poses(times)
+        b, _ = self._odometry.spline.poses(times)
+        return float(np.degrees(np.sqrt((log_so3(a @ b.swapaxes(1, 2)) ** 2).sum(1).mean())))

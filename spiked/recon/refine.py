@@ -1,0 +1,62 @@
+"""Dense alignment of the whole path with the map: one Gauss-Newton step over all views, in the knots of the spline.
+
+Each view is rendered with its depth; the image gradient of the render gives how each pixel changes with the pose
+(the forward-additive direct method). Basis weights carry the 6x6 blocks of the views to the knots.
+"""
+
+import cv2
+import numpy as np
+
+from spiked.pose import Array, hat
+from spiked.recon.mapping import Mapper
+from spiked.recon.views import View, luminance
+from spiked.spline import Spline
+
+
+def align_spline(spline: Spline, views: list[View], mapper: Mapper, prior: float = 0.02) -> Spline:
+    """The spline moved so that the map agrees better with the views. `prior` damps the step, as part of the diagonal."""
+    times = np.array([v.time for v in views])
+    blend = spline.basis_matrix(times)
+    rotations, centres = spline.poses(times)
+    knots = blend.shape[1]
+    hessian, gradient = np.zeros((knots, 6, knots, 6)), np.zeros((knots, 6))
+    for view, rotation, centre, row in zip(views, rotations, centres, blend, strict=True):
+        h, g = _normal_equations(view, rotation, centre, mapper)
+        used = np.flatnonzero(row)
+        hessian[np.ix_(used, range(6), used, range(6))] += np.einsum("a,ij,b->aibj", row[used], h, row[used])
+        gradient[used] += row[used, None] * g
+    square = hessian.reshape(knots * 6, knots * 6)
+    diagonal = np.diag(square).copy()
+    square[np.diag_indices(knots * 6)] += prior * diagonal + 1e-6 * diagonal.max()
+    step = -np.linalg.solve(square, gradient.ravel()).reshape(knots, 6)
+    return spline.move(step[:, :3], step[:, 3:])
+
+
+def _normal_equations(view: View, rotation: Array, centre: Array, mapper: Mapper) -> tuple[Array, Array]:
+    """Hessian [6, 6] and gradient [6] of the view's weighted squared error, for (phi, centre) perturbed on the left."""
+    image = mapper.rasteriser.forward(mapper.scene, rotation[None], centre[None], channels=mapper.channels)
+    error = (image.values - view.rate) / mapper.white
+    k = mapper.camera.intrinsics
+    smooth = luminance(image.values, None) / mapper.white
+    du = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 32)
+    dv = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 32)
+    edge = 2
+    strong = np.zeros(error.shape, bool)
+    size = np.hypot(du, dv)
+    strong[edge:-edge, edge:-edge] = (size > np.quantile(size[::4, ::4], 0.7))[edge:-edge, edge:-edge]
+    strong &= image.alpha > 0.9
+    v, u = np.nonzero(strong)
+    z = image.depth[v, u].astype(float)
+    x = (u + 0.5 - k.cx) / k.fx * z
+    y = (v + 0.5 - k.cy) / k.fy * z
+    a, b = du[v, u] * k.fx / z, dv[v, u] * k.fy / z
+    by_local = np.stack([a, b, -(a * x + b * y) / z], 1)  # change of the pixel with the point in camera axes
+    ray = np.stack([x, y, z], 1) @ rotation.T
+    # A moved camera sees at a fixed pixel what a point moved the other way would show: dI = -grad I . d(pixel of point).
+    by_point = by_local @ rotation.T
+    jacobian = -np.concatenate([np.einsum("mj,mjk->mk", by_point, hat(ray)), -by_point], 1)
+    e = error[v, u].astype(float)
+    scale = 1.5 * np.median(np.abs(e)) + 1e-6
+    weight = mapper.weights(view)[v, u] / (1 + (e / (3 * scale)) ** 2)
+    weighted = jacobian * weight[:, None]
+    return weighted.T @ jacobian, weighted.T @ e

@@ -68,7 +68,7 @@ class Blocks:
     """Offset of the last spike within its block, [blocks, height, width]; 255 where there is none."""
 
     def __len__(self) -> int:
-        return -(-self.frames // BLOCK_FRAMES)
+        return (self.frames + BLOCK_FRAMES - 1) // BLOCK_FRAMES
 
     def __getitem__(self, index: int) -> Block:
         """One block, as views."""
@@ -131,10 +131,11 @@ class Window:
     def rate(self, *, fill: bool = False) -> NDArray[np.float32]:
         """Spikes a frame. Where no interval was found NaN or, with `fill`, half of `rate_bound`."""
         missing = 0.5 * self.rate_bound() if fill else np.full(self.spikes.shape, np.nan, np.float32)
-        return np.divide(self.spikes, self.duration(), out=missing, where=self.valid, dtype=np.float32)
+        np.divide(self.spikes, self.duration(), out=missing, where=self.valid, dtype=np.float32)
+        return missing
 
     def rate_bound(self) -> NDArray[np.float32]:
-        """Upper bound of the mean rate where `spikes` is 0: s spikes in n frames had less than s + 1 thresholds of charge."""
+        """Upper bound of the mean rate where `spikes` is 0: s spikes in n frames had less than s + 1 thresholds."""
         seen = (self.start_offset != 0xFFFF).astype(np.float32)
         return np.asarray((seen + 1) / np.float32(self.frames), np.float32)
 
@@ -144,7 +145,7 @@ class Window:
         return np.where(self.valid, middle, np.nan)
 
     def variance(self, *, jitter: float = 0.002, rate: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-        """Variance of `rate()`: (p^2 / 6 + F m + (0.01 m)^2) / T^2 (algorithm.md, decision 1); NaN where no interval was found.
+        """Variance of `rate()`: (p^2 / 6 + F m + (0.01 m)^2) / T^2 (algorithm.md, decision 1); NaN without an interval.
 
         p is the rate (`rate`, for instance from a render, else the measured one), F the squared relative jitter of one
         interval (`jitter`: 5 % gives 0.0025), m the spikes and T the frames between the edges. The terms are the clock
@@ -154,7 +155,8 @@ class Window:
         m = self.spikes.astype(np.float32)
         charge = p * p / 6 + np.float32(jitter) * m + (np.float32(0.01) * m) ** 2
         out = np.full(m.shape, np.nan, np.float32)
-        return np.divide(charge, self.duration() ** 2, out=out, where=self.valid)
+        np.divide(charge, self.duration() ** 2, out=out, where=self.valid)
+        return out
 
 
 def _layout(sensor: Sensor) -> _blocks.Layout:
@@ -168,7 +170,7 @@ def instruction_sets() -> list[str]:
 
 
 def reduce_block(frames: NDArray[np.uint8], sensor: Sensor, first_frame: int, *, instruction_set: str = "") -> Block:
-    """Reduce up to eight stored frames, uint8 [n <= 8, frame_bytes], whose first has the absolute index `first_frame`."""
+    """Reduce up to eight stored frames, uint8 [n <= 8, frame_bytes]; the first has the absolute index `first_frame`."""
     if not 1 <= len(frames) <= BLOCK_FRAMES:
         raise ValueError(f"a block has 1 to {BLOCK_FRAMES} frames, not {len(frames)}")
     return reduce_blocks(frames, sensor, first_frame, instruction_set=instruction_set)[0]
@@ -252,28 +254,33 @@ def benchmark(*, repeats: int = 15) -> list[BenchmarkRow]:
     rows = []
     for width, height in ((400, 250), (1000, 1000)):
         sensor = Sensor(width, height, 20_000.0)
-        frames = _random_frames(64, sensor)
-        copy = np.empty_like(frames)
-        reference = _median_ns(lambda copy=copy, frames=frames: np.copyto(copy, frames), repeats)  # type: ignore[misc]
-        out = reduce_blocks(frames, sensor, 0)
+        frames = _random_frames(96, sensor)
         for name in instruction_sets():
-
-            def reduce(name: str = name, sensor: Sensor = sensor, out: Blocks = out) -> object:
-                return reduce_blocks(frames, sensor, 0, out=out, instruction_set=name)
-
-            def window(name: str = name, sensor: Sensor = sensor) -> object:
-                return aligned_window(frames, sensor, 0, 16, 48, instruction_set=name)
-
-            for label, work in (("reduce_blocks", reduce), ("aligned_window 16+32+16", window)):
-                ns = _median_ns(work, repeats)
-                title = f"{label} {width}x{height} {name}"
-                rows.append(BenchmarkRow(title, ns / len(frames), ns / reference))
+            rows.append(_benchmark_reduce(sensor, frames[:BLOCK_FRAMES], name, repeats))
+            rows.append(_benchmark_window(sensor, frames, name, repeats))
     return rows
+
+
+def _benchmark_reduce(sensor: Sensor, frames: NDArray[np.uint8], name: str, repeats: int) -> BenchmarkRow:
+    out = reduce_blocks(frames, sensor, 0)
+    ns = _median_ns(lambda: reduce_blocks(frames, sensor, 0, out=out, instruction_set=name), repeats)
+    return _row(f"one block {sensor.width}x{sensor.height} {name}", ns, frames, repeats)
+
+
+def _benchmark_window(sensor: Sensor, frames: NDArray[np.uint8], name: str, repeats: int) -> BenchmarkRow:
+    ns = _median_ns(lambda: aligned_window(frames, sensor, 0, 32, 64, instruction_set=name), repeats)
+    return _row(f"aligned window 32+32+32 {sensor.width}x{sensor.height} {name}", ns, frames, repeats)
+
+
+def _row(name: str, ns: float, frames: NDArray[np.uint8], repeats: int) -> BenchmarkRow:
+    copy = np.empty_like(frames)
+    return BenchmarkRow(name, ns / len(frames), ns / _median_ns(lambda: np.copyto(copy, frames), repeats))
 
 
 def _random_frames(count: int, sensor: Sensor) -> NDArray[np.uint8]:
     bits = np.random.default_rng(0).integers(0, 256, (2, count, sensor.frame_bytes), np.uint8)
-    return np.bitwise_and(bits[0], bits[1])
+    frames: NDArray[np.uint8] = bits[0] & bits[1]
+    return frames
 
 
 def _median_ns(work: Callable[[], object], repeats: int) -> float:

@@ -46,9 +46,15 @@ inline int span_blocks(const Run& run, int from) { return run.blocks - from < kS
 // From block numbers and history bytes to distances in frames, kNever8 where the byte is empty.
 inline vec distance(vec block, vec h) { return ((block << 3) + lowest(h)) | is_zero(h); }
 
-inline uint16_t widened(uint8_t distance, int from) {
-    return distance == kNever8 ? kNever16 : static_cast<uint16_t>(distance + 8 * from);
+constexpr int kHalf = kWidth / 2;  // pixels in a `wide`
+
+// Offsets from the beginning of a span to offsets from the beginning of its run.
+inline wide from_run(const uint8_t* in_span, int from) {
+    const wide v = load_widened(in_span);
+    return (v + static_cast<uint16_t>(8 * from)) | (wide)(v == kNever8);
 }
+
+inline void store_all(uint16_t* to, wide v) { store_wide(to, v, kWidth); }
 
 // Distances to the nearest and the second nearest spike along a run, for 8 * kWidth pixels.
 void nearest_two(const Run& run, Row row, bool msb, uint16_t* nearest, uint16_t* second) {
@@ -56,7 +62,8 @@ void nearest_two(const Run& run, Row row, bool msb, uint16_t* nearest, uint16_t*
     do {
         const int blocks = span_blocks(run, from);
         // The first and second non-empty history byte of each pixel, and how many blocks were waited for them.
-        vec h1[8] = {}, h2[8] = {}, wait1[8] = {}, wait2[8] = {};
+        vec h1[8], h2[8], wait1[8], wait2[8];
+        for (int i = 0; i < 8; ++i) h1[i] = h2[i] = wait1[i] = wait2[i] = vec{};
         for (int k = 0; k < blocks; ++k) {
             vec h[8];
             histories(row.frames + 8 * (from + k), row.at, msb, h);
@@ -78,16 +85,16 @@ void nearest_two(const Run& run, Row row, bool msb, uint16_t* nearest, uint16_t*
             store(near + i * kWidth, d1, kWidth);
             store(next + i * kWidth, d2, kWidth);
         }
-        if (from == 0) {
-            for (int x = 0; x < 8 * kWidth; ++x) nearest[x] = widened(near[x], 0);
-            for (int x = 0; x < 8 * kWidth; ++x) second[x] = widened(next[x], 0);
-        } else {
-            for (int x = 0; x < 8 * kWidth; ++x) {
-                const uint16_t d1 = widened(near[x], from), d2 = widened(next[x], from);
-                const uint16_t behind = nearest[x] == kNever16 ? d2 : d1;
-                second[x] = second[x] == kNever16 ? behind : second[x];
-                nearest[x] = nearest[x] == kNever16 ? d1 : nearest[x];
+        for (int x = 0; x < 8 * kWidth; x += kHalf) {
+            wide d1 = from_run(near + x, from), d2 = from_run(next + x, from);
+            if (from > 0) {
+                const wide before1 = load_wide(nearest + x), before2 = load_wide(second + x);
+                const wide empty1 = (wide)(before1 == kNever16), empty2 = (wide)(before2 == kNever16);
+                d2 = choose(empty2, choose(empty1, d2, d1), before2);
+                d1 = choose(empty1, d1, before1);
             }
+            store_all(nearest + x, d1);
+            store_all(second + x, d2);
         }
         from += kSpan;
     } while (from < run.blocks);
@@ -98,7 +105,8 @@ void inside_window(const Run& run, Row row, bool msb, uint16_t* first, uint16_t*
     int from = 0;
     do {
         const int blocks = span_blocks(run, from);
-        vec h1[8] = {}, hl[8] = {}, wait[8] = {}, block[8] = {}, sum[8] = {};
+        vec h1[8], hl[8], wait[8], block[8], sum[8];
+        for (int i = 0; i < 8; ++i) h1[i] = hl[i] = wait[i] = block[i] = sum[i] = vec{};
         for (int k = 0; k < blocks; ++k) {
             vec h[8];
             histories(row.frames + 8 * (from + k), row.at, msb, h);
@@ -119,16 +127,17 @@ void inside_window(const Run& run, Row row, bool msb, uint16_t* first, uint16_t*
             store(end + i * kWidth, ((block[i] << 3) + highest(hl[i])) | is_zero(hl[i]), kWidth);
             store(total + i * kWidth, sum[i], kWidth);
         }
-        if (from == 0) {
-            for (int x = 0; x < 8 * kWidth; ++x) first[x] = widened(begin[x], 0);
-            for (int x = 0; x < 8 * kWidth; ++x) last[x] = widened(end[x], 0);
-            for (int x = 0; x < 8 * kWidth; ++x) count[x] = total[x];
-        } else {
-            for (int x = 0; x < 8 * kWidth; ++x) {
-                first[x] = first[x] == kNever16 ? widened(begin[x], from) : first[x];
-                last[x] = end[x] == kNever8 ? last[x] : widened(end[x], from);
-                count[x] = static_cast<uint16_t>(count[x] + total[x]);
+        for (int x = 0; x < 8 * kWidth; x += kHalf) {
+            wide f = from_run(begin + x, from), l = from_run(end + x, from), c = load_widened(total + x);
+            if (from > 0) {
+                const wide before = load_wide(first + x);
+                f = choose((wide)(before == kNever16), f, before);
+                l = choose((wide)(l == kNever16), load_wide(last + x), l);
+                c += load_wide(count + x);
             }
+            store_all(first + x, f);
+            store_all(last + x, l);
+            store_all(count + x, c);
         }
         from += kSpan;
     } while (from < run.blocks);
@@ -142,33 +151,29 @@ struct RowState {
 
 // The spikes nearest to both edges; see spiked.blocks.Window for the rules.
 void choose_edges(const RowState& s, const WindowJob& job, size_t width, size_t out) {
-    uint16_t* __restrict spikes = job.spikes + out;
-    uint16_t* __restrict start = job.start + out;
-    uint16_t* __restrict stop = job.stop + out;
-    uint16_t* __restrict count = job.count + out;
-    const uint16_t begin = job.begin, end = job.end, length = end - begin;
-    for (size_t x = 0; x < width; ++x) {
-        const uint16_t p1 = s.p1[x], n1 = s.n1[x], inside = s.sum[x];
+    const wide never = wide{} + kNever16;
+    const wide begin = wide{} + job.begin, end = wide{} + job.end, length = end - begin;
+    for (size_t x = 0; x < width; x += kHalf) {
+        const wide p1 = load_wide(s.p1 + x), n1 = load_wide(s.n1 + x), inside = load_wide(s.sum + x);
+        const wide fired = (wide)(inside != 0);
         // Distances from begin to the spike at or after it, and from end to the spike before it.
-        const uint16_t far_n = n1 == kNever16 ? kNever16 : static_cast<uint16_t>(n1 + length);
-        const uint16_t far_p = p1 == kNever16 ? kNever16 : static_cast<uint16_t>(p1 + length);
-        const uint16_t last_back = static_cast<uint16_t>(length - 1 - s.last[x]);
-        const uint16_t next_b = inside ? s.first[x] : far_n;
-        const uint16_t prev_e = inside ? last_back : far_p;
+        const wide next_b = choose(fired, load_wide(s.first + x), (n1 + length) | (wide)(n1 == never));
+        const wide prev_e = choose(fired, length - 1 - load_wide(s.last + x), (p1 + length) | (wide)(p1 == never));
         // A spike just as far on either side: the outer one, for the longer window.
-        const bool outer0 = p1 <= next_b, outer1 = n1 <= prev_e;
-        const bool any = inside || p1 != kNever16 || n1 != kNever16;
-        const uint16_t m = any ? static_cast<uint16_t>(inside + outer1 - !outer0) : 0;
-        const uint16_t t0 = outer0 ? static_cast<uint16_t>(begin - 1 - p1) : static_cast<uint16_t>(begin + next_b);
-        const uint16_t t1 = outer1 ? static_cast<uint16_t>(end + n1) : static_cast<uint16_t>(end - 1 - prev_e);
+        const wide outer0 = (wide)(p1 <= next_b), outer1 = (wide)(n1 <= prev_e);
+        const wide none = (wide)((p1 & next_b) == never);
+        const wide m = (inside - outer1 + ~outer0) & ~none;
         // Both edges on one spike: each moves outwards to its neighbour.
-        const uint16_t back = outer0 ? s.p2[x] : p1, ahead = outer1 ? s.n2[x] : n1;
-        const bool one = any && m == 0;
-        const bool extend0 = one && back != kNever16, extend1 = one && ahead != kNever16;
-        spikes[x] = static_cast<uint16_t>(m + extend0 + extend1);
-        start[x] = !any ? kNever16 : extend0 ? static_cast<uint16_t>(begin - 1 - back) : t0;
-        stop[x] = !any ? kNever16 : extend1 ? static_cast<uint16_t>(end + ahead) : t1;
-        count[x] = inside;
+        const wide back = choose(outer0, load_wide(s.p2 + x), p1), ahead = choose(outer1, load_wide(s.n2 + x), n1);
+        const wide one = (wide)(m == 0) & ~none;
+        const wide extend0 = one & (wide)(back != never), extend1 = one & (wide)(ahead != never);
+        const wide t0 = choose(outer0, begin - 1 - p1, begin + next_b);
+        const wide t1 = choose(outer1, end + n1, end - 1 - prev_e);
+        const size_t room = 2 * (width - x);
+        store_wide(job.spikes + out + x, m - extend0 - extend1, room);
+        store_wide(job.start + out + x, choose(extend0, begin - 1 - back, t0) | none, room);
+        store_wide(job.stop + out + x, choose(extend1, end + ahead, t1) | none, room);
+        store_wide(job.count + out + x, inside, room);
     }
 }
 

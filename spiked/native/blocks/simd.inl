@@ -43,6 +43,27 @@ inline void store(uint8_t* to, vec v, size_t room) {
 #endif
 }
 
+// Half as many pixels with two bytes each; comparisons give 0 or 0xFFFF.
+typedef uint16_t wide __attribute__((vector_size(kWidth)));
+
+inline wide load_wide(const uint16_t* from) {
+    wide v;
+    memcpy(&v, from, sizeof v);
+    return v;
+}
+
+inline void store_wide(uint16_t* to, wide v, size_t room) { store(reinterpret_cast<uint8_t*>(to), (vec)v, room); }
+
+// Half a vector of bytes to two bytes each.
+inline wide load_widened(const uint8_t* from) {
+    typedef uint8_t half __attribute__((vector_size(kWidth / 2)));
+    half v;
+    memcpy(&v, from, sizeof v);
+    return __builtin_convertvector(v, wide);
+}
+
+inline wide choose(wide mask, wide yes, wide no) { return (yes & mask) | (no & ~mask); }
+
 inline vec is_zero(vec v) { return (vec)(v == 0); }
 inline vec low_nibble(vec v) { return v & 0x0F; }
 inline vec high_nibble(vec v) { return (vec)((lanes)v >> 4) & 0x0F; }
@@ -84,7 +105,21 @@ inline vec bit_index(vec one) {
 
 #endif
 
-#if defined(__AVX2__)
+#if defined(__AVX512BITALG__) && defined(__GFNI__)
+
+// Number of zero bits below the lowest set bit, 8 where there is none.
+inline vec trailing_zeros(vec h) { return popcount(~h & (h - 1)); }
+
+// Index of the lowest set bit of each byte, kNever8 where there is none.
+inline vec lowest(vec h) { return trailing_zeros(h) | is_zero(h); }
+
+// Index of the highest set bit of each byte, kNever8 where there is none.
+inline vec highest(vec h) {
+    const __m512i reverse = _mm512_set1_epi64(static_cast<int64_t>(0x8040201008040201));
+    return 7 - trailing_zeros((vec)_mm512_gf2p8affine_epi64_epi8((__m512i)h, reverse, 0));
+}
+
+#elif defined(__AVX2__)
 
 // Index of the lowest set bit of each byte, kNever8 where there is none.
 inline vec lowest(vec h) {
@@ -135,7 +170,6 @@ typedef __m256i bytes;
 
 #else
 
-typedef uint16_t vec16 __attribute__((vector_size(kWidth)));
 typedef uint32_t vec32 __attribute__((vector_size(kWidth)));
 typedef vec bytes;
 inline vec low8(vec a, vec b) {
@@ -144,8 +178,8 @@ inline vec low8(vec a, vec b) {
 inline vec high8(vec a, vec b) {
     return __builtin_shufflevector(a, b, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
 }
-inline vec low16(vec a, vec b) { return (vec)__builtin_shufflevector((vec16)a, (vec16)b, 0, 8, 1, 9, 2, 10, 3, 11); }
-inline vec high16(vec a, vec b) { return (vec)__builtin_shufflevector((vec16)a, (vec16)b, 4, 12, 5, 13, 6, 14, 7, 15); }
+inline vec low16(vec a, vec b) { return (vec)__builtin_shufflevector((wide)a, (wide)b, 0, 8, 1, 9, 2, 10, 3, 11); }
+inline vec high16(vec a, vec b) { return (vec)__builtin_shufflevector((wide)a, (wide)b, 4, 12, 5, 13, 6, 14, 7, 15); }
 inline vec low32(vec a, vec b) { return (vec)__builtin_shufflevector((vec32)a, (vec32)b, 0, 4, 1, 5); }
 inline vec high32(vec a, vec b) { return (vec)__builtin_shufflevector((vec32)a, (vec32)b, 2, 6, 3, 7); }
 

@@ -1,0 +1,77 @@
+"""A simulated recording is a folder that can be scored: frames, sidecar, truth and held-out views belong together."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from spiked.errors import RecordingError, SceneError
+from spiked.evaluate import psnr
+from spiked.sensor import Intrinsics, Mosaic, Sensor
+from spiked.simulate import SimulatedCamera
+from spiked.simulate.record import camera_of_files, simulate
+from spiked.trajectory import Trajectory
+
+SHARED = Path(__file__).resolve().parents[3] / "shared"
+LIVING = SHARED / "streams" / "living"
+
+
+@pytest.mark.parametrize("mosaic", [None, Mosaic.BGGR], ids=["grey", "colour"])
+def test_the_folder_holds_what_the_camera_saw(tmp_path: Path, mosaic: Mosaic | None) -> None:
+    sensor = Sensor(64, 40, 20000.0, mosaic=mosaic)
+    told: list[int] = []
+    path = simulate(SimulatedCamera(sensor, 1), tmp_path / "walk", "walk", 150, views=4, progress=told.append)
+    assert path.stat().st_size == 150 * sensor.frame_bytes
+    assert told == [64, 128, 150]
+    assert np.array_equal(np.fromfile(path, np.uint8).reshape(150, -1), SimulatedCamera(sensor, 1).next_frames(150))
+    sidecar = json.loads((path.parent / "walk.json").read_text())
+    assert (sidecar["width"], sidecar["height"], sidecar["frames"], sidecar["flipped"]) == (64, 40, 150, True)
+    assert sidecar["cfa"] == (mosaic.value if mosaic else None)
+
+    camera = SimulatedCamera(sensor, 1)
+    truth = Trajectory.read_tum(path.parent / "groundtruth.tum")
+    rotations, centres = camera.truth(np.arange(150))
+    assert np.allclose(truth.centres, centres, atol=1e-8) and np.allclose(truth.rotations, rotations, atol=1e-7)
+    table = json.loads((path.parent / "views.json").read_text())
+    assert [view["on_trajectory"] for view in table["views"]] == [True, False, True, False]
+    for view in table["views"]:
+        pose = np.array(view["c2w"])
+        picture = cv2.imread(str(path.parent / view["file"]), cv2.IMREAD_UNCHANGED)
+        expected = camera.view(pose[:3, :3], pose[:3, 3]) / table["gain"]
+        shown = picture[..., ::-1] if mosaic else picture
+        assert np.abs(shown / 255 - np.clip(expected, 0, 1)).max() < 0.5 / 255 + 1e-6
+        nearest = np.abs(centres - pose[:3, 3]).sum(1).min()
+        assert (nearest < 1e-6) == view["on_trajectory"]
+        assert 0.8 < view["coverage"] <= 1
+
+
+def test_nothing_is_written_over(tmp_path: Path) -> None:
+    (tmp_path / "precious").write_text("x")
+    with pytest.raises(RecordingError, match="not empty"):
+        simulate(SimulatedCamera(Sensor(64, 40, 20000.0)), tmp_path, "walk", 8, views=1)
+    assert [file.name for file in tmp_path.iterdir()] == ["precious"]
+
+
+def test_a_missing_scene_is_a_clear_error(tmp_path: Path) -> None:
+    (tmp_path / "path.tum").write_text("0 0 0 0 0 0 0 1\n1 0 0 1 0 0 0 1\n")
+    with pytest.raises(SceneError, match=r"none\.ply"):
+        camera_of_files(Sensor(64, 40, 20000.0), tmp_path / "none.ply", tmp_path / "path.tum")
+
+
+@pytest.mark.skipif(not LIVING.exists(), reason="needs ../shared/streams and ../shared/scenes")
+def test_the_living_room_is_reproduced_from_its_scene_and_path() -> None:
+    """Same scene, path and sensor model as `streams/living`, another seed: the pictures and the rates agree."""
+    sensor = Sensor(400, 250, 20000.0, intrinsics=Intrinsics(346.4101615137755, 346.4101615137755, 200.0, 125.0))
+    camera = camera_of_files(sensor, SHARED / "scenes" / "living.ply", LIVING / "groundtruth.tum", threads=2)
+    view = json.loads((LIVING / "views.json").read_text())["views"][0]
+    pose = np.array(view["c2w"])
+    picture = cv2.imread(str(LIVING / view["file"]), cv2.IMREAD_GRAYSCALE) / 255
+    assert psnr(np.clip(camera.view(pose[:3, :3], pose[:3, 3]) / camera.gain, 0, 1), picture) > 42
+    theirs = np.fromfile(LIVING / "living.dat", np.uint8, 32 * 12500)
+    ours = camera.next_frames(32)
+    rates = [np.unpackbits(x.reshape(32, 250, 50), axis=2, bitorder="little").mean(0) for x in (theirs, ours)]
+    blurred = [cv2.GaussianBlur(rate, (0, 0), 2) for rate in rates]
+    assert rates[1].mean() == pytest.approx(rates[0].mean(), rel=0.01)
+    assert np.corrcoef(blurred[0].ravel(), blurred[1].ravel())[0, 1] > 0.995

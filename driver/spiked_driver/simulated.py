@@ -30,12 +30,14 @@ class SimulatedSource:
         flow_px: float = 0.12,
         frames: int | None = None,
         pace: float = 1.0,
+        threads: int = 1,
     ) -> None:
         intrinsics = sensor.intrinsics or Intrinsics.from_fov(sensor.width, sensor.height, DEFAULT_FOV_DEG)
         self._sensor = replace(sensor.compact(), intrinsics=intrinsics)
         self._seed = seed
         self._motion = motion
         self._flow_px = flow_px
+        self._threads = threads
         self._frames = frames
         self._pace = pace
         self._camera: SimulatedCamera | None = None
@@ -65,7 +67,9 @@ class SimulatedSource:
 
     def open(self) -> None:
         """Build the scene, which takes a moment, and start again at frame 0."""
-        self._camera = SimulatedCamera(self._sensor, self._seed, self._motion, flow_px=self._flow_px)
+        self._camera = SimulatedCamera(
+            self._sensor, self._seed, self._motion, flow_px=self._flow_px, threads=self._threads
+        )
         self._pacer = Pacer(self._sensor.frame_rate_hz, self._pace)
         self._next = 0
         self._condition = Condition(DeviceState.ARMED)

@@ -83,6 +83,8 @@ class SimulationOptions(SourceOptions):
     motion: MotionKind = MotionKind.HAND_SHAKE
     flow_px: float = Field(0.12, gt=0)
     """Image motion a frame."""
+    threads: int = Field(1, ge=1)
+    """For the simulation; they change its speed, not its frames."""
 
 
 _Kind = TypeVar("_Kind", bound=SourceOptions)
@@ -124,6 +126,7 @@ def _simulated(options: SimulationOptions) -> Source:
         flow_px=options.flow_px,
         frames=frames,
         pace=options.pace,
+        threads=options.threads,
     )
 
 

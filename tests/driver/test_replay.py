@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from spiked.recording import open_recording
 from spiked_driver import Chunk, Faults, FaultySource, Loss, Source, Stall, acquire
 from spiked_driver.replay import ReplaySource
@@ -20,10 +22,10 @@ FRAMES = 50
 FRAME_BYTES = 64 * 48 // 8
 
 
-@pytest.fixture
-def recording(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """50 frames of random bits at 1 kHz with their sidecar."""
-    path = tmp_path / "clip.dat"
+    path = tmp_path_factory.mktemp("replay") / "clip.dat"
     bits().tofile(path)
     sidecar = {
         "format": "compact",
@@ -146,6 +148,43 @@ def test_a_real_stream_goes_through_the_ring_unchanged() -> None:
             assert item.release()
         thread.join()
     np.testing.assert_array_equal(np.concatenate(received), expected[100:500])
+
+
+@st.composite
+def faults(draw: st.DrawFn) -> Faults:
+    starts = sorted(draw(st.sets(st.integers(0, FRAMES + 5), max_size=4)))
+    ends = [*starts[1:], FRAMES + 10]
+    causes = st.sampled_from([Cause.USB, Cause.DEVICE, Cause.DISK])
+    losses = [Loss(a, draw(st.integers(1, b - a)), draw(causes)) for a, b in zip(starts, ends, strict=False)]
+    stalls = [Stall(frame, 0.0) for frame in draw(st.sets(st.integers(0, FRAMES), max_size=2))]
+    drop = draw(st.sampled_from([0.0, 0.05, 0.5, 0.95]))
+    return Faults(tuple(losses), tuple(stalls), drop, draw(st.integers(1, 5)), draw(st.integers(0, 99)))
+
+
+@settings(deadline=None)
+@given(inner=faults(), outer=faults(), block=st.integers(1, 9))
+def test_whatever_the_faults_each_frame_comes_once_or_is_told_lost_once(
+    recording: Path, inner: Faults, outer: Faults, block: int
+) -> None:
+    source = FaultySource(FaultySource(ReplaySource(open_recording(recording), pace=0), inner), outer)
+    source.open()
+    view = np.zeros((block, source.sensor.frame_bytes), np.uint8)
+    expected = 0
+    lost = np.zeros(FRAMES, bool)
+    while not isinstance(item := source.read_into(view), End):
+        if item is None:
+            continue
+        assert item.first == expected
+        if isinstance(item, Chunk):
+            np.testing.assert_array_equal(view[: item.frames], bits()[item.first : item.first + item.frames])
+            expected += item.frames
+        else:
+            expected += item.count
+            lost[item.first : item.first + item.count] = True
+    assert item == End(FRAMES, EndReason.FINISHED)
+    assert expected == FRAMES
+    for loss in inner.losses + outer.losses:
+        assert lost[loss.first : loss.first + loss.count].all()
 
 
 def test_a_range_outside_the_recording_is_refused(recording: Path) -> None:

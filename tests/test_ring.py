@@ -215,7 +215,7 @@ def test_as_context_manager_frames_say_afterwards_whether_they_were_whole(writer
     assert isinstance(frames, Frames)
     with frames as data:
         assert data[3].view(np.int64)[0] == 3
-    assert frames.intact
+    assert frames.valid()
     assert writer.status().readers[0].received == 8
 
 
@@ -394,7 +394,7 @@ def test_whatever_happens_each_frame_is_received_or_lost_once(script: list[Step]
         for reader, items in zip(readers, taken, strict=True):
             items.extend(drain(reader))
             assert items[-1] == End(writer.next_frame, EndReason.FINISHED)
-            told = [item for item in items if isinstance(item, Gap) or (isinstance(item, Frames) and item.intact)]
+            told = [item for item in items if isinstance(item, Gap) or (isinstance(item, Frames) and item.valid())]
             assert assert_contiguous(told) == writer.next_frame
         for row in writer.status().readers:
             assert row.received + row.lost == row.next_frame == writer.next_frame

@@ -22,7 +22,7 @@ class Frames:
     """Frames `first` to `first + count - 1`, lying in the ring itself.
 
     The writer does not wait, so what was computed from `data` counts only if `release` says afterwards that the frames
-    were whole all the time. As a context manager it yields `data` and releases at the end; ask `intact` then.
+    were whole all the time. As a context manager it yields `data` and releases at the end; ask `valid` then.
     """
 
     def __init__(self, reader: "RingReader", first: int, data: NDArray[np.uint8], slot: int) -> None:
@@ -35,7 +35,7 @@ class Frames:
         """Compact frames, uint8 [count, frame_bytes], read-only."""
 
     def valid(self) -> bool:
-        """Whether the frames have not been overwritten up to now."""
+        """Whether the frames have not been overwritten up to now, or up to their release."""
         return self._reader._holds(self._slot) if self._intact is None else self._intact
 
     def release(self) -> bool:
@@ -46,11 +46,6 @@ class Frames:
         if self._intact is None:
             self._intact = self._reader._settle(self)
         return self._intact
-
-    @property
-    def intact(self) -> bool:
-        """Releases, and says what `release` said."""
-        return self.release()
 
     def __enter__(self) -> NDArray[np.uint8]:
         return self.data

@@ -104,5 +104,5 @@ class Sensor:
         return frame / self.frame_rate_hz
 
     def compact(self) -> "Sensor":
-        """The same camera with frames stored compactly, which is how the ring holds them."""
-        return replace(self, layout=Layout.COMPACT)
+        """The same camera with frames stored compactly and LSB first, which is how the ring holds them."""
+        return replace(self, layout=Layout.COMPACT, bit_order=BitOrder.LSB)

@@ -1,0 +1,89 @@
+"""Which camera a file without a sidecar comes from: the known flavours of camera.md, and guessing among them."""
+
+from dataclasses import dataclass
+from enum import Enum, StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.errors import RecordingError
+from spiked.sensor import Layout
+
+DEFAULT_RATE_HZ = 20_000.0
+
+
+class OriginKind(StrEnum):
+    """Where a recording's geometry comes from."""
+
+    GIVEN = "given"
+    SIDECAR = "sidecar"
+    GUESSED = "guessed"
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a recording's geometry comes from, and how to say it."""
+
+    kind: OriginKind
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Format:
+    """A size and layout that recordings are known to have."""
+
+    width: int
+    height: int
+    frame_bytes: int
+    layout: Layout | None
+    """None: known, but this library cannot read it."""
+    name: str
+
+
+class Flavour(Enum):
+    """The known flavours of frame data, by the letters of camera.md."""
+
+    A = Format(400, 250, 12_500, Layout.COMPACT, "compact 400x250")
+    B = Format(400, 250, 13_000, Layout.ROW_TAGGED, "row-tagged 400x250")
+    C = Format(400, 250, 13_016, None, "USB3 wire data 400x250")
+    D = Format(1000, 1000, 125_000, Layout.COMPACT, "compact 1000x1000")
+    E = Format(1000, 1000, 128_000, None, "PCIe capture 1000x1000")
+    F_600 = Format(600, 400, 30_000, Layout.COMPACT, "simulated 600x400")
+    F_640 = Format(640, 360, 28_800, Layout.COMPACT, "simulated 640x360")
+    F_320 = Format(320, 180, 7_200, Layout.COMPACT, "simulated 320x180")
+    F_1280 = Format(1280, 720, 115_200, Layout.COMPACT, "simulated 1280x720")
+
+
+WIRE_MAGIC = bytes.fromhex("00636063")
+
+
+def tags_agree(frames: NDArray[np.uint8], height: int, row_bytes: int) -> NDArray[np.bool_]:
+    """Whether the row numbers of row-tagged frames, uint8 [n, frame_bytes], are 0..height - 1: bool [n]."""
+    tags = frames.reshape(len(frames), height, row_bytes + 2)[:, :, row_bytes:]
+    numbers = tags[..., 0] + 256 * tags[..., 1].astype(np.uint16)
+    agree: NDArray[np.bool_] = (numbers == np.arange(height, dtype=np.uint16)).all(axis=1)
+    return agree
+
+
+def guess(name: str, data: NDArray[np.uint8]) -> Format:
+    """The one known flavour whose frames fill `data` (the file's bytes) exactly; `name` is for messages.
+
+    Row numbers tell flavour B from anything else; the others are told by size alone. Raises RecordingError when none
+    or several fit.
+    """
+    tagged: Format = Flavour.B.value
+    if data.size % tagged.frame_bytes == 0 and tags_agree(data[: tagged.frame_bytes][None], 250, 50).all():
+        return tagged
+    if WIRE_MAGIC in data[: 4 * Flavour.C.value.frame_bytes].tobytes() and data.size % 12_500:
+        raise RecordingError(
+            f"{name}: this looks like {Flavour.C.value.name}, which must be unpacked by the driver first"
+        )
+    fits: list[Format] = [f.value for f in Flavour if data.size % f.value.frame_bytes == 0 and f is not Flavour.B]
+    readable = [f for f in fits if f.layout is not None]
+    if len(readable) == 1:
+        return readable[0]
+    if not readable:
+        known = f"; it would fit {fits[0].name}, which cannot be read" if fits else ""
+        raise RecordingError(f"{name}: {data.size} bytes fit no known flavour{known}; give its width and height")
+    options = " or ".join(f"{f.name} ({data.size // f.frame_bytes} frames)" for f in readable)
+    raise RecordingError(f"{name}: {data.size} bytes may be {options}; give its width and height")

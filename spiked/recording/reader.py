@@ -1,0 +1,287 @@
+"""Reading recordings by memory map."""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.errors import ConfigurationError, RecordingError
+from spiked.recording.geometry import DEFAULT_RATE_HZ, Origin, OriginKind, guess, tags_agree
+from spiked.recording.sidecar import (
+    ClockPair,
+    Gap,
+    Sidecar,
+    find_spikecv_config,
+    read_sidecar,
+    read_spikecv_config,
+    sidecar_path,
+)
+from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
+
+REVERSED_BITS = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)[:, ::-1], axis=1)[:, 0]
+"""Each byte with its bits in the other order, uint8 [256]."""
+
+_MAGICS = {
+    b"\x89PNG\r\n\x1a\n": "a PNG picture",
+    b"\xff\xd8\xff\xe0": "a JPEG picture",
+    b"\xff\xd8\xff\xe1": "a JPEG picture",
+    b"\xff\xd8\xff\xdb": "a JPEG picture",
+    b"PK\x03\x04": "a ZIP archive",
+    b"\x93NUMPY": "a NumPy array",
+    b"\x89HDF\r\n\x1a\n": "an HDF5 file",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """An open recording. Frames stay on disk until they are looked at."""
+
+    path: Path
+    sensor: Sensor
+    frames: int
+    """Whole frames in the file."""
+    origin: Origin
+    """Where the geometry comes from."""
+    warnings: tuple[str, ...]
+    """What a user should know, one sentence each."""
+    contradictions: tuple[str, ...]
+    """What makes the file unusable; only `verify` lets such a recording be."""
+    trailing_bytes: int
+    """Bytes of an unfinished last frame."""
+    gaps: tuple[Gap, ...]
+    clock: tuple[ClockPair, ...]
+    label_types: tuple[float, ...]
+    """SpikeCV's numbers of the label types, when a config.yaml names them."""
+    data: NDArray[np.uint8]
+    """The whole frames as stored, uint8 [frames, frame_bytes], a read-only memory map."""
+
+    @property
+    def seconds(self) -> float:
+        """Length of the whole frames in the file."""
+        return self.sensor.seconds(self.frames)
+
+    def read(self, first: int, count: int) -> NDArray[np.uint8]:
+        """Stored frames, uint8 [count, frame_bytes], a view of the memory map. Raises RecordingError out of range."""
+        if first < 0 or count < 0 or first + count > self.frames:
+            raise RecordingError(
+                f"{self.path}: frames {first} to {first + count - 1} are not within its {self.frames} frames"
+            )
+        return self.data[first : first + count]
+
+    def compact(self, first: int, count: int) -> NDArray[np.uint8]:
+        """Frames without row numbers and LSB first, in stored row order, uint8 [count, height * row_bytes].
+
+        A view where the file is stored so.
+        """
+        frames = self.read(first, count)
+        if self.sensor.layout is Layout.ROW_TAGGED:
+            rows = frames.reshape(count, self.sensor.height, self.sensor.row_stride)[:, :, : self.sensor.row_bytes]
+            frames = rows.reshape(count, self.sensor.height * self.sensor.row_bytes)
+        return REVERSED_BITS[frames] if self.sensor.bit_order is BitOrder.MSB else frames
+
+    def frame(self, k: int) -> NDArray[np.bool_]:
+        """One upright frame, bool [height, width]."""
+        bits = np.unpackbits(self.compact(k, 1)[0], bitorder="little").reshape(self.sensor.height, self.sensor.width)
+        return (bits[::-1] if self.sensor.flipped else bits).astype(np.bool_)
+
+    def chunks(self, count: int = 256) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """All frames in order: (index of the first, stored frames uint8 [<= count, frame_bytes])."""
+        for first in range(0, self.frames, count):
+            yield first, self.read(first, min(count, self.frames - first))
+
+    def capture_index(self, k: int) -> int:
+        """Index in the capture of stored frame k: k plus the frames lost before it."""
+        for gap in sorted(self.gaps, key=lambda gap: gap.first):
+            if gap.first > k:
+                break
+            k += gap.count
+        return k
+
+
+def open_recording(
+    path: str | os.PathLike[str],
+    *,
+    width: int | None = None,
+    height: int | None = None,
+    frame_rate_hz: float | None = None,
+    layout: Layout | None = None,
+    bit_order: BitOrder | None = None,
+    flipped: bool | None = None,
+    mosaic: Mosaic | None = None,
+    intrinsics: Intrinsics | None = None,
+) -> Recording:
+    """Open a `.dat` file. Arguments win over its sidecar or SpikeCV's config.yaml, these over a guess from its size.
+
+    Raises RecordingError with one line that says what is wrong with the file, its sidecar or the arguments.
+    """
+    given = Given(width, height, frame_rate_hz, layout, bit_order, flipped, mosaic, intrinsics)
+    recording = open_unchecked(Path(path), given)
+    if recording.contradictions:
+        raise RecordingError(f"{recording.path}: {recording.contradictions[0]}")
+    return recording
+
+
+@dataclass(frozen=True)
+class Given:
+    """What the caller says about a recording; None: nothing."""
+
+    width: int | None = None
+    height: int | None = None
+    frame_rate_hz: float | None = None
+    layout: Layout | None = None
+    bit_order: BitOrder | None = None
+    flipped: bool | None = None
+    mosaic: Mosaic | None = None
+    intrinsics: Intrinsics | None = None
+
+    def fields(self) -> dict[str, object]:
+        """What is said, by the names of `Sensor`'s fields."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+    @property
+    def geometry(self) -> bool:
+        """Whether it changes how bytes become frames."""
+        return any(value is not None for value in (self.width, self.height, self.layout))
+
+
+def open_unchecked(path: Path, given: Given) -> Recording:
+    """As `open_recording`, but contradictions are noted in the recording and not raised."""
+    data = _map(path)
+    described = _describe(path, data, given)
+    sensor = described.sensor
+    frames, trailing = divmod(data.size, sensor.frame_bytes)
+    if frames == 0:
+        raise RecordingError(
+            f"{path}: its {data.size} bytes are less than one frame of {sensor.width}x{sensor.height} "
+            f"({sensor.frame_bytes} bytes); check the geometry"
+        )
+    warnings, contradictions = list(described.warnings), []
+    if trailing:
+        warnings.append(f"the last frame is truncated to {trailing} of {sensor.frame_bytes} bytes and is left out")
+    sidecar = described.sidecar
+    if sidecar is not None and sidecar.frames is None:
+        warnings.append("the recording was not finished: its sidecar names no number of frames")
+    # A file cut within its last frame is the common interruption; anything else is another file's sidecar.
+    elif sidecar is not None and not given.geometry and sidecar.frames not in (frames, frames + (trailing > 0)):
+        contradictions.append(
+            f"its sidecar {sidecar_path(path).name} says {sidecar.frames} frames of {sensor.width}x{sensor.height}, "
+            f"but the file's {data.size} bytes hold {frames}; mend the sidecar or give the geometry"
+        )
+    whole = data[: frames * sensor.frame_bytes].reshape(frames, sensor.frame_bytes)
+    if sensor.layout is Layout.ROW_TAGGED:
+        samples = sorted({0, frames // 2, frames - 1})
+        wrong = [k for k in samples if not tags_agree(whole[k : k + 1], sensor.height, sensor.row_bytes)[0]]
+        if wrong:
+            contradictions.append(
+                f"the row numbers of frame {wrong[0]} are not 0..{sensor.height - 1}: the file is not row-tagged "
+                f"{sensor.width}x{sensor.height} or is damaged; check layout and geometry"
+            )
+    return Recording(
+        path,
+        sensor,
+        frames,
+        described.origin,
+        tuple(warnings),
+        tuple(contradictions),
+        trailing,
+        sidecar.gaps if sidecar else (),
+        sidecar.clock if sidecar else (),
+        described.label_types,
+        whole,
+    )
+
+
+def _map(path: Path) -> NDArray[np.uint8]:
+    """The file's bytes, uint8 [size], without loading them."""
+    try:
+        if path.is_dir():
+            raise RecordingError(f"{path}: this is a directory; name the .dat file in it")
+        with path.open("rb") as file:
+            head = file.read(16)
+            for magic, what in _MAGICS.items():
+                if head.startswith(magic):
+                    raise RecordingError(f"{path}: this is {what}, not a recording")
+            if not head:
+                raise RecordingError(f"{path}: the file is empty")
+            return np.asarray(np.memmap(file, np.uint8, "r"))
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+@dataclass(frozen=True)
+class _Description:
+    sensor: Sensor
+    origin: Origin
+    warnings: tuple[str, ...] = ()
+    sidecar: Sidecar | None = None
+    label_types: tuple[float, ...] = ()
+
+
+def _describe(path: Path, data: NDArray[np.uint8], given: Given) -> _Description:
+    described = _from_sidecar(path) or _from_spikecv(path, given) or _from_size(path, data, given)
+    fields = given.fields()
+    if not fields or described.origin.kind is not OriginKind.SIDECAR:
+        return described
+    sensor = _replaced(path, described.sensor, fields)
+    changed = [name for name in fields if getattr(sensor, name) != getattr(described.sensor, name)]
+    if not changed:
+        return described
+    told = ", ".join(f"{name} {getattr(sensor, name)} (not {getattr(described.sensor, name)})" for name in changed)
+    origin = Origin(OriginKind.GIVEN, f"{told} as given, the rest {described.origin.sentence}")
+    warnings = (*described.warnings, f"what was given contradicts the sidecar: {told}")
+    return replace(described, sensor=sensor, origin=origin, warnings=warnings)
+
+
+def _replaced(path: Path, sensor: Sensor, fields: dict[str, object]) -> Sensor:
+    try:
+        return replace(sensor, **fields)  # type: ignore[arg-type]
+    except ConfigurationError as error:
+        raise RecordingError(f"{path}: {error}") from error
+
+
+def _from_sidecar(path: Path) -> _Description | None:
+    beside = sidecar_path(path)
+    if not beside.exists():
+        return None
+    sidecar = read_sidecar(beside)
+    return _Description(
+        sidecar.sensor(), Origin(OriginKind.SIDECAR, f"from the sidecar {beside.name}"), sidecar=sidecar
+    )
+
+
+def _from_spikecv(path: Path, given: Given) -> _Description | None:
+    if given.width is not None and given.height is not None:
+        return None
+    beside = find_spikecv_config(path)
+    config = read_spikecv_config(beside) if beside else None
+    if beside is None or config is None:
+        return None
+    sensor = _replaced(path, Sensor(8, 1, DEFAULT_RATE_HZ), {"width": config.spike_w, "height": config.spike_h})
+    sentence = f"{sensor.width}x{sensor.height} from SpikeCV's {beside.name}, which knows sizes only; {_assumed(given)}"
+    return _Description(sensor, Origin(OriginKind.SIDECAR, sentence), label_types=config.labeled_data_type)
+
+
+def _from_size(path: Path, data: NDArray[np.uint8], given: Given) -> _Description:
+    if (given.width is None) != (given.height is None):
+        raise RecordingError(f"{path}: give both width and height, or neither")
+    if given.width is not None:
+        sensor = _replaced(path, Sensor(8, 1, DEFAULT_RATE_HZ), given.fields())
+        return _Description(
+            sensor, Origin(OriginKind.GIVEN, f"{sensor.width}x{sensor.height} as given; {_assumed(given)}")
+        )
+    flavour = guess(str(path), data)
+    fields = {"width": flavour.width, "height": flavour.height, "layout": flavour.layout, **given.fields()}
+    sensor = _replaced(path, Sensor(8, 1, DEFAULT_RATE_HZ), fields)
+    sentence = f"{flavour.name}, the only known flavour that fits the file; {_assumed(given)}"
+    return _Description(sensor, Origin(OriginKind.GUESSED, sentence))
+
+
+def _assumed(given: Given) -> str:
+    rate = f"{DEFAULT_RATE_HZ:g} Hz" if given.frame_rate_hz is None else ""
+    rows = "rows bottom-up" if given.flipped is None else ""
+    bits = "least significant bit first" if given.bit_order is None else ""
+    assumed = ", ".join(part for part in (rate, rows, bits) if part)
+    return f"assumed: {assumed}" if assumed else "nothing assumed"

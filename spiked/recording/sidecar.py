@@ -1,0 +1,175 @@
+"""The JSON file beside a recording, `NAME.json` beside `NAME.dat`, and the `config.yaml` of SpikeCV's data sets."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from spiked.errors import ConfigurationError, RecordingError
+from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Gap(_Strict):
+    """Frames of the capture that are missing from the file."""
+
+    first: int = Field(ge=0)
+    """Index in the capture, counted from the recording's first frame."""
+    count: int = Field(gt=0)
+    cause: str
+    """Where they were lost: device, usb, ring or disk."""
+
+
+class ClockPair(_Strict):
+    """The host's clock when a frame arrived."""
+
+    frame: int = Field(ge=0)
+    unix_ns: int
+
+
+class _Pinhole(_Strict):
+    fx: float = Field(gt=0)
+    fy: float = Field(gt=0)
+    cx: float
+    cy: float
+
+
+class Sidecar(BaseModel):
+    """What a sidecar says. Fields that this version does not know are kept by `read_sidecar` and written back."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
+
+    format: Layout
+    width: int = Field(gt=0, strict=True)
+    height: int = Field(gt=0, strict=True)
+    frame_rate: float = Field(gt=0)
+    """Frames a second."""
+    frames: int | None = Field(ge=0)
+    """Whole frames in the file; null while the recording runs, and so after a crash."""
+    bit_order: BitOrder
+    flipped: bool = Field(strict=True)
+    """Rows are stored bottom-up."""
+    cfa: Mosaic | None = None
+    """Colour pattern of the upright image."""
+    intrinsics: _Pinhole | None = None
+    pixel_centre: float = Field(0.5, ge=0, le=0.5)
+    """Where the intrinsics put the centre of the first pixel."""
+    note: str = ""
+    gaps: tuple[Gap, ...] = ()
+    clock: tuple[ClockPair, ...] = ()
+    calibration: str | None = None
+    """Calibration file, relative to the sidecar."""
+    device: dict[str, Any] | None = None
+    """What the camera said about itself."""
+
+    @classmethod
+    def of(cls, sensor: Sensor, frames: int | None, **more: Any) -> "Sidecar":
+        """The sidecar of a recording of `sensor`; `more` are further fields."""
+        k = sensor.intrinsics
+        return cls(
+            format=sensor.layout,
+            width=sensor.width,
+            height=sensor.height,
+            frame_rate=sensor.frame_rate_hz,
+            frames=frames,
+            bit_order=sensor.bit_order,
+            flipped=sensor.flipped,
+            cfa=sensor.mosaic,
+            intrinsics=None if k is None else _Pinhole(fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy),
+            **more,
+        )
+
+    def sensor(self) -> Sensor:
+        """The camera it describes. Raises ConfigurationError for a geometry that cannot be."""
+        k = self.intrinsics
+        shift = 0.5 - self.pixel_centre
+        return Sensor(
+            self.width,
+            self.height,
+            self.frame_rate,
+            self.format,
+            self.bit_order,
+            self.flipped,
+            self.cfa,
+            None if k is None else Intrinsics(k.fx, k.fy, k.cx + shift, k.cy + shift),
+        )
+
+
+def sidecar_path(recording: Path) -> Path:
+    """Where the sidecar of a recording is."""
+    return recording.with_suffix(".json")
+
+
+def read_sidecar(path: Path) -> Sidecar:
+    """Read and check a sidecar. Raises RecordingError in one line that names the field."""
+    try:
+        sidecar = Sidecar.model_validate_json(path.read_bytes())
+        sidecar.sensor()
+    except OSError as error:
+        raise RecordingError(f"{path}: the sidecar cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        raise RecordingError(f"{path}: {_first_problem(error)}; mend the sidecar") from error
+    except ConfigurationError as error:
+        raise RecordingError(f"{path}: {error}; mend the sidecar") from error
+    return sidecar
+
+
+def _first_problem(error: ValidationError) -> str:
+    problem = error.errors(include_url=False)[0]
+    field = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "missing":
+        return f"field {field!r} is missing"
+    if not field:
+        return f"not a JSON object of a sidecar: {problem['msg']}"
+    return f"field {field!r} is {problem['input']!r}: {problem['msg']}"
+
+
+def write_sidecar(path: Path, sidecar: Sidecar) -> None:
+    """Write a sidecar so that after a crash there is the old one or the new one, whole. Raises OSError."""
+    temporary = path.with_name(path.name + ".part")
+    with temporary.open("w", encoding="utf-8") as file:
+        file.write(sidecar.model_dump_json(indent=1))
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+class SpikeCvConfig(BaseModel):
+    """`config.yaml` of a SpikeCV data set: it knows sizes and labels, but neither rate nor orientation."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    spike_w: int = Field(gt=0)
+    spike_h: int = Field(gt=0)
+    is_labeled: bool = False
+    labeled_data_type: tuple[float, ...] = ()
+    """SpikeCV's ids: 0 none, 1 reconstruction, 2 flow, 3.1 and 3.2 depth, 4 detection, 5 tracking, 6 recognition."""
+
+
+def find_spikecv_config(recording: Path) -> Path | None:
+    """`config.yaml` in the recording's folder or, as in data sets with subfolders, in the one above."""
+    folder = recording.absolute().parent
+    for path in (folder / "config.yaml", folder.parent / "config.yaml"):
+        if path.is_file():
+            return path
+    return None
+
+
+def read_spikecv_config(path: Path) -> SpikeCvConfig | None:
+    """Read a SpikeCV configuration; None when the file is somebody else's (it has neither size field)."""
+    try:
+        content = yaml.safe_load(path.read_bytes())
+        if not isinstance(content, dict) or not content.keys() & {"spike_w", "spike_h"}:
+            return None
+        return SpikeCvConfig.model_validate(content)
+    except OSError as error:
+        raise RecordingError(f"{path}: the configuration cannot be read: {error.strerror}") from error
+    except yaml.YAMLError as error:
+        raise RecordingError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
+    except ValidationError as error:
+        raise RecordingError(f"{path}: {_first_problem(error)}; mend it or give the geometry yourself") from error

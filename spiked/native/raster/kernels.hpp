@@ -42,9 +42,12 @@ struct Record {
     float p, q, r;
     float log2_opacity;
     float z;
-    float radius;  // px, largest half axis of the ellipse where alpha reaches 1/255
+    float radius;   // px, largest half axis of the ellipse where alpha reaches 1/255
+    float half_y;   // px, of that ellipse's box
+    float extreme;  // px, where its rightmost point is above or below the mean; the leftmost is opposite
+    float over_p;
     float colour[3];
-    float unused[5];
+    float unused[2];
 };
 static_assert(sizeof(Record) == 64, "a record is a cache line");
 
@@ -69,7 +72,8 @@ struct Tile {
     int count;
     int tile_x, tile_y;
     float* local;      // scratch, 16 floats an entry
-    uint32_t* listed;  // scratch, an integer an entry
+    uint32_t* listed;  // scratch, an integer an entry and kGroup more
+    uint16_t* blocks;  // scratch, likewise
 };
 
 // Of one tile of one sub-pose, kept for the backward pass. Pixels in tile order.
@@ -90,6 +94,17 @@ struct TileImage {
     float weight[kTilePixels], alpha[kTilePixels], depth[kTilePixels];
 };
 
+struct SplatArrays {  // C-contiguous: [count][3], [count][4], [count][3], [count], [count][colours]
+    int count, colours;
+    const float *means, *quats, *log_scales, *opacity_logits, *colour;
+};
+
+struct GradientArrays {  // the same shapes; rotation and centre [sub-poses][3]
+    float *means, *quats, *log_scales, *opacity_logits, *colour;
+    double *rotation, *centre;
+    float *contribution, *radius_px;
+};
+
 struct SplatGradients {  // arrays of `stride` floats; summed over sub-poses
     float* mean[3];
     float* spread[9];
@@ -100,9 +115,9 @@ struct SplatGradients {  // arrays of `stride` floats; summed over sub-poses
 
 struct Kernels {
     const char* name;
-    // means [n][3], quats [n][4], log_scales [n][3], logits [n] to the arrays of Prepared; a whole group at a time.
-    void (*prepare)(const float* means, const float* quats, const float* log_scales, const float* logits, int count,
-                    int first, int last, float* const mean[3], float* const spread[9], float* log2_opacity);
+    // From the splats to the arrays of Prepared, a whole group at a time; beyond the count the last splat is repeated.
+    void (*prepare)(const SplatArrays&, int first, int last, float* const mean[3], float* const spread[9],
+                    float* log2_opacity);
     // Writes records[first..last) and keys (bits of z, or kCulled).
     void (*project)(const Prepared&, const Lens&, const View&, int count, int first, int last, Record* records,
                     uint32_t* keys);
@@ -117,6 +132,10 @@ struct Kernels {
     // pose: 3 of rotation, then 3 of the mean, added up.
     void (*unproject)(const Prepared&, const Lens&, const View&, int first, const float* sums, const uint8_t* visible,
                       int colours, const SplatGradients&, double pose[6]);
+    // From the gradients of spread, log opacity and so on to those of the parameters, for splats [first, last); zeros
+    // where out.radius_px is 0. share_scale multiplies the contributions.
+    void (*finish)(const SplatArrays&, const Prepared&, const SplatGradients&, int first, int last, float share_scale,
+                   const GradientArrays& out);
 };
 
 extern const Kernels kBaseline;

@@ -13,5 +13,5 @@ namespace {
 // clang-format on
 }  // namespace
 
-const Kernels kAvx2 = {"avx2", prepare, project, emit, forward, store_tile, backward, unproject};
+const Kernels kAvx2 = {"avx2", prepare, project, emit, forward, store_tile, backward, unproject, finish};
 }  // namespace raster

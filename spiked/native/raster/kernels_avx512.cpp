@@ -13,5 +13,5 @@ namespace {
 // clang-format on
 }  // namespace
 
-const Kernels kAvx512 = {"avx512", prepare, project, emit, forward, store_tile, backward, unproject};
+const Kernels kAvx512 = {"avx512", prepare, project, emit, forward, store_tile, backward, unproject, finish};
 }  // namespace raster

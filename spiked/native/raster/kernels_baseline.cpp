@@ -15,5 +15,5 @@ namespace {
 // clang-format on
 }  // namespace
 
-const Kernels kBaseline = {"baseline", prepare, project, emit, forward, store_tile, backward, unproject};
+const Kernels kBaseline = {"baseline", prepare, project, emit, forward, store_tile, backward, unproject, finish};
 }  // namespace raster

@@ -6,29 +6,53 @@ constexpr float kLog2Cut = 7.994353437f;    // log2(255)
 constexpr float kHalfLog2e = 0.721347520f;  // log2(e) / 2
 constexpr float kLog2e = 1.442695041f;
 
-static void prepare(const float* means, const float* quats, const float* log_scales, const float* logits, int count,
-                    int first, int last, float* const mean[3], float* const spread[9], float* log2_opacity) {
-    alignas(64) float in[11][kLanes];
+// Columns of an array of rows, kLanes rows from `first`; beyond the count the last row is repeated.
+template <int Columns>
+static inline void read_rows(const float* rows, int first, int count, Vec out[Columns]) {
+    alignas(64) float in[Columns][kLanes];
+    for (int i = 0; i < kLanes; ++i) {
+        const float* row = rows + (int64_t)Columns * (first + i < count ? first + i : count - 1);
+        for (int k = 0; k < Columns; ++k) in[k][i] = row[k];
+    }
+    for (int k = 0; k < Columns; ++k) out[k] = load(in[k]);
+}
+
+template <int Columns>
+static inline void write_rows(float* rows, int first, int last, const Vec in[Columns]) {
+    alignas(64) float out[Columns][kLanes];
+    for (int k = 0; k < Columns; ++k) store(out[k], in[k]);
+    for (int i = 0; i < kLanes && first + i < last; ++i)
+        for (int k = 0; k < Columns; ++k) rows[(int64_t)Columns * (first + i) + k] = out[k][i];
+}
+
+// Makes a quaternion wxyz a unit one; returns the factor.
+static inline Vec normalise(Vec q[4]) {
+    Vec scale = 1.0f / root(max(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3], splat(1e-24f)));
+    for (int k = 0; k < 4; ++k) q[k] *= scale;
+    return scale;
+}
+
+static inline Vec scale_of(Vec log_scale) { return exp2_fine(clamp(log_scale, splat(-30.0f), splat(30.0f)) * kLog2e); }
+
+static void prepare(const SplatArrays& splats, int first, int last, float* const mean[3], float* const spread[9],
+                    float* log2_opacity) {
     for (int base = first; base < last; base += kLanes) {
-        for (int i = 0; i < kLanes; ++i) {
-            int n = base + i < count ? base + i : count - 1;
-            for (int k = 0; k < 3; ++k) in[k][i] = means[3 * n + k];
-            for (int k = 0; k < 4; ++k) in[3 + k][i] = quats[4 * n + k];
-            for (int k = 0; k < 3; ++k) in[7 + k][i] = log_scales[3 * n + k];
-            in[10][i] = logits[n];
-        }
-        for (int k = 0; k < 3; ++k) store(mean[k] + base, load(in[k]));
-        Vec w = load(in[3]), x = load(in[4]), y = load(in[5]), z = load(in[6]);
-        Vec scale = 1.0f / root(max(w * w + x * x + y * y + z * z, splat(1e-24f)));
-        w *= scale, x *= scale, y *= scale, z *= scale;
+        Vec position[3], quat[4], log_scale[3], logit;
+        read_rows<3>(splats.means, base, splats.count, position);
+        read_rows<4>(splats.quats, base, splats.count, quat);
+        read_rows<3>(splats.log_scales, base, splats.count, log_scale);
+        read_rows<1>(splats.opacity_logits, base, splats.count, &logit);
+        for (int k = 0; k < 3; ++k) store(mean[k] + base, position[k]);
+        normalise(quat);
+        Vec w = quat[0], x = quat[1], y = quat[2], z = quat[3];
         Vec rotation[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z),     2 * (x * z + w * y),
                            2 * (x * y + w * z),     1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
                            2 * (x * z - w * y),     2 * (y * z + w * x),     1 - 2 * (x * x + y * y)};
         for (int k = 0; k < 3; ++k) {
-            Vec s = exp2_fine(clamp(load(in[7 + k]), splat(-30.0f), splat(30.0f)) * kLog2e);
+            Vec s = scale_of(log_scale[k]);
             for (int row = 0; row < 3; ++row) store(spread[3 * row + k] + base, rotation[3 * row + k] * s);
         }
-        Vec logit = clamp(load(in[10]), splat(-30.0f), splat(30.0f));
+        logit = clamp(logit, splat(-30.0f), splat(30.0f));
         store(log2_opacity + base, 0.0f - log2_fine(1.0f + exp2_fine(-kLog2e * logit)));
     }
 }
@@ -83,7 +107,7 @@ static inline Projection project_lanes(const Prepared& s, const Lens& lens, cons
 
 static void project(const Prepared& splats, const Lens& lens, const View& view, int count, int first, int last,
                     Record* records, uint32_t* keys) {
-    alignas(64) float out[8][kLanes];
+    alignas(64) float out[11][kLanes];
     alignas(64) int32_t seen[kLanes];
     for (int base = first; base < last; base += kLanes) {
         Projection o = project_lanes(splats, lens, view, base);
@@ -99,19 +123,17 @@ static void project(const Prepared& splats, const Lens& lens, const View& view, 
                      (v - half_y <= lens.height - 0.5f);
         Int sound = is_finite(u + v) & is_finite(o.determinant) & is_finite(radius) & (o.p > 0.0f) & is_finite(o.q);
         Int visible = inside & sound & (o.z >= lens.near) & (reach >= 0.0f);
-        const Vec fields[8] = {u, v, o.p, o.q, o.r, log2_opacity, o.z, radius};
-        for (int k = 0; k < 8; ++k) store(out[k], fields[k]);
+        const Vec fields[11] = {u,         v, o.p, o.q, o.r, log2_opacity, o.z, radius, half_y, o.xy / o.xx * half_x,
+                                1.0f / o.p};
+        for (int k = 0; k < 11; ++k) store(out[k], fields[k]);
         __builtin_memcpy(seen, &visible, sizeof seen);
         for (int i = 0; i < kLanes && base + i < count; ++i) {
             keys[base + i] = kCulled;
             if (!seen[i]) continue;
             __builtin_memcpy(&keys[base + i], &out[6][i], 4);
-            Record& record = records[base + i];
-            record.x = out[0][i], record.y = out[1][i];
-            record.p = out[2][i], record.q = out[3][i], record.r = out[4][i];
-            record.log2_opacity = out[5][i];
-            record.z = out[6][i];
-            record.radius = out[7][i];
+            // The fields are the record's first eleven floats, in order.
+            float* record = &records[base + i].x;
+            for (int k = 0; k < 11; ++k) record[k] = out[k][i];
         }
     }
 }
@@ -180,5 +202,52 @@ static void unproject(const Prepared& splats, const Lens& lens, const View& view
                 pose[3 + k] += d_mean[k][i];
             }
         }
+    }
+}
+
+static void finish(const SplatArrays& splats, const Prepared& prepared, const SplatGradients& sums, int first, int last,
+                   float share_scale, const GradientArrays& out) {
+    for (int base = first; base < last; base += kLanes) {
+        Vec radius, logit, quat[4], log_scale[3];
+        read_rows<1>(out.radius_px, base, last, &radius);
+        read_rows<1>(splats.opacity_logits, base, last, &logit);
+        read_rows<4>(splats.quats, base, last, quat);
+        read_rows<3>(splats.log_scales, base, last, log_scale);
+        // What was never seen may not even be finite.
+        const Int seen = radius > 0.0f;
+        auto write = [&](float* rows, Vec v) {
+            v = choose(seen, v, Vec{});
+            write_rows<1>(rows, base, last, &v);
+        };
+        write(out.contribution, load(sums.share + base) * share_scale);
+        write(out.opacity_logits,
+              load(sums.log_opacity + base) / (1.0f + exp2_fine(clamp(logit, splat(-30.0f), splat(30.0f)) * kLog2e)));
+
+        Vec mean[3], colour[3], d[9], d_log_scale[3];  // d: of the rotation, row-major
+        for (int k = 0; k < 3; ++k) mean[k] = load(sums.mean[k] + base);
+        write_rows<3>(out.means, base, last, mean);
+        for (int k = 0; k < splats.colours; ++k) colour[k] = load(sums.colour[k] + base);
+        if (splats.colours == 1) write_rows<1>(out.colour, base, last, colour);
+        if (splats.colours == 3) write_rows<3>(out.colour, base, last, colour);
+        for (int j = 0; j < 3; ++j) {
+            Vec scale = scale_of(log_scale[j]), along{};
+            for (int i = 0; i < 3; ++i) {
+                Vec g = load(sums.spread[3 * i + j] + base);
+                along += g * load(prepared.spread[3 * i + j] + base);
+                d[3 * i + j] = g * scale;
+            }
+            d_log_scale[j] = choose(seen, along, Vec{});
+        }
+        write_rows<3>(out.log_scales, base, last, d_log_scale);
+
+        const Vec over = normalise(quat);
+        const Vec w = quat[0], x = quat[1], y = quat[2], z = quat[3];
+        Vec g[4] = {2.0f * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1])),
+                    2.0f * (w * (d[7] - d[5]) + y * (d[1] + d[3]) + z * (d[2] + d[6]) - 2.0f * x * (d[4] + d[8])),
+                    2.0f * (w * (d[2] - d[6]) + x * (d[1] + d[3]) + z * (d[5] + d[7]) - 2.0f * y * (d[0] + d[8])),
+                    2.0f * (w * (d[3] - d[1]) + x * (d[2] + d[6]) + y * (d[5] + d[7]) - 2.0f * z * (d[0] + d[4]))};
+        const Vec radial = w * g[0] + x * g[1] + y * g[2] + z * g[3];
+        for (int k = 0; k < 4; ++k) g[k] = choose(seen, (g[k] - quat[k] * radial) * over, Vec{});
+        write_rows<4>(out.quats, base, last, g);
     }
 }

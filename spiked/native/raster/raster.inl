@@ -34,7 +34,31 @@ static void localise(const Tile& tile) {
         out[kLog2Opacity] = in.log2_opacity;
         out[kZ] = in.z;
         for (int k = 0; k < C; ++k) out[kC + k] = in.colour[k];
+        tile.blocks[i] = (uint16_t)tile.entries[i].blocks;
     }
+    for (int i = 0; i < kGroup; ++i) tile.blocks[tile.count + i] = 0;
+}
+
+// Lists the entries that reach a block; writes up to kGroup places beyond what it keeps.
+static inline int list_block(const Tile& tile, int block) {
+    int listed = 0;
+#if defined(__AVX512F__)
+    __m512i number = _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
+    const __m256i bit = _mm256_set1_epi16((short)(1 << block));
+    for (int i = 0; i < tile.count; i += kGroup) {
+        const __mmask16 kept = _mm256_test_epi16_mask(_mm256_loadu_si256((const __m256i*)(tile.blocks + i)), bit);
+        // Compressed in a register: straight to memory is slow on some machines.
+        _mm512_storeu_si512(tile.listed + listed, _mm512_maskz_compress_epi32(kept, number));
+        listed += __builtin_popcount(kept);
+        number = _mm512_add_epi32(number, _mm512_set1_epi32(kGroup));
+    }
+#else
+    for (int i = 0; i < tile.count; ++i) {
+        tile.listed[listed] = i;
+        listed += tile.blocks[i] >> block & 1;
+    }
+#endif
+    return listed;
 }
 
 static inline int part_x(const Tile& tile, int block) { return tile.tile_x * kTile + block % 4 * 4; }
@@ -70,11 +94,7 @@ static void forward_tile(const Tile& tile, const float background[3], const Plan
     });
     const Vec cut = splat(-kLog2Cut), cap = splat(0.99f), stop = splat(kStopTransmittance);
     for (int block = 0; block < kBlocks; ++block) {
-        int listed = 0;
-        for (int i = 0; i < tile.count; ++i) {
-            tile.listed[listed] = i;
-            listed += tile.entries[i].blocks >> block & 1;
-        }
+        const int listed = list_block(tile, block);
         for (int part = 0; part < kParts; ++part) {
             const int at = block * 16 + part * kLanes;
             const Vec x = load(kCentres.x + at), y = load(kCentres.y + at);
@@ -125,16 +145,32 @@ static void store_tile(const Tile& tile, const TileImage* image, int colours, co
     });
 }
 
-static inline float total(Vec v) {
-    float sum = 0;
-    for (int i = 0; i < kLanes; ++i) sum += v[i];
-    return sum;
-}
-
-// out[i] = the sum of v[i]'s lanes, for i < N; N is 8 or 4.
+// out[i] = the sum of v[i]'s lanes, for i < N; N is 8 or 4. The lanes are added as a tree, N sums at a time.
 template <int N>
 static inline void totals(const Vec* v, float* out) {
-    for (int i = 0; i < N; ++i) out[i] = total(v[i]);
+#if defined(__SSE2__)
+    Vec quads[2];  // in each 128 bits, the sums of four vectors over those 128 bits
+    for (int i = 0; i < N / 4; ++i) quads[i] = interleaved_sum(v + 4 * i);
+#if defined(__AVX512F__)
+    const __m512 a = (__m512)quads[0], b = (__m512)quads[N / 4 - 1];
+    const __m512 halves = _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x44), _mm512_shuffle_f32x4(a, b, 0xee));
+    const __m512 sums = _mm512_add_ps(halves, _mm512_shuffle_f32x4(halves, halves, 0xb1));
+    _mm_storeu_ps(out, _mm512_castps512_ps128(sums));
+    if (N == 8) _mm_storeu_ps(out + 4, _mm512_extractf32x4_ps(sums, 2));
+#elif defined(__AVX2__)
+    for (int i = 0; i < N / 4; ++i) {
+        const __m256 a = (__m256)quads[i];
+        _mm_storeu_ps(out + 4 * i, _mm_add_ps(_mm256_castps256_ps128(a), _mm256_extractf128_ps(a, 1)));
+    }
+#else
+    for (int i = 0; i < N / 4; ++i) store(out + 4 * i, quads[i]);
+#endif
+#else
+    for (int i = 0; i < N; ++i) {
+        out[i] = 0;
+        for (int lane = 0; lane < kLanes; ++lane) out[i] += v[i][lane];
+    }
+#endif
 }
 
 // The state that a tile's pixels carry from splat to splat: transmittance, and what is still to come of the sum over

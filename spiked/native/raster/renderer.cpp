@@ -66,8 +66,7 @@ void Renderer::prepare() {
     for (int k = 0; k < 9; ++k, at += stride_) prepared_.spread[k] = spread[k] = at;
     prepared_.log2_opacity = log2_opacity = at;
     pool_.run(chunks_of(stride_), [&](int chunk, int) {
-        kernels_.prepare(splats_.means, splats_.quats, splats_.log_scales, splats_.opacity_logits, splats_.count,
-                         chunk * kChunk, std::min(stride_, (chunk + 1) * kChunk), mean, spread, log2_opacity);
+        kernels_.prepare(splats_, chunk * kChunk, std::min(stride_, (chunk + 1) * kChunk), mean, spread, log2_opacity);
     });
 }
 
@@ -162,7 +161,6 @@ void Renderer::bin(SubPose& sub) {
 Tile Renderer::tile_of(const SubPose& sub, int tile, int thread) {
     const uint32_t start = sub.tile_start[tile];
     const int count = static_cast<int>(sub.tile_start[tile + 1] - start);
-    // One more than listed: the listing writes ahead of what it keeps.
     return {&lens_,
             sub.records.data(),
             sub.entries.data() + start,
@@ -170,7 +168,8 @@ Tile Renderer::tile_of(const SubPose& sub, int tile, int thread) {
             tile % lens_.tiles_x,
             tile / lens_.tiles_x,
             scratch_[thread].local.grow(static_cast<size_t>(count) * 16),
-            scratch_[thread].listed.grow(static_cast<size_t>(count) + kGroup)};
+            scratch_[thread].listed.grow(static_cast<size_t>(count) + kGroup),
+            scratch_[thread].blocks.grow(static_cast<size_t>(count) + kGroup)};
 }
 
 TileState Renderer::state_of(const SubPose& sub, int tile) const {
@@ -217,7 +216,9 @@ void Renderer::backward(const float* d_values, const GradientArrays& out) {
                                        pose);
             }
         }
-        finish(first, std::min(last, splats_.count), sums, out);
+        const int end = std::min(last, splats_.count);
+        for (int n = first; n < end; ++n) out.radius_px[n] = largest_radius(n);
+        kernels_.finish(splats_, prepared_, sums, first, end, 1.0f / static_cast<float>(sub_poses_), out);
     });
 
     for (int i = 0; i < sub_poses_; ++i) {
@@ -248,47 +249,12 @@ void Renderer::gather(const SubPose& sub, int first, float* sums, uint8_t* visib
     }
 }
 
-// From the gradients of spread, log opacity and so on to those of the parameters.
-void Renderer::finish(int first, int last, const SplatGradients& sums, const GradientArrays& out) const {
-    for (int n = first; n < last; ++n) {
-        float radius = 0;
-        for (int i = 0; i < sub_poses_; ++i)
-            if (const uint32_t rank = views_[i].rank_of[n]; rank != kCulled)
-                radius = std::max(radius, views_[i].records[rank].radius);
-        out.radius_px[n] = radius;
-        out.contribution[n] = sums.share[n] / static_cast<float>(sub_poses_);
-        for (int k = 0; k < splats_.colours; ++k) out.colour[splats_.colours * n + k] = sums.colour[k][n];
-        for (int k = 0; k < 3; ++k) out.means[3 * n + k] = sums.mean[k][n];
-        out.opacity_logits[n] = 0;
-        std::fill_n(out.log_scales + 3 * n, 3, 0.0f);
-        std::fill_n(out.quats + 4 * n, 4, 0.0f);
-        if (radius == 0) continue;  // never seen, and possibly not even finite
-
-        out.opacity_logits[n] = sums.log_opacity[n] / (1 + std::exp(splats_.opacity_logits[n]));
-        float d[9];  // with respect to the rotation, times the scales
-        for (int j = 0; j < 3; ++j) {
-            float along = 0;
-            const float scale = std::exp(std::clamp(splats_.log_scales[3 * n + j], -30.0f, 30.0f));
-            for (int i = 0; i < 3; ++i) {
-                along += sums.spread[3 * i + j][n] * prepared_.spread[3 * i + j][n];
-                d[3 * i + j] = sums.spread[3 * i + j][n] * scale;
-            }
-            out.log_scales[3 * n + j] = along;
-        }
-        const float* quat = splats_.quats + 4 * n;
-        const float over =
-            1 /
-            std::sqrt(std::max(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3], 1e-24f));
-        const float w = quat[0] * over, x = quat[1] * over, y = quat[2] * over, z = quat[3] * over;
-        const float unit[4] = {w, x, y, z};
-        const float g[4] = {2 * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1])),
-                            2 * (w * (d[7] - d[5]) + y * (d[1] + d[3]) + z * (d[2] + d[6]) - 2 * x * (d[4] + d[8])),
-                            2 * (w * (d[2] - d[6]) + x * (d[1] + d[3]) + z * (d[5] + d[7]) - 2 * y * (d[0] + d[8])),
-                            2 * (w * (d[3] - d[1]) + x * (d[2] + d[6]) + y * (d[5] + d[7]) - 2 * z * (d[0] + d[4]))};
-        float radial = 0;
-        for (int k = 0; k < 4; ++k) radial += unit[k] * g[k];
-        for (int k = 0; k < 4; ++k) out.quats[4 * n + k] = (g[k] - unit[k] * radial) * over;
-    }
+float Renderer::largest_radius(int splat) const {
+    float radius = 0;
+    for (int i = 0; i < sub_poses_; ++i)
+        if (const uint32_t rank = views_[i].rank_of[splat]; rank != kCulled)
+            radius = std::max(radius, views_[i].records[rank].radius);
+    return radius;
 }
 
 double Renderer::mean_pairs() const {

@@ -8,17 +8,6 @@
 
 namespace raster {
 
-struct SplatArrays {  // C-contiguous
-    int count, colours;
-    const float *means, *quats, *log_scales, *opacity_logits, *colour;
-};
-
-struct GradientArrays {  // the same shapes; rotation and centre [sub-poses][3]
-    float *means, *quats, *log_scales, *opacity_logits, *colour;
-    double *rotation, *centre;
-    float *contribution, *radius_px;
-};
-
 // Everything of one sub-pose that the backward pass needs again.
 struct SubPose {
     View view;
@@ -62,7 +51,7 @@ class Renderer {
     TileState state_of(const SubPose&, int tile) const;
     Planes planes_of(int sub_pose) const;
     void gather(const SubPose&, int first, float* sums, uint8_t* visible) const;
-    void finish(int first, int last, const SplatGradients&, const GradientArrays&) const;
+    float largest_radius(int splat) const;
 
     const Kernels& kernels_;
     Lens lens_;
@@ -92,6 +81,7 @@ class Renderer {
     struct Scratch {
         Buffer<float> local;
         Buffer<uint32_t> listed;
+        Buffer<uint16_t> blocks;
         Buffer<TileImage> image;
         Buffer<float> gradients;
     };

@@ -26,6 +26,10 @@ static inline Int bits(Vec v) { return (Int)v; }
 static inline Vec min(Vec a, Vec b) { return (Vec)_mm512_min_ps((__m512)a, (__m512)b); }
 static inline Vec max(Vec a, Vec b) { return (Vec)_mm512_max_ps((__m512)a, (__m512)b); }
 static inline Vec root(Vec a) { return (Vec)_mm512_sqrt_ps((__m512)a); }
+static inline Vec unpack_low(Vec a, Vec b) { return (Vec)_mm512_unpacklo_ps((__m512)a, (__m512)b); }
+static inline Vec unpack_high(Vec a, Vec b) { return (Vec)_mm512_unpackhi_ps((__m512)a, (__m512)b); }
+static inline Vec low_pairs(Vec a, Vec b) { return (Vec)_mm512_shuffle_ps((__m512)a, (__m512)b, 0x44); }
+static inline Vec high_pairs(Vec a, Vec b) { return (Vec)_mm512_shuffle_ps((__m512)a, (__m512)b, 0xee); }
 // value where x >= limit, else 0; for NaN 0.
 static inline Vec where_reaches(Vec x, Vec limit, Vec value) {
     return (Vec)_mm512_maskz_mov_ps(_mm512_cmp_ps_mask((__m512)x, (__m512)limit, _CMP_GE_OQ), (__m512)value);
@@ -42,6 +46,10 @@ static inline Vec reciprocal(Vec x) {
 static inline Vec min(Vec a, Vec b) { return (Vec)_mm256_min_ps((__m256)a, (__m256)b); }
 static inline Vec max(Vec a, Vec b) { return (Vec)_mm256_max_ps((__m256)a, (__m256)b); }
 static inline Vec root(Vec a) { return (Vec)_mm256_sqrt_ps((__m256)a); }
+static inline Vec unpack_low(Vec a, Vec b) { return (Vec)_mm256_unpacklo_ps((__m256)a, (__m256)b); }
+static inline Vec unpack_high(Vec a, Vec b) { return (Vec)_mm256_unpackhi_ps((__m256)a, (__m256)b); }
+static inline Vec low_pairs(Vec a, Vec b) { return (Vec)_mm256_shuffle_ps((__m256)a, (__m256)b, 0x44); }
+static inline Vec high_pairs(Vec a, Vec b) { return (Vec)_mm256_shuffle_ps((__m256)a, (__m256)b, 0xee); }
 static inline Vec where_reaches(Vec x, Vec limit, Vec value) {
     return (Vec)_mm256_and_ps(_mm256_cmp_ps((__m256)x, (__m256)limit, _CMP_GE_OQ), (__m256)value);
 }
@@ -56,6 +64,10 @@ static inline Vec reciprocal(Vec x) {
 static inline Vec min(Vec a, Vec b) { return (Vec)_mm_min_ps((__m128)a, (__m128)b); }
 static inline Vec max(Vec a, Vec b) { return (Vec)_mm_max_ps((__m128)a, (__m128)b); }
 static inline Vec root(Vec a) { return (Vec)_mm_sqrt_ps((__m128)a); }
+static inline Vec unpack_low(Vec a, Vec b) { return (Vec)_mm_unpacklo_ps((__m128)a, (__m128)b); }
+static inline Vec unpack_high(Vec a, Vec b) { return (Vec)_mm_unpackhi_ps((__m128)a, (__m128)b); }
+static inline Vec low_pairs(Vec a, Vec b) { return (Vec)_mm_shuffle_ps((__m128)a, (__m128)b, 0x44); }
+static inline Vec high_pairs(Vec a, Vec b) { return (Vec)_mm_shuffle_ps((__m128)a, (__m128)b, 0xee); }
 static inline Vec where_reaches(Vec x, Vec limit, Vec value) {
     return (Vec)_mm_and_ps(_mm_cmpge_ps((__m128)x, (__m128)limit), (__m128)value);
 }
@@ -81,6 +93,15 @@ static inline bool any_reaches(Vec x, Vec limit) {
     return any;
 }
 static inline Vec reciprocal(Vec x) { return 1.0f / x; }
+#endif
+
+#if defined(__SSE2__)
+// In each 128 bits: the sums over those 128 bits of v[0], v[1], v[2] and v[3].
+static inline Vec interleaved_sum(const Vec* v) {
+    const Vec a = unpack_low(v[0], v[1]) + unpack_high(v[0], v[1]),
+              b = unpack_low(v[2], v[3]) + unpack_high(v[2], v[3]);
+    return low_pairs(a, b) + high_pairs(a, b);
+}
 #endif
 
 static inline Vec clamp(Vec x, Vec low, Vec high) { return min(max(x, low), high); }

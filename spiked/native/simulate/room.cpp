@@ -7,6 +7,8 @@
 #include <limits>
 #include <thread>
 
+#include "clones.hpp"
+
 namespace spiked::simulate {
 namespace {
 
@@ -33,10 +35,14 @@ struct View {
     int left, right, top, bottom;  // tiles that it may touch, inclusive
 };
 
-struct Hit {
-    float depth = std::numeric_limits<float>::infinity();
-    int box = -1, face = -1;
-    int id() const { return box * 6 + face; }
+constexpr int kLanes = 32;
+constexpr float kFar = 1e9f;
+
+// Rays of one tile row or of one edge pixel side by side, so that the loop over them becomes vector instructions.
+struct Rays {
+    float x[kLanes], y[kLanes];
+    float depth[kLanes];
+    float surface[kLanes];  // box * 6 + face, -1 for nothing
 };
 
 View view_of(const Box& box, const Pinhole& camera) {
@@ -80,23 +86,51 @@ View view_of(const Box& box, const Pinhole& camera) {
     return view;
 }
 
-void intersect(const Box& box, const View& view, int index, float x, float y, Hit& best) {
-    float enter = kNear, leave = std::numeric_limits<float>::infinity();
-    int enter_face = -1, leave_face = -1;
+// Where rays cross the slabs of a box: they are inside between `enter` and `leave`, through faces that count from 0
+// to 5.
+struct Crossing {
+    float enter, leave, enter_face, leave_face;
+};
+
+inline Crossing cross(const float* half, const View& view, float x, float y) {
+    float in[3], out[3], backwards[3];
     for (int a = 0; a < 3; ++a) {
-        const float d = view.corner[a] + x * view.dx[a] + y * view.dy[a];
-        // A ray within the slab's plane divides by zero: the infinities and comparisons below do what is right.
-        const float inverse = 1.0f / d;
-        const float t0 = (-box.half[a] - view.origin[a]) * inverse, t1 = (box.half[a] - view.origin[a]) * inverse;
-        const bool forward = d >= 0;
-        const float in = forward ? t0 : t1, out = forward ? t1 : t0;
-        if (in > enter) enter = in, enter_face = 2 * a + (forward ? 0 : 1);
-        if (out < leave) leave = out, leave_face = 2 * a + (forward ? 1 : 0);
+        float d = view.corner.v[a] + x * view.dx.v[a] + y * view.dy.v[a];
+        backwards[a] = d < 0.0f ? 1.0f : 0.0f;
+        // A ray in the plane of a slab must give a large number: an infinity would turn into NaN below.
+        d += 1e-20f;
+        const float t0 = (-half[a] - view.origin.v[a]) / d, t1 = (half[a] - view.origin.v[a]) / d;
+        in[a] = t0 < t1 ? t0 : t1;
+        out[a] = t0 < t1 ? t1 : t0;
     }
-    if (index == 0) {
-        if (leave > kNear) best = {leave, 0, leave_face};
-    } else if (enter_face >= 0 && enter < leave && enter < best.depth) {
-        best = {enter, index, enter_face};
+    // Arithmetic instead of choices: GCC 12 turns choices into branches, which cannot be vectorised.
+    const float in1 = in[1] > in[0] ? 1.0f : 0.0f, in01 = in[1] > in[0] ? in[1] : in[0];
+    const float in2 = in[2] > in01 ? 1.0f : 0.0f, enter = in[2] > in01 ? in[2] : in01;
+    const float out1 = out[1] < out[0] ? 1.0f : 0.0f, out01 = out[1] < out[0] ? out[1] : out[0];
+    const float out2 = out[2] < out01 ? 1.0f : 0.0f, leave = out[2] < out01 ? out[2] : out01;
+    const float enter01 = backwards[0] + in1 * (2.0f + backwards[1] - backwards[0]);
+    const float leave01 = 1.0f - backwards[0] + out1 * (2.0f + backwards[0] - backwards[1]);
+    return {enter, leave, enter01 + in2 * (4.0f + backwards[2] - enter01),
+            leave01 + out2 * (5.0f - backwards[2] - leave01)};
+}
+
+SPIKED_CLONES void cast_shell(const float* half, const View& view, int count, Rays& rays) {
+    for (int i = 0; i < count; ++i) {
+        const Crossing c = cross(half, view, rays.x[i], rays.y[i]);
+        const float hit = c.leave > kNear ? 1.0f : 0.0f;
+        rays.depth[i] = hit * c.leave + (1.0f - hit) * kFar;
+        rays.surface[i] = -1.0f + hit * (c.leave_face + 1.0f);
+    }
+}
+
+SPIKED_CLONES void cast_box(const float* half, const View& view, int first_surface, int count, Rays& rays) {
+    const float first = static_cast<float>(first_surface);
+    for (int i = 0; i < count; ++i) {
+        const Crossing c = cross(half, view, rays.x[i], rays.y[i]);
+        const float hit = (c.enter < c.leave ? 1.0f : 0.0f) * (c.enter < rays.depth[i] ? 1.0f : 0.0f) *
+                          (c.enter > kNear ? 1.0f : 0.0f);
+        rays.depth[i] = hit * c.enter + (1.0f - hit) * rays.depth[i];
+        rays.surface[i] = rays.surface[i] + hit * (first + c.enter_face - rays.surface[i]);
     }
 }
 
@@ -143,22 +177,25 @@ void add_trilinear(const Texture& texture, const uint16_t* texels, float u, floa
     }
 }
 
-// Adds the texture's mean over the footprint of one sample, `size` pixels wide; Heckbert's footprint from exact
+// Adds the mean of a surface's texture over the footprint of the pixel around (x, y): Heckbert's footprint from exact
 // derivatives, a few isotropic probes along its long axis.
 template <int C>
-void shade(const Room& room, const View& view, const Hit& hit, float x, float y, float size, float weight, float* sum) {
-    const Box& box = room.boxes[static_cast<size_t>(hit.box)];
-    const Texture& texture = room.textures[static_cast<size_t>(box.textures[hit.face])];
-    const int a = hit.face / 2, axes[2] = {(a + 1) % 3, (a + 2) % 3};
+void shade(const Room& room, const std::vector<View>& views, int surface, float x, float y, float weight, float* sum) {
+    const Box& box = room.boxes[static_cast<size_t>(surface / 6)];
+    const View& view = views[static_cast<size_t>(surface / 6)];
+    const int face = surface % 6;
+    const Texture& texture = room.textures[static_cast<size_t>(box.textures[face])];
+    const int a = face / 2, axes[2] = {(a + 1) % 3, (a + 2) % 3};
     const float d = view.corner[a] + x * view.dx[a] + y * view.dy[a];
     const float slope_x = view.dx[a] / d, slope_y = view.dy[a] / d, k = texture.texels_per_unit;
+    const float depth = ((face % 2 == 1 ? box.half[a] : -box.half[a]) - view.origin[a]) / d;
     float at[2], along_x[2], along_y[2];
     for (int i = 0; i < 2; ++i) {
         const int b = axes[i];
         const float direction = view.corner[b] + x * view.dx[b] + y * view.dy[b];
-        at[i] = k * (view.origin[b] + hit.depth * direction + box.half[b]);
-        along_x[i] = k * size * hit.depth * (view.dx[b] - direction * slope_x);
-        along_y[i] = k * size * hit.depth * (view.dy[b] - direction * slope_y);
+        at[i] = k * (view.origin[b] + depth * direction + box.half[b]);
+        along_x[i] = k * depth * (view.dx[b] - direction * slope_x);
+        along_y[i] = k * depth * (view.dy[b] - direction * slope_y);
     }
     const float x2 = along_x[0] * along_x[0] + along_x[1] * along_x[1];
     const float y2 = along_y[0] * along_y[0] + along_y[1] * along_y[1];
@@ -182,62 +219,74 @@ struct Painter {
     float* image;
     float* depth;
 
-    Hit cast(const std::vector<int>& candidates, float x, float y) const {
-        Hit hit;
-        for (const int b : candidates)
-            intersect(room.boxes[static_cast<size_t>(b)], views[static_cast<size_t>(b)], b, x, y, hit);
-        return hit;
+    void cast(const std::vector<int>& candidates, int count, Rays& rays) const {
+        cast_shell(room.boxes[0].half, views[0], count, rays);
+        for (const int b : candidates) {
+            cast_box(room.boxes[static_cast<size_t>(b)].half, views[static_cast<size_t>(b)], 6 * b, count, rays);
+        }
     }
 
     template <int C>
     void paint_tile(int tile_x, int tile_y) const {
         std::vector<int> candidates;
-        for (int b = 0; b < static_cast<int>(views.size()); ++b) {
+        for (int b = 1; b < static_cast<int>(views.size()); ++b) {
             const View& view = views[static_cast<size_t>(b)];
             const bool touches =
                 tile_x >= view.left && tile_x <= view.right && tile_y >= view.top && tile_y <= view.bottom;
-            if (b == 0 || touches) candidates.push_back(b);
+            if (touches) candidates.push_back(b);
         }
         const int x0 = tile_x * kTile, y0 = tile_y * kTile;
         const int columns = std::min(kTile, camera.width - x0), rows = std::min(kTile, camera.height - y0);
         // With a border of one pixel, so that edges between tiles are seen from both sides.
-        Hit hits[kTile + 2][kTile + 2];
+        Rays lines[kTile + 2];
         for (int y = -1; y <= rows; ++y) {
+            Rays& line = lines[y + 1];
             for (int x = -1; x <= columns; ++x) {
-                hits[y + 1][x + 1] =
-                    cast(candidates, static_cast<float>(x0 + x) + 0.5f, static_cast<float>(y0 + y) + 0.5f);
+                line.x[x + 1] = static_cast<float>(x0 + x) + 0.5f;
+                line.y[x + 1] = static_cast<float>(y0 + y) + 0.5f;
             }
+            cast(candidates, columns + 2, line);
         }
         for (int y = 0; y < rows; ++y) {
             for (int x = 0; x < columns; ++x) {
-                const Hit& hit = hits[y + 1][x + 1];
-                const int id = hit.id();
-                const bool inside = id == hits[y][x + 1].id() && id == hits[y + 2][x + 1].id() &&
-                                    id == hits[y + 1][x].id() && id == hits[y + 1][x + 2].id();
-                paint_pixel<C>(candidates, hit, inside, x0 + x, y0 + y);
+                const float surface = lines[y + 1].surface[x + 1], z = lines[y + 1].depth[x + 1];
+                const bool inside = surface == lines[y].surface[x + 1] && surface == lines[y + 2].surface[x + 1] &&
+                                    surface == lines[y + 1].surface[x] && surface == lines[y + 1].surface[x + 2];
+                const int64_t at = static_cast<int64_t>(y0 + y) * camera.width + x0 + x;
+                depth[at] = z < kFar ? z : std::numeric_limits<float>::infinity();
+                float sum[C] = {};
+                if (!inside) {
+                    paint_edge<C>(candidates, static_cast<float>(x0 + x), static_cast<float>(y0 + y), sum);
+                } else if (surface >= 0) {
+                    shade<C>(room, views, static_cast<int>(surface), lines[y + 1].x[x + 1], lines[y + 1].y[x + 1],
+                             1.0f / 65535, sum);
+                }
+                std::copy_n(sum, C, image + at * C);
             }
         }
     }
 
+    // Each surface in the pixel counts by the area that a grid of rays gives it, and is shaded at that area's middle.
     template <int C>
-    void paint_pixel(const std::vector<int>& candidates, const Hit& centre, bool inside, int x, int y) const {
-        const int64_t at = static_cast<int64_t>(y) * camera.width + x;
-        float sum[C] = {};
-        depth[at] = centre.depth;
-        if (inside) {
-            shade<C>(room, views[static_cast<size_t>(centre.box)], centre, static_cast<float>(x) + 0.5f,
-                     static_cast<float>(y) + 0.5f, 1.0f, 1.0f / 65535, sum);
-        } else {
-            for (int s = 0; s < kFine * kFine; ++s) {
-                const float sx = static_cast<float>(x) + (static_cast<float>(s % kFine) + 0.5f) / kFine;
-                const float sy = static_cast<float>(y) + (static_cast<float>(s / kFine) + 0.5f) / kFine;
-                const Hit hit = cast(candidates, sx, sy);
-                if (hit.box < 0) continue;
-                shade<C>(room, views[static_cast<size_t>(hit.box)], hit, sx, sy, 1.0f / kFine,
-                         1.0f / (65535 * kFine * kFine), sum);
-            }
+    void paint_edge(const std::vector<int>& candidates, float left, float top, float* sum) const {
+        constexpr int count = kFine * kFine;
+        Rays rays;
+        for (int i = 0; i < count; ++i) {
+            rays.x[i] = left + (static_cast<float>(i % kFine) + 0.5f) / kFine;
+            rays.y[i] = top + (static_cast<float>(i / kFine) + 0.5f) / kFine;
         }
-        for (int c = 0; c < C; ++c) image[at * C + c] = sum[c];
+        cast(candidates, count, rays);
+        for (int i = 0; i < count; ++i) {
+            const float surface = rays.surface[i];
+            if (surface < 0) continue;
+            float n = 0, x = 0, y = 0;
+            for (int j = i; j < count; ++j) {
+                if (rays.surface[j] != surface) continue;
+                n += 1, x += rays.x[j], y += rays.y[j];
+                rays.surface[j] = -1;
+            }
+            shade<C>(room, views, static_cast<int>(surface), x / n, y / n, n / (65535 * count), sum);
+        }
     }
 };
 

@@ -4,11 +4,7 @@
 #include <cmath>
 #include <vector>
 
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
-#define SPIKED_CLONES __attribute__((target_clones("arch=x86-64-v4", "avx2", "default")))
-#else
-#define SPIKED_CLONES
-#endif
+#include "clones.hpp"
 
 namespace spiked::simulate {
 namespace {

@@ -2,17 +2,18 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.errors import RecordingError
+from spiked.errors import ConfigurationError, RecordingError
 from spiked.pose import exp_so3
+from spiked.recording import RecordingWriter
 from spiked.scene import Scene
-from spiked.sensor import Sensor
+from spiked.sensor import BitOrder, Layout, Sensor
 from spiked.simulate.camera import SimulatedCamera
 from spiked.simulate.motion import Recorded
 from spiked.simulate.sensor import SensorNoise
@@ -61,47 +62,36 @@ def simulate(
     The folder, which must be new or empty, then holds NAME.dat, its sidecar NAME.json, groundtruth.tum (a pose for the
     middle of each frame), and `views` held-out noise-free pictures in views/ with their poses in views.json; every
     other one lies beside the path, drawn by `seed`. `progress` is told the number of frames written. Raises
-    RecordingError if the folder cannot be written or holds something.
+    RecordingError if the folder cannot be written or holds something, and ConfigurationError for a sensor whose frames
+    are not compact and LSB first.
     """
-    folder = Path(folder)
+    folder, sensor = Path(folder), camera.sensor
+    if sensor.layout is not Layout.COMPACT or sensor.bit_order is not BitOrder.LSB:
+        raise ConfigurationError(
+            "simulated recordings are compact, LSB first; write one and convert it to another layout"
+        )
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise RecordingError(f"{folder} is not empty; name a new folder for the simulated recording")
         data = folder / f"{name}.dat"
-        with data.open("wb") as file:
+        described = replace(sensor, intrinsics=camera.intrinsics)
+        simulation = {"seed": camera.spikes.seed, "gain": camera.gain, "noise": asdict(camera.spikes.noise)}
+        with RecordingWriter(
+            data, described, note="simulated; cfa is of the upright image", simulation=simulation
+        ) as out:
             for begin in range(0, frames, _CHUNK):
                 count = min(_CHUNK, frames - begin)
-                file.write(camera.next_frames(count).tobytes())
+                out.append(camera.next_frames(count))
                 if progress is not None:
                     progress(begin + count)
-        _write_sidecar(camera, folder / f"{name}.json", frames)
         rotations, centres = camera.truth(np.arange(frames))
-        times = (np.arange(frames, dtype=np.float64) + 0.5) / camera.sensor.frame_rate_hz
+        times = (np.arange(frames, dtype=np.float64) + 0.5) / sensor.frame_rate_hz
         Trajectory(times, rotations, centres).write_tum(folder / "groundtruth.tum")
         _write_views(camera, folder, rotations, centres, views=views, seed=seed)
     except OSError as error:
         raise RecordingError(f"cannot write the simulated recording in {folder}: {error.strerror}") from error
     return data
-
-
-def _write_sidecar(camera: SimulatedCamera, path: Path, frames: int) -> None:
-    sensor, k = camera.sensor, camera.intrinsics
-    sidecar = {
-        "format": sensor.layout.value,
-        "width": sensor.width,
-        "height": sensor.height,
-        "frame_rate": sensor.frame_rate_hz,
-        "frames": frames,
-        "bit_order": sensor.bit_order.value,
-        "flipped": sensor.flipped,
-        "cfa": sensor.mosaic.value if sensor.mosaic else None,
-        "intrinsics": {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy},
-        "pixel_centre": 0.5,
-        "note": "simulated; cfa is the pattern of the upright image",
-        "simulation": {"seed": camera.spikes.seed, "gain": camera.gain, "noise": asdict(camera.spikes.noise)},
-    }
-    path.write_text(json.dumps(sidecar, indent=1), encoding="utf-8")
 
 
 def _write_views(

@@ -1,15 +1,17 @@
 """A simulated recording is a folder that can be scored: frames, sidecar, truth and held-out views belong together."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from spiked.errors import RecordingError, SceneError
+from spiked.errors import ConfigurationError, RecordingError, SceneError
 from spiked.evaluate import psnr
-from spiked.sensor import Intrinsics, Mosaic, Sensor
+from spiked.recording import open_recording
+from spiked.sensor import Intrinsics, Layout, Mosaic, Sensor
 from spiked.simulate import SimulatedCamera
 from spiked.simulate.record import camera_of_files, simulate
 from spiked.trajectory import Trajectory
@@ -23,12 +25,11 @@ def test_the_folder_holds_what_the_camera_saw(tmp_path: Path, mosaic: Mosaic | N
     sensor = Sensor(64, 40, 20000.0, mosaic=mosaic)
     told: list[int] = []
     path = simulate(SimulatedCamera(sensor, 1), tmp_path / "walk", "walk", 150, views=4, progress=told.append)
-    assert path.stat().st_size == 150 * sensor.frame_bytes
     assert told == [64, 128, 150]
-    assert np.array_equal(np.fromfile(path, np.uint8).reshape(150, -1), SimulatedCamera(sensor, 1).next_frames(150))
-    sidecar = json.loads((path.parent / "walk.json").read_text())
-    assert (sidecar["width"], sidecar["height"], sidecar["frames"], sidecar["flipped"]) == (64, 40, 150, True)
-    assert sidecar["cfa"] == (mosaic.value if mosaic else None)
+    recording = open_recording(path)
+    assert recording.frames == 150
+    assert replace(recording.sensor, intrinsics=None) == sensor
+    assert np.array_equal(recording.read(0, 150), SimulatedCamera(sensor, 1).next_frames(150))
 
     camera = SimulatedCamera(sensor, 1)
     truth = Trajectory.read_tum(path.parent / "groundtruth.tum")
@@ -52,6 +53,12 @@ def test_nothing_is_written_over(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="not empty"):
         simulate(SimulatedCamera(Sensor(64, 40, 20000.0)), tmp_path, "walk", 8, views=1)
     assert [file.name for file in tmp_path.iterdir()] == ["precious"]
+
+
+def test_other_layouts_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="convert"):
+        simulate(SimulatedCamera(Sensor(64, 40, 20000.0, Layout.ROW_TAGGED)), tmp_path / "walk", "walk", 8)
+    assert not (tmp_path / "walk").exists()
 
 
 def test_a_missing_scene_is_a_clear_error(tmp_path: Path) -> None:

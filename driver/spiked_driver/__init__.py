@@ -3,5 +3,6 @@
 from spiked_driver.acquisition import StopEvent, acquire
 from spiked_driver.faults import Faults, FaultySource, Loss, Stall
 from spiked_driver.source import Chunk, Pacer, Source
+from spiked_driver.spec import open_source
 
-__all__ = ["Chunk", "Faults", "FaultySource", "Loss", "Pacer", "Source", "Stall", "StopEvent", "acquire"]
+__all__ = ["Chunk", "Faults", "FaultySource", "Loss", "Pacer", "Source", "Stall", "StopEvent", "acquire", "open_source"]

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from spiked.recording import open_recording
 from spiked_driver import Chunk, Faults, FaultySource, Loss, Source, Stall, acquire
 from spiked_driver.replay import ReplaySource
 from spiked_driver.simulated import SimulatedSource
 from spiked_driver.spec import open_source
 
 from spiked.errors import SourceError, SpikedError
-from spiked.ring import Cause, DeviceState, End, EndReason, Frames, Policy, RingReader, RingWriter
+from spiked.recording import RecordingWriter, open_recording
+from spiked.ring import Cause, DeviceState, End, EndReason, Frames, Gap, Policy, RingReader, RingWriter
+from spiked.sensor import BitOrder, Layout, Sensor
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared"
 FRAMES = 50
@@ -72,6 +73,54 @@ def test_ranges_and_repeats_run_on_without_renumbering(recording: Path) -> None:
     source = open_source(f"replay:{recording}?pace=max&range=10:30&repeat=3")
     assert source.frames == 60
     np.testing.assert_array_equal(play(source), np.tile(bits()[10:30], (3, 1)))
+
+
+def test_what_the_recording_lost_is_lost_again(tmp_path: Path) -> None:
+    path = tmp_path / "lossy.dat"
+    with RecordingWriter(path, Sensor(64, 48, 1000.0)) as writer:
+        writer.gap(0, 3, "device")
+        writer.append(bits()[:20])
+        writer.gap(23, 7, "usb")
+        writer.append(bits()[20:])
+        writer.gap(60, 5, "disk")
+    source = open_source(f"replay:{path}?pace=0")
+    assert source.frames == 65
+    assert items_of(source) == [
+        Gap(0, 3, Cause.DEVICE),
+        Chunk(3, 20),
+        Gap(23, 7, Cause.USB),
+        Chunk(30, 30),
+        Gap(60, 5, Cause.DISK),
+        End(65, EndReason.FINISHED),
+    ]
+    part = open_source(f"replay:{path}?pace=0&range=10:30&repeat=2")
+    assert items_of(part) == [
+        Chunk(0, 10),
+        Gap(10, 7, Cause.USB),
+        Chunk(17, 10),
+        Chunk(27, 10),
+        Gap(37, 7, Cause.USB),
+        Chunk(44, 10),
+        End(54, EndReason.FINISHED),
+    ]
+
+
+def items_of(source: Source) -> list[Chunk | Gap | End | None]:
+    source.open()
+    view = np.zeros((100, source.sensor.frame_bytes), np.uint8)
+    items = [source.read_into(view)]
+    while not isinstance(items[-1], End):
+        items.append(source.read_into(view))
+    return items
+
+
+def test_other_bit_orders_and_row_tags_are_delivered_as_compact_lsb_frames(tmp_path: Path) -> None:
+    path = tmp_path / "tagged.dat"
+    with RecordingWriter(path, Sensor(64, 48, 1000.0, Layout.ROW_TAGGED, BitOrder.MSB)) as writer:
+        writer.append(bits())
+    source = open_source(f"replay:{path}?pace=0")
+    assert (source.sensor.layout, source.sensor.bit_order) == (Layout.COMPACT, BitOrder.LSB)
+    np.testing.assert_array_equal(play(source), bits())
 
 
 def test_a_source_can_be_opened_again(recording: Path) -> None:

@@ -1,0 +1,1 @@
+"""The commands of `spiked`, one a file; `cli` puts them together."""

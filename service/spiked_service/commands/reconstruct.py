@@ -1,0 +1,168 @@
+"""`spiked reconstruct`: a recording in; scene, trajectory, report and pictures out."""
+
+import json
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Annotated
+
+import typer
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from spiked.errors import ConfigurationError
+from spiked.recon import Options, Reconstructor, Status
+from spiked.trajectory import Trajectory
+from spiked_service import geometry as g
+from spiked_service.console import messages, output, report_warning
+from spiked_service.offline import reconstruct_recording
+from spiked_service.overview import draw_overview
+
+INTERRUPTED = 130
+_FEED_SHARE = 0.3
+"""Part of the progress bar for feeding; the refinement has the rest."""
+
+
+def reconstruct(
+    file: Annotated[Path, typer.Argument(help="A recording.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; made if it is not there.")],
+    poses: Annotated[Path | None, typer.Option(help="Known poses, a TUM file, camera-to-world.")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Stop after so long with what there is.", min=0.0)] = None,
+    steps: Annotated[int, typer.Option(help="Gradient steps of the final refinement.", min=0)] = Options().steps,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same result.")] = 0,
+    threads: Annotated[int | None, typer.Option(help="Threads of the rasteriser; all cores if not given.")] = None,
+    fov: g.Fov = None,
+    intrinsics: g.IntrinsicsText = None,
+    width: g.Width = None,
+    height: g.Height = None,
+    rate: g.Rate = None,
+    layout: g.FrameLayout = None,
+    bit_order: g.Bits = None,
+    flipped: g.Flipped = None,
+    mosaic: g.Colours = None,
+) -> None:
+    """Reconstruct the camera's trajectory and a Gaussian scene from a recording.
+
+    OUT then holds scene.ply (3DGS fields), trajectory.tum (a pose for every frame that has one), report.json and
+    overview.png. Ctrl-C keeps what there is: OUT is written from the current state, and the exit code is 130.
+    Without a pose to show the exit code is 1 and report.json says why.
+
+    Examples:
+
+    - `spiked reconstruct rec.dat -o out`
+
+    - `spiked reconstruct rec.dat -o out --fov 60 --seconds 120`
+
+    - `spiked reconstruct rec.dat -o out --poses known.tum`
+    """
+    recording = g.Geometry(width, height, rate, layout, bit_order, flipped, mosaic).open(file)
+    for warning in recording.warnings:
+        report_warning(warning)
+    sensor = g.with_optics(recording.sensor, fov, intrinsics)
+    known = None if poses is None else Trajectory.read_tum(poses)
+    reconstructor = Reconstructor(sensor, Options(seed=seed, steps=steps, threads=threads, poses=known))
+    _check_folder(out)
+    total = recording.capture_index(recording.frames - 1) + 1
+    with _interruptible() as interrupt, _Display(total) as display:
+        reconstruct_recording(
+            recording, reconstructor, progress=display.show, cancelled=interrupt.is_set, budget_s=seconds
+        )
+    _write(reconstructor, out, file.name)
+    status = reconstructor.status()
+    poses_found = len(reconstructor.trajectory())
+    output.print(f"{out}: {poses_found} poses for {status.frames} frames, {status.splats} splats, {status.state}")
+    if interrupt.is_set():
+        raise typer.Exit(INTERRUPTED)
+    if poses_found == 0:
+        report_warning(f"no pose was found: {status.reason}")
+        raise typer.Exit(1)
+
+
+class _Interrupt:
+    """Set by the first Ctrl-C; the second one ends the program."""
+
+    def __init__(self) -> None:
+        self._set = False
+
+    def is_set(self) -> bool:
+        return self._set
+
+    def handle(self, number: int, frame: FrameType | None) -> None:
+        if self._set:
+            raise KeyboardInterrupt
+        self._set = True
+        messages.print("stopping; writing what there is (Ctrl-C again to leave at once)")
+
+
+@contextmanager
+def _interruptible() -> Iterator[_Interrupt]:
+    interrupt = _Interrupt()
+    before = signal.signal(signal.SIGINT, interrupt.handle)
+    try:
+        yield interrupt
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+class _Display:
+    """A live line: stage, frames, state, loss, splats, time left. Off a terminal, a plain line every few seconds."""
+
+    def __init__(self, frames: int) -> None:
+        self._frames = frames
+        self._bar = Progress(
+            TextColumn("{task.description:9s}"),
+            BarColumn(bar_width=28),
+            TextColumn("{task.fields[figures]}"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=messages,
+            disable=not messages.is_terminal,
+        )
+        self._task = self._bar.add_task("waiting", total=1.0, figures="")
+        self._last = time.monotonic()
+        self._stage = ""
+
+    def __enter__(self) -> "_Display":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.stop()
+
+    def show(self, status: Status) -> None:
+        """Show where the reconstruction stands."""
+        loss = "" if status.loss is None else f"  loss {status.loss:.2e}"
+        figures = f"{status.frames}/{self._frames} frames  {status.state}{loss}  {status.splats} splats"
+        fed = min(1.0, status.frames / max(self._frames, 1))
+        done = _FEED_SHARE * fed + (1 - _FEED_SHARE) * status.progress
+        self._bar.update(
+            self._task, description=status.stage, completed=1.0 if status.stage == "done" else done, figures=figures
+        )
+        if not messages.is_terminal and (status.stage != self._stage or time.monotonic() - self._last > 5):
+            self._last, self._stage = time.monotonic(), status.stage
+            messages.print(f"{status.stage}: {figures}  {100 * status.progress:.0f} % refined", markup=False)
+
+
+def _check_folder(out: Path) -> None:
+    """Before minutes of work: whether the results can be written. Nothing is created."""
+    if out.exists() and not out.is_dir():
+        raise ConfigurationError(f"--out {out} is a file; name a folder")
+    nearest = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
+    if not nearest.is_dir():
+        raise ConfigurationError(f"--out {out} cannot be made: {nearest} is a file")
+
+
+def _write(reconstructor: Reconstructor, out: Path, title: str) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        reconstructor.scene().write_ply(out / "scene.ply", reconstructor.white)
+        reconstructor.trajectory().write_tum(out / "trajectory.tum")
+        (out / "report.json").write_text(json.dumps(reconstructor.report(), indent=1), encoding="utf-8")
+        draw_overview(reconstructor, title, out / "overview.png")
+    except OSError as error:
+        raise ConfigurationError(
+            f"cannot write the results to {out}: {error.strerror}; choose another folder"
+        ) from error

@@ -1,0 +1,59 @@
+"""A whole recording through the reconstructor, as `spiked reconstruct` does it."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from spiked.recon import Reconstructor, Status
+from spiked.recording import Recording
+
+CHUNK_FRAMES = 64
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Stored frames `first` to `first + count - 1`, the first of them captured as frame `index`."""
+
+    first: int
+    count: int
+    index: int
+
+
+def pieces(recording: Recording, chunk: int = CHUNK_FRAMES) -> Iterator[Piece]:
+    """The stored frames in pieces of at most `chunk` that no gap interrupts."""
+    first = 0
+    while first < recording.frames:
+        index = recording.capture_index(first)
+        later = (gap.first - index for gap in recording.gaps if gap.first > index)
+        count = min(chunk, recording.frames - first, *later)
+        yield Piece(first, count, index)
+        first += count
+
+
+def reconstruct_recording(
+    recording: Recording,
+    reconstructor: Reconstructor,
+    *,
+    progress: Callable[[Status], None],
+    cancelled: Callable[[], bool],
+    budget_s: float | None = None,
+) -> None:
+    """Feed every frame and gap, then refine; stops early when cancelled or when the budget in seconds is used up.
+
+    Whatever stops it, the reconstructor holds what was reached by then.
+    """
+    deadline = None if budget_s is None else time.monotonic() + budget_s
+
+    def over() -> bool:
+        return cancelled() or (deadline is not None and time.monotonic() > deadline)
+
+    expected = 0
+    for piece in pieces(recording):
+        if over():
+            break
+        if piece.index > expected:
+            reconstructor.gap(expected, piece.index - expected)
+        reconstructor.feed(piece.index, recording.read(piece.first, piece.count))
+        expected = piece.index + piece.count
+        progress(reconstructor.status())
+    reconstructor.finish(progress, over)

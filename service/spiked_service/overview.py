@@ -1,0 +1,95 @@
+"""One picture that tells how a reconstruction went: the path, observed against rendered, and the fit over time."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from spiked.recon import Reconstructor, Sample
+from spiked.trajectory import Trajectory
+
+_SAMPLES = 4
+_INK = "#1d2330"
+_PATH = "viridis"
+
+
+def draw_overview(reconstructor: Reconstructor, title: str, path: Path) -> None:
+    """Write the picture as PNG."""
+    samples = reconstructor.samples(_SAMPLES)
+    figure = Figure(figsize=(14, 9.2), facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    status = reconstructor.status()
+    figure.suptitle(f"{title}   ·   {status.frames} frames, {status.splats} splats, {status.state}", color=_INK)
+    above, below = figure.subfigures(2, 1, height_ratios=(1.0, 1.15))
+    top, side, fit = above.subplots(1, 3)
+    trajectory = reconstructor.trajectory()
+    _draw_path(top, trajectory, (0, 2), ("x, right", "z, forward"), "path from above")
+    _draw_path(side, trajectory, (2, 1), ("z, forward", "y, down"), "path from the side")
+    side.invert_yaxis()
+    _draw_fit(fit, _curve(reconstructor))
+    if samples:
+        _draw_samples(below.subplots(2, len(samples), squeeze=False), samples, reconstructor.white)
+    else:
+        below.text(0.5, 0.5, f"no scene: {status.reason or status.stage}", ha="center", color=_INK)
+    figure.savefig(path, dpi=110)
+
+
+def _draw_path(
+    axes: Axes, trajectory: Trajectory, columns: tuple[int, int], labels: tuple[str, str], title: str
+) -> None:
+    axes.set_title(title, fontsize=10, color=_INK)
+    axes.set_xlabel(labels[0])
+    axes.set_ylabel(labels[1])
+    axes.grid(color="#e6e8ee", linewidth=0.6)
+    if len(trajectory) == 0:
+        axes.text(0.5, 0.5, "no pose", transform=axes.transAxes, ha="center")
+        return
+    a, b = columns
+    at = trajectory.centres
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.scatter(at[:, a], at[:, b], c=trajectory.times_s, cmap=_PATH, s=4, zorder=3)
+    every = np.linspace(0, len(at) - 1, 14).round().astype(int)
+    forward = trajectory.rotations[every][:, :, 2]
+    length = 0.12 * max(float(np.ptp(at[:, a])), float(np.ptp(at[:, b])), 1e-9)
+    heads = at[every] + length * forward
+    axes.plot(
+        np.stack([at[every, a], heads[:, a]]), np.stack([at[every, b], heads[:, b]]), color=_INK, lw=0.8, alpha=0.6
+    )
+    axes.plot(*at[0, [a, b]], "o", color="#2a9d4a", ms=7, label=f"{trajectory.times_s[0] * 1e3:.1f} ms")
+    axes.plot(*at[-1, [a, b]], "s", color="#d1495b", ms=7, label=f"{trajectory.times_s[-1] * 1e3:.1f} ms")
+    axes.legend(fontsize=8, loc="best", framealpha=0.8)
+
+
+def _curve(reconstructor: Reconstructor) -> list[tuple[float, float]]:
+    curve = reconstructor.report()["psnr_of_views_over_seconds"]
+    assert isinstance(curve, list)
+    return [(float(seconds), float(decibels)) for seconds, decibels in curve]
+
+
+def _draw_fit(axes: Axes, curve: list[tuple[float, float]]) -> None:
+    axes.set_title("fit of the views", fontsize=10, color=_INK)
+    axes.set_xlabel("seconds of work")
+    axes.set_ylabel("PSNR of the views, dB")
+    axes.grid(color="#e6e8ee", linewidth=0.6)
+    if curve:
+        seconds, decibels = np.array(curve).T
+        axes.plot(seconds, decibels, color="#3a6ea5", lw=0.7, alpha=0.35)
+        width = min(9, len(decibels))
+        smooth = np.convolve(decibels, np.full(width, 1 / width), "valid")
+        axes.plot(seconds[width - 1 :], smooth, color="#3a6ea5", lw=1.8)
+
+
+def _draw_samples(grid: NDArray[np.object_], samples: list[Sample], white: float) -> None:
+    for column, sample in enumerate(samples):
+        for row, (name, image) in enumerate((("observed", sample.observed), ("rendered", sample.rendered))):
+            axes: Axes = grid[row, column]
+            shown = np.clip(image / white, 0, 1)
+            axes.imshow(shown[..., 0] if shown.shape[2] == 1 else shown, cmap="gray", vmin=0, vmax=1)
+            axes.set_xticks([])
+            axes.set_yticks([])
+            if column == 0:
+                axes.set_ylabel(name, color=_INK)
+        grid[0, column].set_title(f"{sample.time_s * 1e3:.2f} ms", fontsize=9, color=_INK)

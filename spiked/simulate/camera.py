@@ -20,9 +20,9 @@ DEFAULT_FOV_DEG = 60.0
 """Horizontal field of view of a simulated camera whose sensor states no intrinsics."""
 
 _GROUP = 8
-_STEP_PX = 0.5
+_STEP_PX = 0.6
 """Images are exact at least every so many pixels of motion and run linearly in between; halfway, a detail of four
-pixels from crest to crest loses 8 % of its contrast."""
+pixels from crest to crest loses 11 % of its contrast."""
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,9 @@ from typing import Annotated, Any, TypeVar
 from urllib.parse import parse_qs
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
-from spiked.recording import open_recording
 
 from spiked.errors import SourceError
+from spiked.recording import open_recording
 from spiked.ring import Cause
 from spiked.sensor import Sensor
 from spiked.simulate import MotionKind
@@ -60,6 +60,11 @@ class SourceOptions(_Options):
 class ReplayOptions(SourceOptions):
     """Options of `replay:FILE`."""
 
+    width: int | None = Field(None, gt=0)
+    """Geometry and rate for a recording without a sidecar."""
+    height: int | None = Field(None, gt=0)
+    rate: float | None = Field(None, gt=0)
+    """Frames a second."""
     repeat: int = Field(1, ge=1)
     range: tuple[int | None, int | None] = (None, None)
     """`first:stop` frames, either may be left out."""
@@ -113,7 +118,8 @@ def open_source(spec: str) -> Source:
 
 def _replay(path: str, options: ReplayOptions) -> Source:
     first, stop = options.range
-    return ReplaySource(open_recording(path), pace=options.pace, repeat=options.repeat, first=first or 0, stop=stop)
+    recording = open_recording(path, width=options.width, height=options.height, frame_rate_hz=options.rate)
+    return ReplaySource(recording, pace=options.pace, repeat=options.repeat, first=first or 0, stop=stop)
 
 
 def _simulated(options: SimulationOptions) -> Source:

@@ -75,6 +75,14 @@ def test_ranges_and_repeats_run_on_without_renumbering(recording: Path) -> None:
     np.testing.assert_array_equal(play(source), np.tile(bits()[10:30], (3, 1)))
 
 
+def test_a_bare_file_is_described_by_options(tmp_path: Path) -> None:
+    path = tmp_path / "bare.dat"
+    bits().tofile(path)
+    source = open_source(f"replay:{path}?pace=0&width=64&height=48&rate=500")
+    assert source.sensor == Sensor(64, 48, 500.0)
+    np.testing.assert_array_equal(play(source), bits())
+
+
 def test_what_the_recording_lost_is_lost_again(tmp_path: Path) -> None:
     path = tmp_path / "lossy.dat"
     with RecordingWriter(path, Sensor(64, 48, 1000.0)) as writer:

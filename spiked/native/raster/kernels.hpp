@@ -113,6 +113,21 @@ struct SplatGradients {  // arrays of `stride` floats; summed over sub-poses
     float* share;
 };
 
+struct AdamRates {
+    float rate, blend1, blend2, epsilon;  // blend: 1 - beta
+};
+
+enum class Penalty : int { kCharbonnier, kHuber };
+
+struct SsimImage {
+    int width, height;
+    float c1, c2;
+};
+// Floats of scratch: eight planes with margins above and below, and eight rows with margins at both ends.
+static inline int64_t ssim_scratch(int width, int height) { return 8 * ((int64_t)(height + 10) * width + width + 10); }
+// Of one `rounds` of multiply_add.
+constexpr int kMultiplyAddChains = 12;
+
 struct Kernels {
     const char* name;
     // From the splats to the arrays of Prepared, a whole group at a time; beyond the count the last splat is repeated.
@@ -136,6 +151,16 @@ struct Kernels {
     // where out.radius_px is 0. share_scale multiplies the contributions.
     void (*finish)(const SplatArrays&, const Prepared&, const SplatGradients&, int first, int last, float share_scale,
                    const GradientArrays& out);
+    // One step over [rows][columns <= 4]; correction is the bias correction of a row, 0 to leave it as it is.
+    void (*adam)(const AdamRates&, int rows, int columns, const float* correction, const float* gradient,
+                 float* parameter, float* first, float* second);
+    // sum of weight * penalty(rendered - target), and its gradient.
+    double (*robust)(Penalty, float scale, int64_t count, const float* rendered, const float* target,
+                     const float* weight, float* d_rendered);
+    // Mean structural similarity of two planes, and its gradient.
+    double (*ssim)(const SsimImage&, const float* rendered, const float* target, float* scratch, float* d_rendered);
+    float (*multiply_add)(int64_t rounds);
+    int lanes;
 };
 
 extern const Kernels kBaseline;

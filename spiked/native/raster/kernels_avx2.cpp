@@ -10,8 +10,10 @@ namespace {
 #include "project.inl"
 #include "emit.inl"
 #include "raster.inl"
+#include "losses.inl"
 // clang-format on
 }  // namespace
 
-const Kernels kAvx2 = {"avx2", prepare, project, emit, forward, store_tile, backward, unproject, finish};
+const Kernels kAvx2 = {"avx2",    prepare, project, emit,   forward, store_tile,   backward,
+                       unproject, finish,  adam,    robust, ssim,    multiply_add, kLanes};
 }  // namespace raster

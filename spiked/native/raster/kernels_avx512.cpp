@@ -10,8 +10,10 @@ namespace {
 #include "project.inl"
 #include "emit.inl"
 #include "raster.inl"
+#include "losses.inl"
 // clang-format on
 }  // namespace
 
-const Kernels kAvx512 = {"avx512", prepare, project, emit, forward, store_tile, backward, unproject, finish};
+const Kernels kAvx512 = {"avx512",  prepare, project, emit,   forward, store_tile,   backward,
+                         unproject, finish,  adam,    robust, ssim,    multiply_add, kLanes};
 }  // namespace raster

@@ -12,8 +12,10 @@ namespace {
 #include "project.inl"
 #include "emit.inl"
 #include "raster.inl"
+#include "losses.inl"
 // clang-format on
 }  // namespace
 
-const Kernels kBaseline = {"baseline", prepare, project, emit, forward, store_tile, backward, unproject, finish};
+const Kernels kBaseline = {"baseline", prepare, project, emit,   forward, store_tile,   backward,
+                           unproject,  finish,  adam,    robust, ssim,    multiply_add, kLanes};
 }  // namespace raster

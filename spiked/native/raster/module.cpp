@@ -2,23 +2,13 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 
+#include "bindings.hpp"
 #include "renderer.hpp"
 
 namespace nb = nanobind;
 using namespace raster;
 
 namespace {
-
-template <class T, int N>
-using Read = nb::ndarray<const T, nb::ndim<N>, nb::c_contig, nb::device::cpu>;
-template <class T, int N>
-using Write = nb::ndarray<T, nb::ndim<N>, nb::c_contig, nb::device::cpu>;
-template <class T>
-using WriteAny = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
-
-void expect(bool holds, const char* what) {
-    if (!holds) throw std::invalid_argument(what);
-}
 
 Lens lens_of(double fx, double fy, double cx, double cy, int width, int height, double near) {
     expect(width > 0 && height > 0 && width <= kMaxSide && height <= kMaxSide, "image sides are 1 to 4096 pixels");
@@ -61,9 +51,9 @@ void forward(Renderer& self, Read<float, 2> means, Read<float, 2> quats, Read<fl
                  channels ? channels->data() : nullptr, background.data(), values.data(), alpha.data(), depth.data());
 }
 
-void backward(Renderer& self, nb::ndarray<const float, nb::c_contig, nb::device::cpu> d_values, Write<float, 2> means,
-              Write<float, 2> quats, Write<float, 2> log_scales, Write<float, 1> opacity_logits,
-              Write<float, 2> colours, Write<double, 2> rotation, Write<double, 2> centre, Write<float, 1> contribution,
+void backward(Renderer& self, ReadAny<float> d_values, Write<float, 2> means, Write<float, 2> quats,
+              Write<float, 2> log_scales, Write<float, 1> opacity_logits, Write<float, 2> colours,
+              Write<double, 2> rotation, Write<double, 2> centre, Write<float, 1> contribution,
               Write<float, 1> radius_px) {
     expect(self.sub_poses() > 0, "backward follows forward");
     const size_t n = self.splats().count, s = self.sub_poses(), c = self.splats().colours;
@@ -82,6 +72,7 @@ void backward(Renderer& self, nb::ndarray<const float, nb::c_contig, nb::device:
 }  // namespace
 
 NB_MODULE(_raster, m) {
+    bind_losses(m);
     nb::class_<Renderer>(m, "Renderer")
         .def(
             "__init__",
@@ -97,5 +88,5 @@ NB_MODULE(_raster, m) {
              nb::arg("contribution"), nb::arg("radius_px"))
         .def_prop_ro("instructions", &Renderer::instructions)
         .def_prop_ro("threads", &Renderer::threads)
-        .def_prop_ro("mean_pairs", &Renderer::mean_pairs);
+        .def_prop_ro("block_evaluations", &Renderer::block_evaluations);
 }

@@ -203,7 +203,7 @@ static inline void backward_entry(const float* s, uint32_t blocks, int index, co
             rest -= shown;
             store(pixels.t + at, t - share);
             store(pixels.rest + at, rest);
-            Vec v = shown - rest * reciprocal(1.0f - alpha) * alpha;
+            Vec v = shown - rest * (reciprocal(1.0f - alpha) * alpha);
             if (Capped) v = where_reaches(splat(kLog2Cap), log2_alpha, v);
             Vec vu = v * u, vw = v * w;
             sum[kV] += v;

@@ -257,10 +257,11 @@ float Renderer::largest_radius(int splat) const {
     return radius;
 }
 
-double Renderer::mean_pairs() const {
-    double sum = 0;
-    for (int i = 0; i < sub_poses_; ++i) sum += views_[i].pairs;
-    return sub_poses_ ? sum / sub_poses_ : 0;
+int64_t Renderer::block_evaluations() const {
+    int64_t sum = 0;
+    for (int i = 0; i < sub_poses_; ++i)
+        for (uint32_t n = 0; n < views_[i].pairs; ++n) sum += __builtin_popcount(views_[i].entries[n].blocks);
+    return sum;
 }
 
 }  // namespace raster

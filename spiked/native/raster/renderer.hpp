@@ -40,7 +40,8 @@ class Renderer {
     const SplatArrays& splats() const { return splats_; }
     int sub_poses() const { return sub_poses_; }
     bool mosaic() const { return channels_ != nullptr; }
-    double mean_pairs() const;
+    // Blocks of 16 pixels times splats that the last forward() had to look at, at most.
+    int64_t block_evaluations() const;
 
   private:
     void prepare();

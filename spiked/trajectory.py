@@ -106,6 +106,8 @@ class Trajectory:
 
     def nearest(self, times_s: Array, within_s: float) -> NDArray[np.int64]:
         """For each time the index of the nearest pose, or -1 where none lies within `within_s`."""
+        if len(self) == 0:
+            return np.full(len(times_s), -1, np.int64)
         j = np.clip(np.searchsorted(self.times_s, times_s), 1, max(len(self) - 1, 1))
         before = np.abs(self.times_s[j - 1] - times_s) < np.abs(self.times_s[np.minimum(j, len(self) - 1)] - times_s)
         j = np.minimum(np.where(before, j - 1, j), len(self) - 1)

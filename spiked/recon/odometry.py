@@ -54,6 +54,8 @@ class Fit:
 
 
 BOOT_VIEWS = 10
+MIN_PARALLAX_PX = 1.5
+"""Motion that rotation cannot explain before a bootstrap is tried; tracks are good to 0.05 px."""
 MIN_POINTS = 15
 KEY_EVERY = 8
 """Every eighth posed view is kept for relocalisation."""
@@ -83,7 +85,7 @@ class Odometry:
     def __post_init__(self) -> None:
         self._tracks = Tracks()
         self._boot_start = 0
-        self._boot_parallax = 3.0
+        self._boot_parallax = MIN_PARALLAX_PX
         self._next_global = 0
         self._keys: dict[int, Picture] = {}
 

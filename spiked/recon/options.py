@@ -14,10 +14,10 @@ class MapOptions:
     """Spacing of the pixels that become the first splats."""
     splats_a_pixel: float = 0.4
     """Cap of the number of splats, in splats for each sensor pixel."""
-    rate_means: float = 2e-4
+    rate_means: float = 1.2e-3
     """Learning rates at the start, per step; those of the means and of colour are in units of depth and of white."""
-    rate_quats: float = 2e-3
-    rate_scales: float = 5e-3
+    rate_quats: float = 8e-3
+    rate_scales: float = 1.2e-2
     rate_opacities: float = 3e-2
     rate_colours: float = 4e-3
     floor: float = 0.03

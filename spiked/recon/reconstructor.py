@@ -25,7 +25,7 @@ from spiked.trajectory import Trajectory
 
 FIRST_WINDOW = 16
 WINDOWS = (8, 16, 32, 64)
-WINDOW_MOTION_PX = (0.45, 1.2)
+WINDOW_MOTION_PX = (0.25, 0.6)
 """A view gets twice as long when the image moves less than the first in it, and half as long above twice the second."""
 SEED_VIEWS = 5
 """Views swept for depth when the map begins."""

@@ -62,6 +62,11 @@ class Rasteriser:
         """The instruction set in use: avx512, avx2 or baseline."""
         return str(self._native.instructions)
 
+    @property
+    def block_evaluations(self) -> int:
+        """Pairs of a splat and a block of 4x4 pixels that it reaches in the last forward(), over all sub-poses."""
+        return int(self._native.block_evaluations)
+
     def forward(
         self,
         splats: SplatArrays,

@@ -1,0 +1,20 @@
+"""The benchmark measures what it says; its figures are not judged here."""
+
+import numpy as np
+
+from spiked.render import Rasteriser, benchmark
+
+
+def test_the_naive_renderer_draws_the_same_picture() -> None:
+    camera, splats = benchmark.scene(benchmark.Size(150, 64, 40))
+    image = Rasteriser(camera, 1).forward(splats, np.eye(3)[None], np.zeros((1, 3)))
+    assert np.abs(image.values - benchmark.naive_image(camera, splats)).max() < 1e-4
+
+
+def test_every_row_is_a_positive_number() -> None:
+    rows = benchmark.measure((benchmark.Size(300, 64, 40),), repetitions=1)
+    assert len({row.name for row in rows}) == len(rows)
+    assert all(row.value > 0 for row in rows)
+    steps = [row for row in rows if row.name.startswith("step")]
+    assert steps
+    assert all(row.ratio is not None and 0 < row.ratio < 1 for row in steps)

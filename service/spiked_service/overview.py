@@ -1,5 +1,6 @@
 """One picture that tells how a reconstruction went: the path, observed against rendered, and the fit over time."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,20 +17,20 @@ _INK = "#1d2330"
 _PATH = "viridis"
 
 
-def draw_overview(reconstructor: Reconstructor, title: str, path: Path) -> None:
-    """Write the picture as PNG."""
+def draw_overview(reconstructor: Reconstructor, title: str, curve: Sequence[tuple[float, float]], path: Path) -> None:
+    """Write the picture as PNG; `curve` is the loss over seconds of work."""
     samples = reconstructor.samples(_SAMPLES)
     figure = Figure(figsize=(14, 9.2), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     status = reconstructor.status()
     figure.suptitle(f"{title}   ·   {status.frames} frames, {status.splats} splats, {status.state}", color=_INK)
-    above, below = figure.subfigures(2, 1, height_ratios=(1.0, 1.15))
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.0, 1.15))[:, 0]
     top, side, fit = above.subplots(1, 3)
     trajectory = reconstructor.trajectory()
     _draw_path(top, trajectory, (0, 2), ("x, right", "z, forward"), "path from above")
     _draw_path(side, trajectory, (2, 1), ("z, forward", "y, down"), "path from the side")
     side.invert_yaxis()
-    _draw_fit(fit, _curve(reconstructor))
+    _draw_fit(fit, curve)
     if samples:
         _draw_samples(below.subplots(2, len(samples), squeeze=False), samples, reconstructor.white)
     else:
@@ -63,23 +64,14 @@ def _draw_path(
     axes.legend(fontsize=8, loc="best", framealpha=0.8)
 
 
-def _curve(reconstructor: Reconstructor) -> list[tuple[float, float]]:
-    curve = reconstructor.report()["psnr_of_views_over_seconds"]
-    assert isinstance(curve, list)
-    return [(float(seconds), float(decibels)) for seconds, decibels in curve]
-
-
-def _draw_fit(axes: Axes, curve: list[tuple[float, float]]) -> None:
-    axes.set_title("fit of the views", fontsize=10, color=_INK)
+def _draw_fit(axes: Axes, curve: Sequence[tuple[float, float]]) -> None:
+    axes.set_title("loss of the views", fontsize=10, color=_INK)
     axes.set_xlabel("seconds of work")
-    axes.set_ylabel("PSNR of the views, dB")
-    axes.grid(color="#e6e8ee", linewidth=0.6)
+    axes.set_ylabel("mean squared error, white = 1")
+    axes.grid(color="#e6e8ee", linewidth=0.6, which="both")
     if curve:
-        seconds, decibels = np.array(curve).T
-        axes.plot(seconds, decibels, color="#3a6ea5", lw=0.7, alpha=0.35)
-        width = min(9, len(decibels))
-        smooth = np.convolve(decibels, np.full(width, 1 / width), "valid")
-        axes.plot(seconds[width - 1 :], smooth, color="#3a6ea5", lw=1.8)
+        seconds, losses = np.array(curve).T
+        axes.semilogy(seconds, losses, color="#3a6ea5", lw=1.8)
 
 
 def _draw_samples(grid: NDArray[np.object_], samples: list[Sample], white: float) -> None:

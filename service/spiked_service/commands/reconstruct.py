@@ -69,7 +69,7 @@ def reconstruct(
         reconstruct_recording(
             recording, reconstructor, progress=display.show, cancelled=interrupt.is_set, budget_s=seconds
         )
-    _write(reconstructor, out, file.name)
+    _write(reconstructor, out, file.name, display.curve)
     status = reconstructor.status()
     poses_found = len(reconstructor.trajectory())
     output.print(f"{out}: {poses_found} poses for {status.frames} frames, {status.splats} splats, {status.state}")
@@ -122,8 +122,10 @@ class _Display:
             disable=not messages.is_terminal,
         )
         self._task = self._bar.add_task("waiting", total=1.0, figures="")
-        self._last = time.monotonic()
+        self._begin = self._last = time.monotonic()
         self._stage = ""
+        self.curve: list[tuple[float, float]] = []
+        """Seconds since the beginning and loss, as they came."""
 
     def __enter__(self) -> "_Display":
         self._bar.start()
@@ -134,6 +136,8 @@ class _Display:
 
     def show(self, status: Status) -> None:
         """Show where the reconstruction stands."""
+        if status.loss is not None:
+            self.curve.append((time.monotonic() - self._begin, status.loss))
         loss = "" if status.loss is None else f"  loss {status.loss:.2e}"
         figures = f"{status.frames}/{self._frames} frames  {status.state}{loss}  {status.splats} splats"
         fed = min(1.0, status.frames / max(self._frames, 1))
@@ -155,13 +159,13 @@ def _check_folder(out: Path) -> None:
         raise ConfigurationError(f"--out {out} cannot be made: {nearest} is a file")
 
 
-def _write(reconstructor: Reconstructor, out: Path, title: str) -> None:
+def _write(reconstructor: Reconstructor, out: Path, title: str, curve: list[tuple[float, float]]) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         reconstructor.scene().write_ply(out / "scene.ply", reconstructor.white)
         reconstructor.trajectory().write_tum(out / "trajectory.tum")
         (out / "report.json").write_text(json.dumps(reconstructor.report(), indent=1), encoding="utf-8")
-        draw_overview(reconstructor, title, out / "overview.png")
+        draw_overview(reconstructor, title, curve, out / "overview.png")
     except OSError as error:
         raise ConfigurationError(
             f"cannot write the results to {out}: {error.strerror}; choose another folder"

@@ -1,2 +1,129 @@
-def serve() -> None:
-    """x"""
+"""`spiked serve`: the daemon."""
+
+import ipaddress
+import socket
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+import uvicorn
+
+from spiked.errors import ConfigurationError
+from spiked_service.api import create_app
+from spiked_service.capture import CaptureState, Plan, Snapshot
+from spiked_service.captures import Captures, unhurried
+from spiked_service.console import messages, output
+from spiked_service.geometry import parse_intrinsics
+from spiked_service.runtime import RuntimeFolder
+
+_FOLLOW_S = 2.0
+
+
+def serve(
+    device: Annotated[
+        list[str] | None, typer.Option("--device", "-d", help="replay:FILE or sim:, with options; may be repeated.")
+    ] = None,
+    host: Annotated[str, typer.Option(help="Address to listen at; beyond loopback it needs --token.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port; 0 takes a free one.", min=0, max=65535)] = 8650,
+    token: Annotated[
+        str | None, typer.Option(envvar="SPIKED_TOKEN", help="What every request must bring.", show_envvar=True)
+    ] = None,
+    capture: Annotated[bool, typer.Option("--capture/--no-capture", help="Start with the first device.")] = True,
+    frames: Annotated[int | None, typer.Option(help="Length of that capture.", min=1)] = None,
+    intrinsics: Annotated[str | None, typer.Option(help="Its optics: fx,fy,cx,cy in pixels.")] = None,
+    follow: Annotated[bool, typer.Option("--follow", help="Print how the reconstruction grows.")] = False,
+    runtime: Annotated[
+        Path | None, typer.Option(envvar="SPIKED_RUNTIME", help="Folder for running captures.", show_envvar=True)
+    ] = None,
+) -> None:
+    """Run the daemon: acquisition, reconstruction in a worker process, HTTP and a page to watch it.
+
+    A simulated camera or a replay waits for the reconstruction, so nothing is lost; `?pace=1` plays it as live.
+
+    Examples:
+
+    - `spiked serve --device sim:`
+
+    - `spiked serve --device 'replay:rec.dat?pace=1' --port 9000`
+
+    - `SPIKED_TOKEN=secret spiked serve --device sim: --host 0.0.0.0`
+    """
+    _check_access(host, token)
+    devices = device or []
+    plan = None
+    if devices and capture:
+        k = parse_intrinsics(intrinsics) if intrinsics else None
+        plan = Plan(unhurried(devices[0]), frames=frames, intrinsics=k)
+    listener = _listen(host, port)
+    folder = RuntimeFolder(runtime)
+    captures = Captures(folder.path)
+    server = _Server(uvicorn.Config(create_app(captures, devices, token), log_level="warning", lifespan="on"))
+    server.config.timeout_graceful_shutdown = 0
+    try:
+        if plan is not None:
+            captures.start(plan)
+        output.print(f"spiked listens at http://{_shown(host)}:{listener.getsockname()[1]}/", markup=False)
+        if follow:
+            threading.Thread(target=_follow, args=(captures,), name="follow", daemon=True).start()
+        server.run(sockets=[listener])
+    finally:
+        captures.close()
+        folder.remove()
+
+
+class _Server(uvicorn.Server):
+    """Leaves with exit code 0 after SIGINT and SIGTERM: both are ways to end a daemon."""
+
+    def run(self, sockets: list[socket.socket] | None = None) -> None:
+        try:
+            super().run(sockets)
+        except KeyboardInterrupt:
+            messages.print("stopped")
+
+
+def _check_access(host: str, token: str | None) -> None:
+    """Raises ConfigurationError for an address that others can reach without a token."""
+    try:
+        loopback = ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        loopback = host == "localhost"
+    if not loopback and not token:
+        raise ConfigurationError(f"--host {host} can be reached by others: give a --token that requests must bring")
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    """A listening socket, so that the address is known before anything is started. Raises ConfigurationError."""
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        raise ConfigurationError(f"cannot listen at {host}:{port}: {error.strerror}; choose another --port") from error
+
+
+def _shown(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
+
+
+def _follow(captures: Captures) -> None:
+    """Print a line whenever something has changed, until the process ends."""
+    last = ""
+    pause = threading.Event()
+    while True:
+        for capture in captures.all()[-1:]:
+            line = _line(capture.snapshot())
+            if line != last:
+                output.print(line, markup=False)
+                last = line
+        pause.wait(_FOLLOW_S)
+
+
+def _line(snapshot: Snapshot) -> str:
+    """How a capture stands, in one line."""
+    status = snapshot.reconstruction
+    if status is None or snapshot.state is CaptureState.FAILED:
+        return f"{snapshot.state}  {snapshot.reason}".rstrip()
+    loss = "" if status.loss is None else f"  loss {status.loss:.1e}"
+    left = f"  {100 * status.progress:.0f} % refined" if snapshot.state is CaptureState.FINISHING else ""
+    growth = f"{status.frames} frames  {status.poses} poses  {status.splats} splats"
+    return f"{snapshot.state}  {status.state}  {growth}{loss}  version {status.version}{left}"

@@ -1,0 +1,222 @@
+"""What goes over HTTP, with an example of each."""
+
+from datetime import datetime
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from spiked.pose import rotation_of
+from spiked.sensor import Intrinsics
+from spiked_service.capture import CaptureState, Snapshot
+from spiked_service.messages import ReconstructionStatus
+
+Array = NDArray[np.float64]
+
+
+class _Schema(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class DeviceOut(BaseModel):
+    """Something to capture from."""
+
+    source: str = Field(description="To be given as `source` of a capture.")
+    kind: str
+    description: str
+
+
+class IntrinsicsModel(_Schema):
+    """A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5)."""
+
+    fx: float = Field(gt=0)
+    fy: float = Field(gt=0)
+    cx: float
+    cy: float
+
+    def intrinsics(self) -> Intrinsics:
+        """The same for the library."""
+        return Intrinsics(self.fx, self.fy, self.cx, self.cy)
+
+
+class CaptureRequest(_Schema):
+    """A capture to start."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={"examples": [{"source": "sim:?seed=1", "frames": 1280}, {"source": "replay:rec.dat"}]},
+    )
+    source: str = Field(description="sim: or replay:FILE, with options after a question mark; without pace it waits.")
+    frames: int | None = Field(None, gt=0, description="Length; until the source ends or is stopped if not given.")
+    seconds: float | None = Field(None, gt=0, description="Length in seconds of the camera, instead of frames.")
+    seed: int = 0
+    steps: int = Field(4000, ge=0, le=200_000, description="Gradient steps of the refinement after the last frame.")
+    intrinsics: IntrinsicsModel | None = Field(None, description="If the source does not know its own.")
+
+    @model_validator(mode="after")
+    def _one_length(self) -> Self:
+        if self.frames is not None and self.seconds is not None:
+            raise ValueError("frames and seconds both say how long to capture; give one of them")
+        return self
+
+
+class SensorOut(BaseModel):
+    """The camera of a capture."""
+
+    width: int
+    height: int
+    frame_rate_hz: float
+    frames: int | None = Field(description="Length of the capture if it is known.")
+    intrinsics: IntrinsicsModel | None
+
+
+class ConsumerOut(BaseModel):
+    """One reader of the ring."""
+
+    name: str
+    received: int
+    lost: int
+    lag_frames: int
+    fill: float = Field(description="Its lag as a part of what it may lag; at 1 it loses frames.")
+    lagging: bool
+
+
+class CountersOut(BaseModel):
+    """Frames of a capture; received + lost is the index of the next frame."""
+
+    device: str = Field(description="State of the device, with its reason.")
+    received: int
+    lost: dict[str, int] = Field(description="By cause: device, usb, ring, disk.")
+    next_frame: int
+    consumers: list[ConsumerOut]
+
+
+class CaptureOut(BaseModel):
+    """A capture."""
+
+    id: str = Field(description="UUID version 7: ids sort by time.")
+    source: str
+    started: datetime
+    state: CaptureState
+    reason: str = Field(description="Why, if the capture has failed or is about to.")
+    warnings: list[str]
+    sensor: SensorOut | None
+    counters: CountersOut | None
+    reconstruction: ReconstructionStatus | None
+
+    @classmethod
+    def of(cls, snapshot: Snapshot) -> "CaptureOut":
+        """A snapshot as it is shown."""
+        return cls(
+            id=snapshot.id,
+            source=snapshot.plan.source,
+            started=snapshot.started,
+            state=snapshot.state,
+            reason=snapshot.reason,
+            warnings=list(snapshot.warnings),
+            sensor=_sensor(snapshot),
+            counters=_counters(snapshot),
+            reconstruction=snapshot.reconstruction,
+        )
+
+
+def _sensor(snapshot: Snapshot) -> SensorOut | None:
+    ring = snapshot.ring
+    if ring is None:
+        return None
+    k = snapshot.plan.intrinsics or ring.intrinsics
+    return SensorOut(
+        width=ring.width,
+        height=ring.height,
+        frame_rate_hz=ring.frame_rate_hz,
+        frames=ring.frames,
+        intrinsics=None if k is None else IntrinsicsModel(fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy),
+    )
+
+
+def _counters(snapshot: Snapshot) -> CountersOut | None:
+    counters = snapshot.counters
+    if counters is None:
+        return None
+    writer, condition = counters.writer, counters.writer.condition
+    return CountersOut(
+        device=f"{condition.state}: {condition.reason}" if condition.reason else str(condition.state),
+        received=writer.committed,
+        lost={str(cause): count for cause, count in writer.lost.items()},
+        next_frame=writer.next_frame,
+        consumers=[
+            ConsumerOut(
+                name=reader.consumer,
+                received=reader.received,
+                lost=reader.lost,
+                lag_frames=reader.lag_frames,
+                fill=reader.fill,
+                lagging=reader.lagging,
+            )
+            for reader in counters.readers
+        ],
+    )
+
+
+class TrajectoryOut(BaseModel):
+    """Camera-to-world poses, OpenCV axes."""
+
+    version: int
+    times_s: list[float]
+    positions: list[list[float]] = Field(description="[n, 3], length unit of the scene.")
+    quaternions_wxyz: list[list[float]] = Field(description="[n, 4]")
+
+
+class ViewRequest(_Schema):
+    """A camera to look through: c2w, or position and quaternion_wxyz; the capture's own optics if none are given."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {"position": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]},
+                {
+                    "c2w": [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+                    "width": 640,
+                    "height": 400,
+                    "intrinsics": {"fx": 550, "fy": 550, "cx": 320, "cy": 200},
+                },
+            ]
+        },
+    )
+    c2w: list[list[float]] | None = Field(None, description="Camera to world, 4x4, rows.")
+    position: tuple[float, float, float] | None = None
+    quaternion_wxyz: tuple[float, float, float, float] | None = None
+    intrinsics: IntrinsicsModel | None = None
+    width: int | None = Field(None, ge=1, le=4096)
+    height: int | None = Field(None, ge=1, le=4096)
+    white: float | None = Field(None, gt=0, description="Radiance shown as white in PNG; the scene's own if not given.")
+
+    @model_validator(mode="after")
+    def _one_pose(self) -> Self:
+        by_parts = self.position is not None and self.quaternion_wxyz is not None
+        if (self.c2w is not None) == by_parts:
+            raise ValueError("give either c2w, or position and quaternion_wxyz")
+        rotation, centre = self.pose()
+        if not (np.isfinite(rotation).all() and np.isfinite(centre).all()):
+            raise ValueError("the pose holds values that are not finite")
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+            raise ValueError("the upper left of c2w is not a rotation")
+        if (self.width is None) != (self.height is None):
+            raise ValueError("give width and height together")
+        if self.width is not None and self.intrinsics is None:
+            raise ValueError("a size of your own needs intrinsics of your own")
+        return self
+
+    def pose(self) -> tuple[Array, Array]:
+        """Rotation [3, 3] and centre [3], camera to world. Raises ValueError for a matrix of another shape."""
+        if self.c2w is not None:
+            if [len(row) for row in self.c2w] != [4] * 4:
+                raise ValueError("c2w is 4 rows of 4 numbers")
+            matrix = np.array(self.c2w)
+            return matrix[:3, :3], matrix[:3, 3]
+        quaternion = np.array(self.quaternion_wxyz)
+        if np.linalg.norm(quaternion) < 1e-6:
+            raise ValueError("quaternion_wxyz is zero")
+        return rotation_of(quaternion), np.array(self.position)

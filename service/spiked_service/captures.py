@@ -1,0 +1,69 @@
+"""All captures of a service."""
+
+import threading
+from pathlib import Path
+from urllib.parse import urlencode
+
+from spiked.errors import SpikedError
+from spiked_service.capture import Capture, Plan
+
+_CLOSE_S = 1.2
+
+
+class UnknownCaptureError(SpikedError):
+    """There is no capture with this id."""
+
+
+class BusyError(SpikedError):
+    """Another capture is running."""
+
+
+class Captures:
+    """Starts captures, one at a time, and remembers those that are over."""
+
+    def __init__(self, runtime: Path) -> None:
+        self._runtime = runtime
+        self._lock = threading.Lock()
+        self._captures: dict[str, Capture] = {}
+
+    def start(self, plan: Plan) -> Capture:
+        """Raises BusyError while another capture runs."""
+        with self._lock:
+            for other in self._captures.values():
+                if not other.snapshot().state.over:
+                    raise BusyError(f"capture {other.id} is still running: stop it, or wait for its end")
+            capture = Capture(plan, self._runtime)
+            self._captures[capture.id] = capture
+            return capture
+
+    def get(self, capture_id: str) -> Capture:
+        """Raises UnknownCaptureError."""
+        with self._lock:
+            try:
+                return self._captures[capture_id]
+            except KeyError as error:
+                raise UnknownCaptureError(f"there is no capture {capture_id}; GET captures lists them") from error
+
+    def all(self) -> list[Capture]:
+        """Oldest first."""
+        with self._lock:
+            return list(self._captures.values())
+
+    def close(self) -> None:
+        """End every worker, within a moment."""
+        captures = self.all()
+        for capture in captures:
+            capture.dismiss()
+        for capture in captures:
+            capture.join(_CLOSE_S)
+
+
+def unhurried(source: str) -> str:
+    """The source with `pace=0` unless it names a pace: files and simulations then wait for the reconstruction.
+
+    A real camera cannot wait; a replay at its recorded rate, which loses what is not taken in time, is `pace=1`.
+    """
+    kind, _, query = source.partition("?")
+    if not kind.startswith(("replay:", "sim:")) or "pace=" in query:
+        return source
+    return f"{kind}?{query}&{urlencode({'pace': 0})}" if query else f"{kind}?pace=0"

@@ -1,0 +1,1 @@
+"""What the workers do: acquisition, reconstruction, preview, each in a process of its own."""

@@ -30,11 +30,19 @@ static void block_columns(const Record& s, const Lens& lens, int row, int rows, 
     }
 }
 
-// A bit for each column of blocks from first to last of the 64 that start at `from`.
+// A bit for each column of blocks from first to last of the 16 that start at `from`.
 static inline uint64_t columns_of(int first, int last, int from) {
     first = first > from ? first - from : 0;
-    last = last - from < 63 ? last - from : 63;
-    return first > last ? 0 : ~0ull << first & ~0ull >> (63 - last);
+    last = last - from < 15 ? last - from : 15;
+    return first > last ? 0 : 0xffffu << first & 0xffffu >> (15 - last);
+}
+
+// From four rows of sixteen blocks to four tiles of 4x4 blocks: transposes a 4x4 matrix of nibbles.
+static inline uint64_t tiles_of(uint64_t rows) {
+    uint64_t swap = (rows ^ rows >> 12) & 0x0000f0f00000f0f0u;
+    rows ^= swap ^ swap << 12;
+    swap = (rows ^ rows >> 24) & 0x00000000ff00ff00u;
+    return rows ^ swap ^ swap << 24;
 }
 
 static int emit(const Record& s, uint32_t rank, const Lens& lens, int32_t* columns, Pair* out) {
@@ -54,15 +62,15 @@ static int emit(const Record& s, uint32_t rank, const Lens& lens, int32_t* colum
             from = first[k] < from ? first[k] : from;
             to = last[k] > to ? last[k] : to;
         }
-        for (from &= ~3; from <= to; from += 64) {
-            uint64_t row[4], any = 0;
-            for (int k = 0; k < 4; ++k) any |= row[k] = columns_of(first[k], last[k], from);
-            Pair pair = {(uint32_t)(tile_y * lens.tiles_x + from / 4) << 16, rank};
-            for (; any; any >>= 4, pair.tile_blocks += 1u << 16) {
-                *end = pair;
-                end->tile_blocks |= (row[0] & 15) | (row[1] & 15) << 4 | (row[2] & 15) << 8 | (row[3] & 15) << 12;
-                end += (any & 15) != 0;
-                for (int k = 0; k < 4; ++k) row[k] >>= 4;
+        for (from &= ~3; from <= to; from += 16) {
+            uint64_t rows = 0;
+            for (int k = 0; k < 4; ++k) rows |= columns_of(first[k], last[k], from) << (16 * k);
+            uint64_t tiles = tiles_of(rows);
+            const uint32_t tile = (uint32_t)(tile_y * lens.tiles_x + from / 4);
+            // Written whether reached or not, which is cheaper than to ask; `out` has room for three more.
+            for (uint32_t k = 0; k < 4; ++k, tiles >>= 16) {
+                *end = {(tile + k) << 16 | (uint32_t)(tiles & 0xffff), rank};
+                end += (tiles & 0xffff) != 0;
             }
         }
     }

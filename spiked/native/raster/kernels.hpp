@@ -136,7 +136,7 @@ struct Kernels {
     // Writes records[first..last) and keys (bits of z, or kCulled).
     void (*project)(const Prepared&, const Lens&, const View&, int count, int first, int last, Record* records,
                     uint32_t* keys);
-    // Appends the pairs of one splat, at most `tiles_x * tiles_y`, to `out`; returns their number.
+    // Appends the pairs of one splat to `out`, which has room for tiles_x * tiles_y + 4; returns their number.
     // `columns` is scratch, 2 * (blocks in a column of the image + kGroup) integers.
     int (*emit)(const Record&, uint32_t rank, const Lens&, int32_t* columns, Pair* out);
     void (*forward)(const Tile&, int colours, const float background[3], const Planes&, const TileState&, TileImage*);

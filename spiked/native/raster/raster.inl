@@ -22,12 +22,16 @@ static constexpr Centres kCentres;
 enum Local { kP, kQ, kS, kR, kT, kLog2Opacity, kZ, kC };
 constexpr int local_floats(int colours) { return colours == 1 ? 8 : 16; }
 
+constexpr int kAhead = 12;  // entries; covers the latency of main memory
+
 template <int C>
 static void localise(const Tile& tile) {
     float* out = tile.local;
     const float left = (float)(tile.tile_x * kTile), top = (float)(tile.tile_y * kTile);
     for (int i = 0; i < tile.count; ++i, out += local_floats(C)) {
         const Record& in = tile.records[tile.entries[i].rank];
+        // Records lie in order of depth, so those of a tile are far apart.
+        if (i + kAhead < tile.count) __builtin_prefetch(&tile.records[tile.entries[i + kAhead].rank]);
         out[kP] = in.p, out[kQ] = in.q, out[kR] = in.r;
         out[kS] = -(in.p * (in.x - left) + in.q * (in.y - top));
         out[kT] = -in.r * (in.y - top);
@@ -241,15 +245,15 @@ static void backward_tile(const Tile& tile, const float* d_values, const Planes&
             }
         }
     });
+#if defined(__AVX512F__)
+    const __m512i ends = _mm512_loadu_si512(state.ends);
+#endif
     const float* s = tile.local;
     for (int i = 0; i < tile.count; ++i, s += local_floats(C)) {
         uint32_t blocks = tile.entries[i].blocks;
-        for (uint32_t left = blocks; left; left &= left - 1) {
-            const int block = __builtin_ctz(left);
-            bool done = true;
-            for (int part = 0; part < kParts; ++part) done &= i >= state.ends[block * kParts + part];
-            if (done) blocks &= ~(1u << block);
-        }
+#if defined(__AVX512F__)
+        blocks &= _mm512_cmpgt_epi32_mask(ends, _mm512_set1_epi32(i));
+#endif
         float* slot = slots + (int64_t)tile.entries[i].slot * slot_floats(C);
         if (s[kLog2Opacity] > kLog2Cap) {
             backward_entry<C, true>(s, blocks, i, state.ends, pixels, slot);

@@ -124,8 +124,8 @@ void Renderer::bin(SubPose& sub) {
         std::fill_n(tile_counts, tiles, 0u);
         uint32_t size = 0;
         for (int rank = first_rank(run); rank < first_rank(run + 1); ++rank) {
-            if (emission.pairs.size() < size + static_cast<size_t>(tiles))
-                emission.pairs.resize(2 * size + static_cast<size_t>(tiles));
+            const size_t room = size + static_cast<size_t>(tiles) + 4;
+            if (emission.pairs.size() < room) emission.pairs.resize(2 * room);
             Pair* pairs = emission.pairs.data() + size;
             const int emitted = kernels_.emit(sub.records[rank], rank, lens_, columns, pairs);
             for (int i = 0; i < emitted; ++i) ++tile_counts[pairs[i].tile_blocks >> 16];
@@ -235,6 +235,9 @@ void Renderer::backward(const float* d_values, const GradientArrays& out) {
 // The sums of a group's splats over their tiles, in order of emission.
 void Renderer::gather(const SubPose& sub, int first, float* sums, uint8_t* visible) const {
     const int stride = slot_floats(splats_.colours), used = kColour0 + splats_.colours;
+    for (int splat = first + kGroup; splat < std::min(first + 2 * kGroup, splats_.count); ++splat)
+        if (const uint32_t rank = sub.rank_of[splat]; rank != kCulled)
+            __builtin_prefetch(sub.slots.data() + static_cast<size_t>(sub.first_slot[rank]) * stride);
     for (int lane = 0; lane < kGroup; ++lane) {
         const int splat = first + lane;
         const uint32_t rank = splat < splats_.count ? sub.rank_of[splat] : kCulled;

@@ -108,7 +108,7 @@ static inline Vec clamp(Vec x, Vec low, Vec high) { return min(max(x, low), high
 static inline Vec choose(Int condition, Vec yes, Vec no) { return condition ? yes : no; }
 static inline Int is_finite(Vec x) { return (x - x) == 0.0f; }
 
-// 2^x from the polynomial p of 2^f on [0, 1), f the fractional part of x.
+// 2^x for x >= -126, and anything at all below, from the polynomial p of 2^f on [0, 1), f the fractional part of x.
 template <class Polynomial>
 static inline Vec exp2_by(Vec x, Polynomial p) {
 #if defined(__AVX512F__)
@@ -116,7 +116,6 @@ static inline Vec exp2_by(Vec x, Polynomial p) {
     return (Vec)_mm512_scalef_ps((__m512)p(f), (__m512)x);
 #else
     const Vec shift = splat(12582912.0f);  // 1.5 * 2^23: adding it leaves the rounded integer in the low bits
-    x = max(x, splat(-126.0f));
     Vec shifted = (x - 0.5f) + shift;
     Vec f = x - (shifted - shift);
     return (Vec)(bits(p(f)) + (bits(shifted) << 23));
@@ -131,9 +130,9 @@ static inline Vec exp2_fast(Vec x) {
     });
 }
 
-// Relative error 1e-7, minimax fit.
+// Relative error 1e-7, minimax fit; any x up to 127.
 static inline Vec exp2_fine(Vec x) {
-    return exp2_by(x, [](Vec f) {
+    return exp2_by(max(x, splat(-126.0f)), [](Vec f) {
         return 0.9999999403953552f +
                f * (0.6931530833244324f +
                     f * (0.24015362560749054f +

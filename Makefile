@@ -16,7 +16,7 @@ PAGE := $(shell find service/spiked_service/page -name '*.js')
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.native
-	$(BIN)/spiked serve --device sim: --follow
+	$(BIN)/spiked serve --device sim: --frames 1280 --follow
 
 test: lint
 	$(BIN)/pytest -m "not slow"

@@ -193,6 +193,8 @@ class Capture:
             self._state = CaptureState.FAILED if self._reason else CaptureState.COMPLETE
 
     def _reconstruction_ended(self, trouble: str | None) -> None:
+        if self._closing:
+            return
         self._note(trouble)
         self._state = CaptureState.FAILED if self._reason else CaptureState.COMPLETE
         for child in list(self._children.values()):

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from spiked.pose import rotation_of
+from spiked.ring import Policy
 from spiked.sensor import Intrinsics
 from spiked_service.capture import CaptureState, Snapshot
 from spiked_service.messages import ReconstructionStatus
@@ -75,6 +76,7 @@ class ConsumerOut(BaseModel):
     """One reader of the ring."""
 
     name: str
+    policy: Policy = Field(description="latest skips frames by intention; the others want them all.")
     received: int
     lost: int
     lag_frames: int
@@ -148,6 +150,7 @@ def _counters(snapshot: Snapshot) -> CountersOut | None:
         consumers=[
             ConsumerOut(
                 name=reader.consumer,
+                policy=reader.policy,
                 received=reader.received,
                 lost=reader.lost,
                 lag_frames=reader.lag_frames,

@@ -1,9 +1,13 @@
 """`spiked serve`: the daemon."""
 
 import ipaddress
+import signal
 import socket
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Annotated
 
 import typer
@@ -13,7 +17,7 @@ from spiked.errors import ConfigurationError
 from spiked_service.api import create_app
 from spiked_service.capture import CaptureState, Plan, Snapshot
 from spiked_service.captures import Captures, unhurried
-from spiked_service.console import messages, output
+from spiked_service.console import output
 from spiked_service.geometry import parse_intrinsics
 from spiked_service.runtime import RuntimeFolder
 
@@ -58,15 +62,16 @@ def serve(
     listener = _listen(host, port)
     folder = RuntimeFolder(runtime)
     captures = Captures(folder.path)
-    server = _Server(uvicorn.Config(create_app(captures, devices, token), log_level="warning", lifespan="on"))
-    server.config.timeout_graceful_shutdown = 0
+    config = uvicorn.Config(
+        create_app(captures, devices, token), log_level="warning", lifespan="on", timeout_graceful_shutdown=1
+    )
     try:
         if plan is not None:
             captures.start(plan)
         output.print(f"spiked listens at http://{_shown(host)}:{listener.getsockname()[1]}/", markup=False)
         if follow:
             threading.Thread(target=_follow, args=(captures,), name="follow", daemon=True).start()
-        server.run(sockets=[listener])
+        _Server(config, captures).run(sockets=[listener])
     finally:
         captures.close()
         folder.remove()
@@ -75,11 +80,24 @@ def serve(
 class _Server(uvicorn.Server):
     """Leaves with exit code 0 after SIGINT and SIGTERM: both are ways to end a daemon."""
 
-    def run(self, sockets: list[socket.socket] | None = None) -> None:
+    def __init__(self, config: uvicorn.Config, captures: Captures) -> None:
+        super().__init__(config)
+        self._captures = captures
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """The workers learn of the end at once, not when the last response is sent."""
+        threading.Thread(target=self._captures.dismiss, name="dismissal").start()
+        super().handle_exit(sig, frame)
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """As uvicorn does, but without dying of the signal afterwards, which would leave the runtime folder behind."""
+        before = {number: signal.signal(number, self.handle_exit) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
-            super().run(sockets)
-        except KeyboardInterrupt:
-            messages.print("stopped")
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
 
 def _check_access(host: str, token: str | None) -> None:

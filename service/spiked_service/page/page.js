@@ -33,7 +33,8 @@ function figuresOf(capture) {
     const lost = Object.entries(counters.lost).filter(([, n]) => n > 0);
     rows.push(["lost", lost.length ? lost.map(([cause, n]) => `${count(n)} ${cause}`).join(", ") : "none"]);
     for (const c of counters.consumers) {
-      rows.push([`→ ${c.name}`, `${Math.round(100 * c.fill)} % of its ring, ${count(c.lost)} lost${c.lagging ? ", lagging" : ""}`]);
+      const missed = c.policy === "latest" ? "skipped" : "lost";
+      rows.push([`→ ${c.name}`, `${count(c.lag_frames)} behind, ${count(c.lost)} ${missed}${c.lagging ? ", lagging" : ""}`]);
     }
   }
   if (r) {

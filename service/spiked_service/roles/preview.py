@@ -12,7 +12,7 @@ from spiked_service.messages import PreviewOrder
 from spiked_service.publication import write_atomically
 from spiked_service.worker import Link
 
-_BLOCKS = 6
+_BLOCKS = 4
 """Blocks of a picture; the nominal window leaves one at either end for the edge spikes."""
 _PERIOD_S = 0.15
 _WAIT_S = 0.1

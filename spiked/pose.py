@@ -96,7 +96,7 @@ def quaternion(rotation: ArrayLike) -> Array:
     )
     q = np.take_along_axis(candidates, np.argmax(squares, -1)[..., None, None], -2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.where(q[..., :1] < 0, -q, q)
+    return np.asarray(np.where(q[..., :1] < 0, -q, q))
 
 
 def rotation_of(wxyz: ArrayLike) -> Array:

@@ -1,9 +1,10 @@
-"""The first map from nothing: sparse tracks over a few views, several starting guesses, the lowest robust cost wins.
+"""The first map from nothing: tracks over a few views, several starting guesses, the lowest robust cost wins.
 
-Joint optimisation from one guess often ends in the depth-reversed scene; trying guesses and the mirror image of the best
-(translations negated, inverse depths mirrored about their median) avoids that.
+Joint optimisation from one guess often ends in the depth-reversed scene; trying guesses, and the mirror image of the
+best (translations negated, inverse depths mirrored about their median), avoids that.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -67,7 +68,7 @@ class Verdict:
 
 
 def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = 3.0) -> Verdict:
-    """Try all guesses on `views`. Accepts when inliers > 60 %, parallax is enough and the depth-reversed rival is worse."""
+    """Try all guesses on `views`. Accepts when inliers > 60 % and the depth-reversed rival is worse."""
     if len(views.ids) < 30:
         return Verdict(None, f"only {len(views.ids)} tracks span the views; more texture or light is needed", [])
     rotation_only = _rotation_residual(views)
@@ -77,7 +78,7 @@ def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = 3.0) -> Verd
         )
     rng = np.random.default_rng(seed)
     count = len(views.ids)
-    starts = {
+    starts: dict[Guess, Callable[[], Bundle | None]] = {
         Guess.FLAT: lambda: _from_depth(views, np.ones(count)),
         Guess.RANDOM: lambda: _from_depth(views, 1 / rng.uniform(0.5, 1.5, count)),
         Guess.FIVE_POINT: lambda: _from_five_point(views),

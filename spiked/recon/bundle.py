@@ -1,7 +1,7 @@
 """Bundle adjustment of sparse points and poses: robust Levenberg-Marquardt with the points eliminated (Schur).
 
-(B. Triggs et al., "Bundle adjustment - a modern synthesis", 1999.) Dense linear algebra throughout: the reduced system of
-a few hundred poses is small, and the long sides are one matrix product.
+(B. Triggs et al., "Bundle adjustment - a modern synthesis", 1999.) Dense linear algebra throughout: the reduced
+system of a few hundred poses is small, and the long sides are one matrix product.
 """
 
 from dataclasses import dataclass
@@ -77,7 +77,7 @@ class Bundle:
     def optimise_spline(
         self, spline: Spline, times: Array, iterations: int, scale_px: float = 0.5, tolerance: float = 1e-4
     ) -> tuple[Spline, float]:
-        """As `optimise`, with the poses tied to a spline at `times` [C] (frames): returns the new spline and the cost."""
+        """As `optimise`, with the poses tied to a spline at `times` [C] (frames): returns spline and cost."""
         self.rotations, self.centres = spline.poses(times)
         blend = spline.basis_matrix(times)
         everything = np.ones(len(self.centres), bool)
@@ -162,12 +162,13 @@ class _System:
         self.pose_hessian = _sum_by(c, np.einsum("mki,mkj->mij", a, a), cameras)
         self.pose_gradient = _sum_by(c, np.einsum("mki,mk->mi", a, e), cameras)
         self.cross = np.zeros((cameras, 6, points, 3))
-        np.add.at(self.cross, (c, slice(None), p), np.einsum("mki,mkj->mij", a, b))
+        blocks = self.cross.transpose(0, 2, 1, 3)
+        np.add.at(blocks, (c, p), np.einsum("mki,mkj->mij", a, b))
 
     def solve(self, damping: float, blend: Array | None = None) -> tuple[Array, Array]:
         """Steps of the free poses [c, 6] and of the points [P, 3].
 
-        With `blend` [c, knots] the poses move only as that blend of knots, and the knots' steps [knots, 6] are returned.
+        With `blend` [c, knots] the poses move only as that blend of knots, and their steps [knots, 6] are returned.
         """
         cameras, _, points, _ = self.cross.shape
         eye = np.eye(3)

@@ -44,14 +44,14 @@ def neighbours(centres: Array, forward: Array, reference: int, count: int) -> ND
     ordered = usable[np.argsort(baseline[usable])]
     first = np.searchsorted(baseline[ordered], 0.3 * baseline[ordered[-1]])
     first = min(first, len(ordered) - count)
-    return ordered[np.linspace(first, len(ordered) - 1, count).round().astype(int)]
+    return np.asarray(ordered[np.linspace(first, len(ordered) - 1, count).round().astype(int)], np.int64)
 
 
 def sweep(
     reference: Shot, others: list[Shot], intrinsics: Intrinsics, near_far: tuple[float, float], noise: Image
 ) -> Sweep:
-    """Inverse depth of `reference` between `near_far` (inverse depths: largest, smallest). `noise` [H, W] is the standard
-    deviation of a difference between two images."""
+    """Inverse depth of `reference` between `near_far` (inverse depths: largest, smallest). `noise` [H, W] is the
+    standard deviation of a difference between two images."""
     height, width = reference.image.shape
     k = intrinsics.matrix()
     baseline = max(np.linalg.norm(o.centre - reference.centre) for o in others)
@@ -89,7 +89,7 @@ def _through_plane(other: Shot, reference: Shot, k: Array, inverse_depth: float)
 
 
 def _winner(cost: Image, inverse: Image) -> Sweep:
-    """Best plane, refined by a parabola through its neighbours; the runner-up two or more planes away gives confidence."""
+    """Best plane, refined by a parabola through its neighbours; the runner-up gives confidence."""
     planes = len(inverse)
     best = np.argmin(cost, 0)
     inner = np.clip(best, 1, planes - 2)

@@ -1,4 +1,4 @@
-"""The map: Gaussians fitted to views by gradient descent, added where the map is empty or wrong, moved where they are dead."""
+"""The map: Gaussians fitted to views by gradient descent, added where it is empty or wrong, moved where dead."""
 
 import cv2
 import numpy as np
@@ -8,12 +8,14 @@ from spiked.pose import Array
 from spiked.recon.depth import Sweep
 from spiked.recon.options import MapOptions
 from spiked.recon.views import Image, View
-from spiked.recon.adam import Adam
 from spiked.render import Camera, Gradients, Rasteriser
+from spiked.render.loss import dssim
+from spiked.render.optimiser import Adam
 from spiked.scene import Scene
 from spiked.sensor import Sensor
 
-Rows = NDArray[np.int64]
+SSIM_SCALE = 0.01
+"""Brings 1 - SSIM to the size of the mean squared error."""
 
 
 class Mapper:
@@ -91,7 +93,11 @@ class Mapper:
         error = image.values - view.rate
         weight = self.weights(view)
         scale = np.float32(1 / (self.white**2 * error.size))
-        gradients = self.rasteriser.backward(2 * scale * weight * error)
+        slope = 2 * scale * weight * error
+        if self.options.ssim > 0 and self.channels is None:
+            _, structural = dssim(image.values, view.rate, self.white)
+            slope = (1 - self.options.ssim) * slope + self.options.ssim * SSIM_SCALE * structural
+        gradients = self.rasteriser.backward(slope)
         self._residuals[key] = float(np.mean(weight * error * error)) / self.white**2
         self.steps += 1
         o = self.options
@@ -110,7 +116,7 @@ class Mapper:
         self._residuals.clear()
 
     def densify(self, view: View, rotation: Array, centre: Array, share: float = 0.03) -> None:
-        """Give splats to what is rendered worst: dead ones are moved there first, then new ones are made up to the cap."""
+        """Give splats to what is rendered worst: in place of dead ones first, then new ones up to the cap."""
         image = self.rasteriser.forward(self.scene, rotation[None], centre[None], channels=self.channels)
         error = (view.rate - image.values) * self.weights(view)
         badness = cv2.GaussianBlur(np.abs(cv2.GaussianBlur(error, (0, 0), 0.7)), (0, 0), 1.0)
@@ -139,8 +145,10 @@ class Mapper:
 
 
 def fill_mosaic(rate: Image, channels: NDArray[np.uint8] | None) -> Image:
-    """Colours [H, W, C] of an observed image, for display and first guesses: each colour is the normalised average of its
-    own sites nearby; grey passes through."""
+    """Colours [H, W, C] of an observed image, for display and first guesses.
+
+    Each colour is the normalised average of its own sites nearby; grey passes through.
+    """
     if channels is None:
         return rate[..., None]
     planes = []

@@ -3,6 +3,7 @@
 It needs no map of Gaussians, so a trajectory exists within a second or two; mapping then refines the same spline.
 """
 
+import re
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -111,11 +112,17 @@ class Odometry:
         return posed
 
     def _become(self, state: State, reason: str) -> None:
-        if state is not self.state or reason != self.reason:
+        if state is not self.state or _kind(reason) != _kind(self.reason):
             self.changes.append((self.views[-1].time, state, reason))
         self.state, self.reason = state, reason
 
-    def _try_bootstrap(self) -> None:
+    def end(self) -> None:
+        """No more views will come: a last try to begin, then the adjustment of the whole path."""
+        if self.state is State.BOOT and self.views:
+            self._try_bootstrap(final=True)
+        self.settle()
+
+    def _try_bootstrap(self, final: bool = False) -> None:
         newest = self.views[-1]
         start = self.views[self._boot_start]
         common = np.intersect1d(start.ids, newest.ids)
@@ -124,7 +131,7 @@ class Odometry:
             start = self.views[self._boot_start]
             common = np.intersect1d(start.ids, newest.ids)
         count = len(self.views) - self._boot_start
-        if count < BOOT_VIEWS or count % 3:
+        if count < BOOT_VIEWS or (count % 3 and not final):
             return
         chosen = self._equal_flow()
         for k in chosen[1:-1]:
@@ -417,6 +424,11 @@ def _median_depth(bundle: Bundle) -> float:
     ray = bundle.points[bundle.point] - bundle.centres[bundle.camera]
     z = np.einsum("mj,mj->m", bundle.rotations[bundle.camera][:, :, 2], ray)
     return float(np.median(z))
+
+
+def _kind(reason: str) -> str:
+    """A reason without its figures: the same kind again is no news."""
+    return re.sub(r"[0-9.]+", "#", reason)
 
 
 def _pick(view: Posed, ids: NDArray[np.int64]) -> Array:

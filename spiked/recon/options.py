@@ -20,6 +20,8 @@ class MapOptions:
     rate_scales: float = 1.2e-2
     rate_opacities: float = 3e-2
     rate_colours: float = 4e-3
+    ssim: float = 0.2
+    """Share of structural similarity in the loss of grey views, as in 3D Gaussian splatting."""
     floor: float = 0.03
     """Part of the scene's white added to the noise of each pixel: small values trust dark pixels more."""
 

@@ -234,7 +234,7 @@ class Reconstructor:
         for view in self._windows.flush():
             self._add(view)
         if self.options.poses is None:
-            self._odometry.settle()
+            self._odometry.end()
         else:
             self._take_given_poses()
         self._spent["tracking"] += time.perf_counter() - begin

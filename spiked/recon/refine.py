@@ -14,7 +14,7 @@ from spiked.spline import Spline
 
 
 def align_spline(spline: Spline, views: list[View], mapper: Mapper, prior: float = 0.02) -> Spline:
-    """The spline moved so that the map agrees better with the views. `prior` damps the step, as part of the diagonal."""
+    """The spline moved so that the map agrees better with the views. `prior` damps, relative to the diagonal."""
     times = np.array([v.time for v in views])
     blend = spline.basis_matrix(times)
     rotations, centres = spline.poses(times)
@@ -23,12 +23,12 @@ def align_spline(spline: Spline, views: list[View], mapper: Mapper, prior: float
     for view, rotation, centre, row in zip(views, rotations, centres, blend, strict=True):
         h, g = _normal_equations(view, rotation, centre, mapper)
         used = np.flatnonzero(row)
-        hessian[np.ix_(used, range(6), used, range(6))] += np.einsum("a,ij,b->aibj", row[used], h, row[used])
+        hessian[np.ix_(used, np.arange(6), used, np.arange(6))] += np.einsum("a,ij,b->aibj", row[used], h, row[used])
         gradient[used] += row[used, None] * g
     square = hessian.reshape(knots * 6, knots * 6)
     diagonal = np.diag(square).copy()
     square[np.diag_indices(knots * 6)] += prior * diagonal + 1e-6 * diagonal.max()
-    step = -np.linalg.solve(square, gradient.ravel()).reshape(knots, 6)
+    step = np.asarray(-np.linalg.solve(square, gradient.ravel()).reshape(knots, 6), np.float64)
     return spline.move(step[:, :3], step[:, 3:])
 
 
@@ -52,7 +52,7 @@ def _normal_equations(view: View, rotation: Array, centre: Array, mapper: Mapper
     a, b = du[v, u] * k.fx / z, dv[v, u] * k.fy / z
     by_local = np.stack([a, b, -(a * x + b * y) / z], 1)  # change of the pixel with the point in camera axes
     ray = np.stack([x, y, z], 1) @ rotation.T
-    # A moved camera sees at a fixed pixel what a point moved the other way would show: dI = -grad I . d(pixel of point).
+    # At a fixed pixel a moved camera sees what lay the other way: dI = -grad I . d(pixel of the point).
     by_point = by_local @ rotation.T
     jacobian = -np.concatenate([np.einsum("mj,mjk->mk", by_point, hat(ray)), -by_point], 1)
     e = error[v, u].astype(float)

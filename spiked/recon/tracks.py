@@ -4,6 +4,7 @@ Each track keeps the window where it was born and is re-aligned against it, so t
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 
 import cv2
 import numpy as np
@@ -100,15 +101,16 @@ def _flow(
     """Positions in `b` of the points `start` of `a`, and which came back to where they started."""
     p = (start - 0.5).astype(np.float32)[:, None]
     q = (guess - 0.5).astype(np.float32)[:, None]
-    options = {
-        "winSize": (13, 13),
-        "maxLevel": levels,
-        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003),
-        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-        "minEigThreshold": 1e-4,
-    }
-    forth, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, p, q.copy(), **options)
-    back, ok2, _ = cv2.calcOpticalFlowPyrLK(b, a, forth, p.copy(), **options)
+    lucas_kanade = partial(
+        cv2.calcOpticalFlowPyrLK,
+        winSize=(13, 13),
+        maxLevel=levels,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=1e-4,
+    )
+    forth, ok, _ = lucas_kanade(a, b, p, q.copy())
+    back, ok2, _ = lucas_kanade(b, a, forth, p.copy())
     close = np.linalg.norm(back[:, 0] - p[:, 0], axis=1) < reach_px
     return forth[:, 0].astype(float) + 0.5, (ok[:, 0] == 1) & (ok2[:, 0] == 1) & close
 

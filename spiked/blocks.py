@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.native import _blocks
+import spiked.native._blocks as _blocks
 from spiked.sensor import BitOrder, Sensor
 
 BLOCK_FRAMES = 8

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.native import _simulate
+import spiked.native._simulate as _simulate
 from spiked.sensor import Intrinsics
 from spiked.simulate.motion import Stage
 from spiked.simulate.textures import Material, paint

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+import spiked.native._simulate as _simulate
 from spiked.errors import ConfigurationError
-from spiked.native import _simulate
 from spiked.sensor import BitOrder, Layout, Sensor
 
 Image = NDArray[np.float32]

@@ -105,7 +105,8 @@ struct GradientArrays {  // the same shapes; rotation and centre [sub-poses][3]
     float *contribution, *radius_px;
 };
 
-struct SplatGradients {  // arrays of `stride` floats; summed over sub-poses
+struct SplatGradients {  // arrays of some groups of splats, from `first` on; summed over sub-poses
+    int first;
     float* mean[3];
     float* spread[9];
     float* log_opacity;

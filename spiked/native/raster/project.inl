@@ -143,13 +143,13 @@ static inline void add(float* p, Vec v) { store(p, load(p) + v); }
 static void unproject(const Prepared& splats, const Lens& lens, const View& view, int first, const float* sums,
                       const uint8_t* visible, int colours, const SplatGradients& out, double pose[6]) {
     for (int at = 0; at < kGroup; at += kLanes) {
-        int base = first + at;
+        const int base = first + at, into = base - out.first;
         Int seen;
         for (int i = 0; i < kLanes; ++i) seen[i] = visible[at + i] ? -1 : 0;
         auto sum = [&](int which) { return load(sums + which * kGroup + at); };
-        add(out.log_opacity + base, sum(kV));
-        add(out.share + base, sum(kShare));
-        for (int k = 0; k < colours; ++k) add(out.colour[k] + base, sum(kColour0 + k));
+        add(out.log_opacity + into, sum(kV));
+        add(out.share + into, sum(kShare));
+        for (int k = 0; k < colours; ++k) add(out.colour[k] + into, sum(kColour0 + k));
 
         Projection o = project_lanes(splats, lens, view, base);
         // Offsets times the conic are (p u, q u + r w) / kHalfLog2e, so nothing has to be inverted.
@@ -186,9 +186,9 @@ static void unproject(const Prepared& splats, const Lens& lens, const View& view
         for (int k = 0; k < 3; ++k) {
             const float* w = view.rotation + k;
             d_mean[k] = choose(seen, w[0] * gx + w[3] * gy + w[6] * gz, Vec{});
-            add(out.mean[k] + base, d_mean[k]);
+            add(out.mean[k] + into, d_mean[k]);
         }
-        for (int k = 0; k < 9; ++k) add(out.spread[k] + base, d_spread[k]);
+        for (int k = 0; k < 9; ++k) add(out.spread[k] + into, d_spread[k]);
 
         for (int k = 0; k < 3; ++k) {
             int a = (k + 1) % 3, b = (k + 2) % 3;
@@ -208,6 +208,7 @@ static void unproject(const Prepared& splats, const Lens& lens, const View& view
 static void finish(const SplatArrays& splats, const Prepared& prepared, const SplatGradients& sums, int first, int last,
                    float share_scale, const GradientArrays& out) {
     for (int base = first; base < last; base += kLanes) {
+        const int from = base - sums.first;
         Vec radius, logit, quat[4], log_scale[3];
         read_rows<1>(out.radius_px, base, last, &radius);
         read_rows<1>(splats.opacity_logits, base, last, &logit);
@@ -219,20 +220,20 @@ static void finish(const SplatArrays& splats, const Prepared& prepared, const Sp
             v = choose(seen, v, Vec{});
             write_rows<1>(rows, base, last, &v);
         };
-        write(out.contribution, load(sums.share + base) * share_scale);
+        write(out.contribution, load(sums.share + from) * share_scale);
         write(out.opacity_logits,
-              load(sums.log_opacity + base) / (1.0f + exp2_fine(clamp(logit, splat(-30.0f), splat(30.0f)) * kLog2e)));
+              load(sums.log_opacity + from) / (1.0f + exp2_fine(clamp(logit, splat(-30.0f), splat(30.0f)) * kLog2e)));
 
         Vec mean[3], colour[3], d[9], d_log_scale[3];  // d: of the rotation, row-major
-        for (int k = 0; k < 3; ++k) mean[k] = load(sums.mean[k] + base);
+        for (int k = 0; k < 3; ++k) mean[k] = load(sums.mean[k] + from);
         write_rows<3>(out.means, base, last, mean);
-        for (int k = 0; k < splats.colours; ++k) colour[k] = load(sums.colour[k] + base);
+        for (int k = 0; k < splats.colours; ++k) colour[k] = load(sums.colour[k] + from);
         if (splats.colours == 1) write_rows<1>(out.colour, base, last, colour);
         if (splats.colours == 3) write_rows<3>(out.colour, base, last, colour);
         for (int j = 0; j < 3; ++j) {
             Vec scale = scale_of(log_scale[j]), along{};
             for (int i = 0; i < 3; ++i) {
-                Vec g = load(sums.spread[3 * i + j] + base);
+                Vec g = load(sums.spread[3 * i + j] + from);
                 along += g * load(prepared.spread[3 * i + j] + base);
                 d[3 * i + j] = g * scale;
             }

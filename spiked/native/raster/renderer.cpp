@@ -198,8 +198,8 @@ void Renderer::backward(const float* d_values, const GradientArrays& out) {
         const int first = chunk * kChunk, last = std::min(stride_, first + kChunk);
         float* store = scratch_[thread].gradients.grow(17 * kChunk);
         std::fill_n(store, 17 * kChunk, 0.0f);
-        store -= first;  // the kernels index by splat
         SplatGradients sums;
+        sums.first = first;
         for (float*& p : sums.mean) p = store, store += kChunk;
         for (float*& p : sums.spread) p = store, store += kChunk;
         for (float*& p : sums.colour) p = store, store += kChunk;

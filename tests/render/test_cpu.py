@@ -12,7 +12,7 @@ import render_scenes as scenes
 import torch
 
 from spiked.errors import ConfigurationError
-from spiked.render import Camera, Gradients, Rasteriser, Splats, reference
+from spiked.render import Camera, Gradients, Image, Rasteriser, Splats, reference
 from spiked.sensor import Intrinsics, Mosaic
 
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "colours")
@@ -34,7 +34,7 @@ class Case:
         values = size if name != "three colours" else (*size, 3)
         self.d_values = rng.normal(size=values).astype(np.float32)
 
-    def forward(self, threads: int = 1) -> tuple[Rasteriser, "object"]:
+    def forward(self, threads: int = 1) -> tuple[Rasteriser, Image]:
         rasteriser = Rasteriser(self.camera, threads)
         image = rasteriser.forward(
             self.splats,
@@ -98,6 +98,20 @@ def test_moving_the_camera_is_moving_the_scene_back(name: str) -> None:
     rasteriser, _ = case.forward()
     gradients = rasteriser.backward(case.d_values)
     assert relative(gradients.centre.sum(0), -gradients.means.astype(np.float64).sum(0)) < 1e-5
+
+
+def test_pixels_without_weight_are_black_and_move_nothing() -> None:
+    case = Case("sub-poses")
+    assert case.weights is not None
+    case.weights[:, :, 20:] = 0
+    case.d_values[:, :20] = 0
+    rasteriser, image = case.forward()
+    gradients = rasteriser.backward(case.d_values)
+    for array in (image.values, image.alpha, image.depth):
+        assert (array[:, 20:] == 0).all()
+        assert (array[:, :20] != 0).any()
+    for name in (*PARAMETERS, "rotation", "centre"):
+        assert (getattr(gradients, name) == 0).all(), name
 
 
 def test_pose_gradient_matches_finite_differences() -> None:

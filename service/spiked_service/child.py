@@ -28,7 +28,7 @@ class Child:
         self._writing = threading.Lock()
         with log.open("ab") as errors:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "spiked_service.worker"],
+                [sys.executable, "-m", "spiked_service.worker", order.role],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=errors,

@@ -1,4 +1,7 @@
-"""A worker process: `python -m spiked_service.worker` takes one order from stdin and carries it out."""
+"""A worker process: `python -m spiked_service.worker` takes one order from stdin and carries it out.
+
+The role in its arguments is for people who look at a list of processes.
+"""
 
 import os
 import sys

@@ -18,7 +18,6 @@ from spiked.trajectory import Trajectory
 from spiked_service import geometry as g
 from spiked_service.console import messages, output, report_warning
 from spiked_service.offline import reconstruct_recording
-from spiked_service.overview import draw_overview
 
 INTERRUPTED = 130
 _FEED_SHARE = 0.3
@@ -160,6 +159,8 @@ def _check_folder(out: Path) -> None:
 
 
 def _write(reconstructor: Reconstructor, out: Path, title: str, curve: list[tuple[float, float]]) -> None:
+    from spiked_service.overview import draw_overview  # matplotlib takes longer to load than most commands run
+
     try:
         out.mkdir(parents=True, exist_ok=True)
         reconstructor.scene().write_ply(out / "scene.ply", reconstructor.white)

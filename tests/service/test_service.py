@@ -1,0 +1,186 @@
+"""The daemon over HTTP, and what becomes of it when parts of it die."""
+
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+import pytest
+
+SHM = Path("/dev/shm")
+ENDED_S = 20.0
+SMALL = "sim:?width=96&height=64"
+
+
+def wait_for(condition: Callable[[], bool], what: str) -> None:
+    """Poll until the condition holds; the test fails if it does not within a minute."""
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline, f"waited in vain until {what}"
+        time.sleep(0.05)
+
+
+def one_capture(daemon: Any) -> dict[str, Any]:
+    captures = daemon.http.get("captures").json()
+    assert len(captures) == 1
+    return dict(captures[0])
+
+
+def streaming(daemon: Any) -> dict[str, Any]:
+    """The capture, once its three workers run and frames have come."""
+
+    def flows() -> bool:
+        capture = one_capture(daemon)
+        return bool(capture["counters"] and capture["counters"]["received"] > 100)
+
+    wait_for(flows, "frames come")
+    assert set(daemon.workers()) == {"acquisition", "reconstruction", "preview"}
+    return one_capture(daemon)
+
+
+def ring_of(capture: dict[str, Any]) -> Path:
+    return SHM / f"spiked-{capture['id']}"
+
+
+def test_errors_are_problem_details(daemon: Callable[..., Any]) -> None:
+    http = daemon().http
+    answers = [
+        (404, http.get("captures/no-such")),
+        (404, http.get("nowhere")),
+        (422, http.post("captures", json={"source": "sim:", "frames": 5, "seconds": 1})),
+        (422, http.post("captures", json={})),
+    ]
+    for status, answer in answers:
+        assert answer.status_code == status
+        assert answer.headers["content-type"] == "application/problem+json"
+        assert answer.json()["status"] == status
+        assert answer.json()["detail"]
+
+
+def test_pages_and_health(daemon: Callable[..., Any]) -> None:
+    one = daemon("--device", "replay:rec.dat", "--no-capture")
+    assert httpx.get(f"{one.address}healthz").json() == {"status": "ok"}
+    assert httpx.get(f"{one.address}readyz").status_code == 200
+    page = httpx.get(one.address).text
+    assert 'src="page.js"' in page
+    assert "refresh" in httpx.get(f"{one.address}page.js").text
+    assert httpx.get(f"{one.address}page.css").status_code == 200
+    assert httpx.get(f"{one.address}docs").status_code == 200
+    examples = httpx.get(f"{one.address}openapi.json").json()["components"]["schemas"]["ViewRequest"]["examples"]
+    assert len(examples) == 2
+    assert [device["source"] for device in one.http.get("devices").json()][:2] == ["replay:rec.dat", "sim:"]
+
+
+def test_a_token_is_asked_for_and_taken_in_three_ways(daemon: Callable[..., Any]) -> None:
+    one = daemon("--token", "sesame", token="sesame")
+    assert one.http.get("captures").status_code == 200
+    refused = httpx.get(f"{one.address}api/v1/captures")
+    assert refused.status_code == 401
+    assert refused.headers["content-type"] == "application/problem+json"
+    assert httpx.get(f"{one.address}api/v1/captures", headers={"Authorization": "Bearer open"}).status_code == 401
+    assert httpx.get(f"{one.address}healthz").status_code == 200
+    with httpx.Client() as browser:
+        assert browser.get(f"{one.address}?token=sesame").status_code == 200
+        assert browser.get(f"{one.address}api/v1/captures").status_code == 200
+
+
+def test_a_source_that_cannot_be_opened_fails_the_capture_with_its_reason(
+    daemon: Callable[..., Any], tmp_path: Path
+) -> None:
+    one = daemon("--device", f"replay:{tmp_path / 'none.dat'}")
+    wait_for(lambda: one_capture(one)["state"] == "failed", "the capture fails")
+    assert "none.dat" in one_capture(one)["reason"]
+
+
+def test_one_capture_at_a_time_and_the_account_of_frames(daemon: Callable[..., Any]) -> None:
+    one = daemon()
+    started = one.http.post("captures", json={"source": SMALL, "frames": 400, "steps": 10})
+    assert started.status_code == 201
+    assert started.headers["location"].endswith(started.json()["id"])
+    assert one.http.post("captures", json={"source": SMALL}).status_code == 409
+    wait_for(lambda: one_capture(one)["state"] in ("complete", "failed"), "the capture ends")
+    capture = one_capture(one)
+    assert (capture["state"], capture["reason"]) == ("complete", "")
+    assert capture["counters"]["received"] == capture["counters"]["next_frame"] == 400
+    assert capture["reconstruction"]["frames"] == 400
+    assert one.http.get(f"captures/{capture['id']}/preview").content.startswith(b"\x89PNG")
+    assert not ring_of(capture).exists()
+    assert one.workers() == {}
+
+
+def test_stop_ends_the_source_and_then_the_reconstruction(daemon: Callable[..., Any]) -> None:
+    one = daemon("--device", "sim:")
+    capture = streaming(one)
+    wait_for(lambda: one_capture(one)["reconstruction"]["version"] > 0, "there is a map to refine")
+    assert one.http.post(f"captures/{capture['id']}:stop").status_code == 202
+    wait_for(lambda: one_capture(one)["state"] == "finishing", "the source ends")
+    one.http.post(f"captures/{capture['id']}:stop")
+    wait_for(lambda: one_capture(one)["state"] == "complete", "the reconstruction ends")
+    assert one_capture(one)["reconstruction"]["progress"] < 1
+    assert one.workers() == {}
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_everything_and_leaves_nothing(
+    daemon: Callable[..., Any], tmp_path: Path, number: signal.Signals
+) -> None:
+    one = daemon("--device", SMALL)
+    capture = streaming(one)
+    workers = list(one.workers().values())
+    one.process.send_signal(number)
+    assert one.process.wait(ENDED_S) == 0
+    assert psutil.wait_procs(workers, ENDED_S)[1] == []
+    assert not ring_of(capture).exists()
+    assert list((tmp_path / "runtime").iterdir()) == []
+
+
+def test_the_death_of_the_service_takes_all_workers_along(daemon: Callable[..., Any], tmp_path: Path) -> None:
+    one = daemon("--device", SMALL)
+    capture = streaming(one)
+    workers = list(one.workers().values())
+    one.process.kill()
+    assert psutil.wait_procs(workers, ENDED_S)[1] == []
+    one.process.wait()
+    abandoned = list((tmp_path / "runtime").iterdir())
+    assert len(abandoned) == 1
+    daemon()
+    assert not ring_of(capture).exists()
+    assert not abandoned[0].exists()
+
+
+def test_the_death_of_the_acquisition_is_told_and_its_ring_removed(daemon: Callable[..., Any]) -> None:
+    one = daemon("--device", SMALL)
+    capture = streaming(one)
+    one.workers()["acquisition"].kill()
+    wait_for(lambda: one_capture(one)["reason"] != "", "the death is told")
+    assert one_capture(one)["reason"] == "the acquisition worker was killed by signal 9"
+    wait_for(lambda: not ring_of(capture).exists(), "the ring is gone")
+    one.http.post(f"captures/{capture['id']}:stop")
+    wait_for(lambda: one_capture(one)["state"] == "failed", "the reconstruction ends with what there is")
+    assert one.workers() == {}
+
+
+def test_the_death_of_the_reconstruction_ends_the_capture(daemon: Callable[..., Any]) -> None:
+    one = daemon("--device", SMALL)
+    capture = streaming(one)
+    one.workers()["reconstruction"].kill()
+    wait_for(lambda: one_capture(one)["state"] == "failed", "the death is told")
+    assert one_capture(one)["reason"] == "the reconstruction worker was killed by signal 9"
+    wait_for(lambda: one.workers() == {}, "the other workers leave")
+    wait_for(lambda: not ring_of(capture).exists(), "the ring is gone")
+    again = one.http.post("captures", json={"source": SMALL, "frames": 8, "steps": 0})
+    assert again.status_code == 201
+
+
+def test_the_death_of_the_preview_is_mended(daemon: Callable[..., Any]) -> None:
+    one = daemon("--device", SMALL)
+    streaming(one)
+    dead = one.workers()["preview"]
+    dead.kill()
+    wait_for(lambda: one.workers().get("preview", dead).pid != dead.pid, "another preview runs")
+    capture = one_capture(one)
+    assert capture["state"] == "streaming"
+    assert capture["warnings"] == ["the preview worker was killed by signal 9; it was started again"]

@@ -111,6 +111,7 @@ def test_one_capture_at_a_time_and_the_account_of_frames(daemon: Callable[..., A
     assert one.workers() == {}
 
 
+@pytest.mark.slow
 def test_stop_ends_the_source_and_then_the_reconstruction(daemon: Callable[..., Any]) -> None:
     one = daemon("--device", "sim:")
     capture = streaming(one)

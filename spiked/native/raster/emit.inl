@@ -45,7 +45,7 @@ static inline uint64_t tiles_of(uint64_t rows) {
     return rows ^ swap ^ swap << 24;
 }
 
-static int emit(const Record& s, uint32_t rank, const Lens& lens, int32_t* columns, Pair* out) {
+static inline int emit_one(const Record& s, uint32_t rank, const Lens& lens, int32_t* columns, Pair* out) {
     const float top = s.y - s.half_y - (0.5f + kMargin), bottom = s.y + s.half_y - (0.5f - kMargin);
     if (bottom < 0 || top > lens.height - 1) return 0;
     const int first_row = top <= 0 ? 0 : (int)top / kTile;
@@ -75,4 +75,19 @@ static int emit(const Record& s, uint32_t rank, const Lens& lens, int32_t* colum
         }
     }
     return (int)(end - out);
+}
+
+static int emit(const Record* records, int first, int last, const Lens& lens, int32_t* columns, const Pairs& out) {
+    const uint32_t most = (uint32_t)(lens.tiles_x * lens.tiles_y) + 4;
+    uint32_t size = *out.size;
+    int rank = first;
+    for (; rank < last && size + most <= out.room; ++rank) {
+        Pair* pairs = out.pairs + size;
+        const int emitted = emit_one(records[rank], (uint32_t)rank, lens, columns, pairs);
+        for (int i = 0; i < emitted; ++i) ++out.tile_counts[pairs[i].tile_blocks >> 16];
+        out.counts[records[rank].splat] = (uint32_t)emitted;
+        size += (uint32_t)emitted;
+    }
+    *out.size = size;
+    return rank;
 }

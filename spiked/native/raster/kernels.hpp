@@ -47,11 +47,12 @@ struct Record {
     float extreme;  // px, where its rightmost point is above or below the mean; the leftmost is opposite
     float over_p;
     float colour[3];
-    float unused[2];
+    uint32_t splat;
+    float unused;
 };
 static_assert(sizeof(Record) == 64, "a record is a cache line");
 
-// A splat seen by a tile. `slot` is the pair's number in order of emission, which is depth order, then tile order.
+// A splat seen by a tile. Slots are numbered by splat, so that a splat's sums lie together.
 struct Entry {
     uint32_t slot, rank, blocks;
 };
@@ -59,6 +60,14 @@ struct Entry {
 struct Pair {
     uint32_t tile_blocks;  // tile << 16 | blocks
     uint32_t rank;
+};
+
+struct Pairs {
+    Pair* pairs;
+    uint32_t room;
+    uint32_t* size;         // pairs written so far
+    uint32_t* counts;       // [splats]
+    uint32_t* tile_counts;  // [tiles]
 };
 
 // Sums over a tile's pixels for one pair; v = alpha dL/dalpha, and alpha T is the pixel's share of the splat.
@@ -137,9 +146,10 @@ struct Kernels {
     // Writes records[first..last) and keys (bits of z, or kCulled).
     void (*project)(const Prepared&, const Lens&, const View&, int count, int first, int last, Record* records,
                     uint32_t* keys);
-    // Appends the pairs of one splat to `out`, which has room for tiles_x * tiles_y + 4; returns their number.
+    // Writes the pairs of records[first..last) to `out` as long as there is room for tiles_x * tiles_y + 4 more, counts
+    // them by splat and by tile, and returns the first rank that was left out.
     // `columns` is scratch, 2 * (blocks in a column of the image + kGroup) integers.
-    int (*emit)(const Record&, uint32_t rank, const Lens&, int32_t* columns, Pair* out);
+    int (*emit)(const Record* records, int first, int last, const Lens&, int32_t* columns, const Pairs& out);
     void (*forward)(const Tile&, int colours, const float background[3], const Planes&, const TileState&, TileImage*);
     void (*store)(const Tile&, const TileImage*, int colours, const Planes&, float* values, float* alpha, float* depth);
     // d_values [height][width] or [height][width][3]; slots are slot_floats(colours) floats each.

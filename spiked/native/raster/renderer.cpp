@@ -11,6 +11,8 @@ namespace {
 
 constexpr int kChunk = 1024;  // splats a task; fixed, so that sums do not depend on the number of threads
 
+constexpr int kAhead = 16;  // splats; covers the latency of main memory
+
 int chunks_of(int count) { return (count + kChunk - 1) / kChunk; }
 
 View view_of(const double* rotation, const double* centre) {
@@ -37,6 +39,7 @@ void Renderer::forward(const SplatArrays& splats, const double* rotations, const
     channels_ = channels;
     if (static_cast<int>(views_.size()) < count) views_.resize(count);
     prepare();
+    std::fill_n(radius_.grow(splats.count), splats.count, 0.0f);
     for (int i = 0; i < count; ++i) {
         SubPose& sub = views_[i];
         std::copy_n(rotations + 9 * i, 9, sub.rotation);
@@ -74,8 +77,10 @@ void Renderer::project(SubPose& sub) {
     raw_.grow(stride_);
     keys_.grow(stride_);
     pool_.run(chunks_of(stride_), [&](int chunk, int) {
-        kernels_.project(prepared_, lens_, sub.view, splats_.count, chunk * kChunk,
-                         std::min(stride_, (chunk + 1) * kChunk), raw_.data(), keys_.data());
+        const int first = chunk * kChunk, last = std::min(stride_, first + kChunk);
+        kernels_.project(prepared_, lens_, sub.view, splats_.count, first, last, raw_.data(), keys_.data());
+        for (int n = first; n < std::min(last, splats_.count); ++n)
+            if (keys_[n] != kCulled) radius_[n] = std::max(radius_[n], raw_[n].radius);
     });
 }
 
@@ -100,13 +105,14 @@ void Renderer::sort(SubPose& sub) {
     }
     sub.visible = visible;
     sub.records.grow(visible);
-    std::fill_n(sub.rank_of.grow(splats_.count), splats_.count, kCulled);
     pool_.run(chunks_of(visible), [&](int chunk, int) {
-        for (int rank = chunk * kChunk; rank < std::min(visible, (chunk + 1) * kChunk); ++rank) {
+        const int last = std::min(visible, (chunk + 1) * kChunk);
+        for (int rank = chunk * kChunk; rank < last; ++rank) {
+            if (rank + kAhead < last) __builtin_prefetch(&raw_[from[rank + kAhead].splat]);
             const uint32_t splat = from[rank].splat;
-            sub.rank_of[splat] = rank;
             Record& record = sub.records[rank] = raw_[splat];
             for (int k = 0; k < splats_.colours; ++k) record.colour[k] = splats_.colour[splats_.colours * splat + k];
+            record.splat = splat;
         }
     });
 }
@@ -115,29 +121,28 @@ void Renderer::sort(SubPose& sub) {
 void Renderer::bin(SubPose& sub) {
     const int tiles = lens_.tiles_x * lens_.tiles_y, runs = pool_.threads();
     const size_t rows = static_cast<size_t>(lens_.tiles_y) * 4 + kGroup;
-    uint32_t* counts = sub.first_slot.grow(sub.visible + 1);
+    uint32_t* counts = sub.first_slot.grow(splats_.count + 1);
+    std::fill_n(counts, splats_.count, 0u);
     auto first_rank = [&](int run) { return static_cast<int>(static_cast<int64_t>(sub.visible) * run / runs); };
     pool_.run(runs, [&](int run, int) {
         Emission& emission = emissions_[run];
         int32_t* columns = emission.columns.grow(2 * rows);
         uint32_t* tile_counts = emission.tile_counts.grow(tiles);
         std::fill_n(tile_counts, tiles, 0u);
-        uint32_t size = 0;
-        for (int rank = first_rank(run); rank < first_rank(run + 1); ++rank) {
-            const size_t room = size + static_cast<size_t>(tiles) + 4;
+        emission.size = 0;
+        int rank = first_rank(run);
+        for (const int last = first_rank(run + 1); rank < last;) {
+            const size_t room = emission.size + static_cast<size_t>(tiles) + 4;
             if (emission.pairs.size() < room) emission.pairs.resize(2 * room);
-            Pair* pairs = emission.pairs.data() + size;
-            const int emitted = kernels_.emit(sub.records[rank], rank, lens_, columns, pairs);
-            for (int i = 0; i < emitted; ++i) ++tile_counts[pairs[i].tile_blocks >> 16];
-            counts[rank] = emitted;
-            size += emitted;
+            const Pairs out{emission.pairs.data(), static_cast<uint32_t>(emission.pairs.size()), &emission.size, counts,
+                            tile_counts};
+            rank = kernels_.emit(sub.records.data(), rank, last, lens_, columns, out);
         }
-        emission.size = size;
     });
 
     uint32_t sum = 0;
-    for (int rank = 0; rank < sub.visible; ++rank) sum += std::exchange(counts[rank], sum);
-    counts[sub.visible] = sum;
+    for (int n = 0; n < splats_.count; ++n) sum += std::exchange(counts[n], sum);
+    counts[splats_.count] = sum;
     sub.pairs = sum;
     uint32_t* tile_start = sub.tile_start.grow(tiles + 1);
     sum = 0;
@@ -150,10 +155,14 @@ void Renderer::bin(SubPose& sub) {
     Entry* entries = sub.entries.grow(sum);
     pool_.run(runs, [&](int run, int) {
         Emission& emission = emissions_[run];
-        uint32_t slot = sub.first_slot[first_rank(run)];
+        uint32_t slot = 0, rank = kCulled;
         for (uint32_t i = 0; i < emission.size; ++i, ++slot) {
             const Pair pair = emission.pairs[i];
-            entries[emission.tile_counts[pair.tile_blocks >> 16]++] = {slot, pair.rank, pair.tile_blocks & 0xffffu};
+            if (pair.rank != rank) {
+                rank = pair.rank;
+                slot = sub.first_slot[sub.records[rank].splat];
+            }
+            entries[emission.tile_counts[pair.tile_blocks >> 16]++] = {slot, rank, pair.tile_blocks & 0xffffu};
         }
     });
 }
@@ -217,7 +226,7 @@ void Renderer::backward(const float* d_values, const GradientArrays& out) {
             }
         }
         const int end = std::min(last, splats_.count);
-        for (int n = first; n < end; ++n) out.radius_px[n] = largest_radius(n);
+        std::copy(radius_.data() + first, radius_.data() + end, out.radius_px + first);
         kernels_.finish(splats_, prepared_, sums, first, end, 1.0f / static_cast<float>(sub_poses_), out);
     });
 
@@ -232,32 +241,20 @@ void Renderer::backward(const float* d_values, const GradientArrays& out) {
     }
 }
 
-// The sums of a group's splats over their tiles, in order of emission.
+// The sums of a group's splats over their tiles.
 void Renderer::gather(const SubPose& sub, int first, float* sums, uint8_t* visible) const {
     const int stride = slot_floats(splats_.colours), used = kColour0 + splats_.colours;
-    for (int splat = first + kGroup; splat < std::min(first + 2 * kGroup, splats_.count); ++splat)
-        if (const uint32_t rank = sub.rank_of[splat]; rank != kCulled)
-            __builtin_prefetch(sub.slots.data() + static_cast<size_t>(sub.first_slot[rank]) * stride);
     for (int lane = 0; lane < kGroup; ++lane) {
-        const int splat = first + lane;
-        const uint32_t rank = splat < splats_.count ? sub.rank_of[splat] : kCulled;
-        visible[lane] = rank != kCulled;
+        const int splat = std::min(first + lane, splats_.count);
+        const uint32_t from = sub.first_slot[splat];
+        const uint32_t to = splat < splats_.count ? sub.first_slot[splat + 1] : from;
+        visible[lane] = to > from;
         float sum[16] = {};
-        if (rank != kCulled) {
-            const float* slot = sub.slots.data() + static_cast<size_t>(sub.first_slot[rank]) * stride;
-            for (uint32_t n = sub.first_slot[rank + 1] - sub.first_slot[rank]; n > 0; --n, slot += stride)
-                for (int k = 0; k < used; ++k) sum[k] += slot[k];
-        }
+        const float* slot = sub.slots.data() + static_cast<size_t>(from) * stride;
+        for (uint32_t n = to - from; n > 0; --n, slot += stride)
+            for (int k = 0; k < used; ++k) sum[k] += slot[k];
         for (int k = 0; k < used; ++k) sums[k * kGroup + lane] = sum[k];
     }
-}
-
-float Renderer::largest_radius(int splat) const {
-    float radius = 0;
-    for (int i = 0; i < sub_poses_; ++i)
-        if (const uint32_t rank = views_[i].rank_of[splat]; rank != kCulled)
-            radius = std::max(radius, views_[i].records[rank].radius);
-    return radius;
 }
 
 int64_t Renderer::block_evaluations() const {

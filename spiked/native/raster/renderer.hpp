@@ -14,9 +14,8 @@ struct SubPose {
     double rotation[9];  // camera to world
     int visible = 0;
     uint32_t pairs = 0;
-    Buffer<uint32_t> rank_of;     // [splats]
     Buffer<Record> records;       // [visible], by depth
-    Buffer<uint32_t> first_slot;  // [visible + 1]
+    Buffer<uint32_t> first_slot;  // [splats + 1]
     Buffer<uint32_t> tile_start;  // [tiles + 1]
     Buffer<Entry> entries;        // [pairs], by tile, then depth
     Buffer<float> colour;         // [tiles][colours][kTilePixels]
@@ -52,7 +51,6 @@ class Renderer {
     TileState state_of(const SubPose&, int tile) const;
     Planes planes_of(int sub_pose) const;
     void gather(const SubPose&, int first, float* sums, uint8_t* visible) const;
-    float largest_radius(int splat) const;
 
     const Kernels& kernels_;
     Lens lens_;
@@ -67,6 +65,7 @@ class Renderer {
     Buffer<float> prepared_store_;
     Prepared prepared_{};
     Buffer<Record> raw_;
+    Buffer<float> radius_;  // [splats], largest over the sub-poses
     Buffer<uint32_t> keys_;
     struct Item {
         uint32_t key, splat;

@@ -45,18 +45,21 @@ static inline uint64_t tiles_of(uint64_t rows) {
     return rows ^ swap ^ swap << 24;
 }
 
-static inline int emit_one(const Record& s, uint32_t rank, const Lens& lens, int32_t* columns, Pair* out) {
-    const float top = s.y - s.half_y - (0.5f + kMargin), bottom = s.y + s.half_y - (0.5f - kMargin);
-    if (bottom < 0 || top > lens.height - 1) return 0;
-    const int first_row = top <= 0 ? 0 : (int)top / kTile;
-    const int last_row = (bottom >= lens.height - 1 ? lens.height - 1 : (int)bottom) / kTile;
-    const int rows = 4 * (last_row - first_row + 1);
-    int32_t* first = columns;
-    int32_t* last = columns + (rows + kLanes - 1) / kLanes * kLanes;
-    block_columns(s, lens, 4 * first_row, rows, first, last);
+struct TileRows {
+    int first, last;  // empty when first > last
+};
 
+static inline TileRows tile_rows(const Record& s, const Lens& lens) {
+    const float top = s.y - s.half_y - (0.5f + kMargin), bottom = s.y + s.half_y - (0.5f - kMargin);
+    if (bottom < 0 || top > lens.height - 1) return {0, -1};
+    return {top <= 0 ? 0 : (int)top / kTile, (bottom >= lens.height - 1 ? lens.height - 1 : (int)bottom) / kTile};
+}
+
+// From the columns of blocks that one splat reaches to its pairs.
+static inline int emit_tiles(TileRows tile_rows, const int32_t* first, const int32_t* last, uint32_t rank,
+                             const Lens& lens, Pair* out) {
     Pair* end = out;
-    for (int tile_y = first_row; tile_y <= last_row; ++tile_y, first += 4, last += 4) {
+    for (int tile_y = tile_rows.first; tile_y <= tile_rows.last; ++tile_y, first += 4, last += 4) {
         int from = kMaxSide, to = -1;
         for (int k = 0; k < 4; ++k) {
             from = first[k] < from ? first[k] : from;
@@ -78,15 +81,27 @@ static inline int emit_one(const Record& s, uint32_t rank, const Lens& lens, int
 }
 
 static int emit(const Record* records, int first, int last, const Lens& lens, int32_t* columns, const Pairs& out) {
-    const uint32_t most = (uint32_t)(lens.tiles_x * lens.tiles_y) + 4;
+    const int stride = lens.tiles_y * 4 + kGroup;
+    const uint32_t most = kEmitBatch * ((uint32_t)(lens.tiles_x * lens.tiles_y) + 4);
     uint32_t size = *out.size;
     int rank = first;
-    for (; rank < last && size + most <= out.room; ++rank) {
-        Pair* pairs = out.pairs + size;
-        const int emitted = emit_one(records[rank], (uint32_t)rank, lens, columns, pairs);
-        for (int i = 0; i < emitted; ++i) ++out.tile_counts[pairs[i].tile_blocks >> 16];
-        out.counts[records[rank].splat] = (uint32_t)emitted;
-        size += (uint32_t)emitted;
+    while (rank < last && size + most <= out.room) {
+        const int count = last - rank < kEmitBatch ? last - rank : kEmitBatch;
+        // In two passes, since the second one's branches are hard to foretell: they must not wait for the arithmetic.
+        TileRows rows[kEmitBatch];
+        for (int i = 0; i < count; ++i) {
+            rows[i] = tile_rows(records[rank + i], lens);
+            block_columns(records[rank + i], lens, 4 * rows[i].first, 4 * (rows[i].last - rows[i].first + 1),
+                          columns + 2 * i * stride, columns + (2 * i + 1) * stride);
+        }
+        for (int i = 0; i < count; ++i, ++rank) {
+            Pair* pairs = out.pairs + size;
+            const int emitted = emit_tiles(rows[i], columns + 2 * i * stride, columns + (2 * i + 1) * stride,
+                                           (uint32_t)rank, lens, pairs);
+            for (int k = 0; k < emitted; ++k) ++out.tile_counts[pairs[k].tile_blocks >> 16];
+            out.counts[records[rank].splat] = (uint32_t)emitted;
+            size += (uint32_t)emitted;
+        }
     }
     *out.size = size;
     return rank;

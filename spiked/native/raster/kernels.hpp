@@ -12,6 +12,7 @@ constexpr int kTilePixels = kTile * kTile;   // stored block by block, each bloc
 constexpr int kMaxParts = 4;                 // native vectors in a block, at most
 constexpr int kGroup = 16;                   // splats are projected in whole groups; a multiple of every vector width
 constexpr int kMaxSide = 4096;               // pixels; tile numbers then fit in 16 bits
+constexpr int kEmitBatch = 8;                // splats
 constexpr uint32_t kCulled = 0xffffffffu;    // as a depth key, and as a rank
 constexpr float kStopTransmittance = 1e-4f;  // a block is finished when none of its pixels lets more through
 
@@ -146,9 +147,9 @@ struct Kernels {
     // Writes records[first..last) and keys (bits of z, or kCulled).
     void (*project)(const Prepared&, const Lens&, const View&, int count, int first, int last, Record* records,
                     uint32_t* keys);
-    // Writes the pairs of records[first..last) to `out` as long as there is room for tiles_x * tiles_y + 4 more, counts
-    // them by splat and by tile, and returns the first rank that was left out.
-    // `columns` is scratch, 2 * (blocks in a column of the image + kGroup) integers.
+    // Writes the pairs of records[first..last) to `out` as long as there is room for kEmitBatch times
+    // tiles_x * tiles_y + 4 more, counts them by splat and by tile, and returns the first rank that was left out.
+    // `columns` is scratch, 2 * kEmitBatch * (blocks in a column of tiles + kGroup) integers.
     int (*emit)(const Record* records, int first, int last, const Lens&, int32_t* columns, const Pairs& out);
     void (*forward)(const Tile&, int colours, const float background[3], const Planes&, const TileState&, TileImage*);
     void (*store)(const Tile&, const TileImage*, int colours, const Planes&, float* values, float* alpha, float* depth);

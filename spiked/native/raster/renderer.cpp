@@ -126,13 +126,13 @@ void Renderer::bin(SubPose& sub) {
     auto first_rank = [&](int run) { return static_cast<int>(static_cast<int64_t>(sub.visible) * run / runs); };
     pool_.run(runs, [&](int run, int) {
         Emission& emission = emissions_[run];
-        int32_t* columns = emission.columns.grow(2 * rows);
+        int32_t* columns = emission.columns.grow(2 * kEmitBatch * rows);
         uint32_t* tile_counts = emission.tile_counts.grow(tiles);
         std::fill_n(tile_counts, tiles, 0u);
         emission.size = 0;
         int rank = first_rank(run);
         for (const int last = first_rank(run + 1); rank < last;) {
-            const size_t room = emission.size + static_cast<size_t>(tiles) + 4;
+            const size_t room = emission.size + kEmitBatch * (static_cast<size_t>(tiles) + 4);
             if (emission.pairs.size() < room) emission.pairs.resize(2 * room);
             const Pairs out{emission.pairs.data(), static_cast<uint32_t>(emission.pairs.size()), &emission.size, counts,
                             tile_counts};

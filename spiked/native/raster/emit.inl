@@ -56,10 +56,10 @@ static inline TileRows tile_rows(const Record& s, const Lens& lens) {
 }
 
 // From the columns of blocks that one splat reaches to its pairs.
-static inline int emit_tiles(TileRows tile_rows, const int32_t* first, const int32_t* last, uint32_t rank,
-                             const Lens& lens, Pair* out) {
+static inline int emit_tiles(TileRows span, const int32_t* first, const int32_t* last, uint32_t rank, const Lens& lens,
+                             Pair* out) {
     Pair* end = out;
-    for (int tile_y = tile_rows.first; tile_y <= tile_rows.last; ++tile_y, first += 4, last += 4) {
+    for (int tile_y = span.first; tile_y <= span.last; ++tile_y, first += 4, last += 4) {
         int from = kMaxSide, to = -1;
         for (int k = 0; k < 4; ++k) {
             from = first[k] < from ? first[k] : from;

@@ -13,7 +13,7 @@ constexpr int kMaxParts = 4;                 // native vectors in a block, at mo
 constexpr int kGroup = 16;                   // splats are projected in whole groups; a multiple of every vector width
 constexpr int kMaxSide = 4096;               // pixels; tile numbers then fit in 16 bits
 constexpr int kEmitBatch = 8;                // splats
-constexpr uint32_t kCulled = 0xffffffffu;    // as a depth key, and as a rank
+constexpr uint32_t kCulled = 0xffffffffu;    // as a depth key; as a rank: none
 constexpr float kStopTransmittance = 1e-4f;  // a block is finished when none of its pixels lets more through
 
 struct Lens {
@@ -136,8 +136,7 @@ struct SsimImage {
 };
 // Floats of scratch: eight planes with margins above and below, and eight rows with margins at both ends.
 static inline int64_t ssim_scratch(int width, int height) { return 8 * ((int64_t)(height + 10) * width + width + 10); }
-// Of one `rounds` of multiply_add.
-constexpr int kMultiplyAddChains = 12;
+constexpr int kMultiplyAddChains = 12;  // vectors that a round of multiply_add changes
 
 struct Kernels {
     const char* name;

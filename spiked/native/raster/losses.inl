@@ -162,14 +162,13 @@ static double ssim(const SsimImage& image, const float* rendered, const float* t
 
 // Independent fused multiply-adds, enough of them to fill the pipelines; for measuring the machine's peak.
 static float multiply_add(int64_t rounds) {
-    constexpr int kChains = 12;
-    Vec sum[kChains], factor = splat(0.999f), term = splat(1e-3f);
-    for (int i = 0; i < kChains; ++i) sum[i] = splat((float)i);
+    Vec sum[kMultiplyAddChains], factor = splat(0.999f), term = splat(1e-3f);
+    for (int i = 0; i < kMultiplyAddChains; ++i) sum[i] = splat((float)i);
     for (int64_t n = 0; n < rounds; ++n) {
 #pragma GCC unroll 12
-        for (int i = 0; i < kChains; ++i) sum[i] = sum[i] * factor + term;
+        for (int i = 0; i < kMultiplyAddChains; ++i) sum[i] = sum[i] * factor + term;
     }
     float total = 0;
-    for (int i = 0; i < kChains; ++i) total += sum[i][0];
+    for (int i = 0; i < kMultiplyAddChains; ++i) total += sum[i][0];
     return total;
 }

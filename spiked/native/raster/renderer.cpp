@@ -42,7 +42,6 @@ void Renderer::forward(const SplatArrays& splats, const double* rotations, const
     std::fill_n(radius_.grow(splats.count), splats.count, 0.0f);
     for (int i = 0; i < count; ++i) {
         SubPose& sub = views_[i];
-        std::copy_n(rotations + 9 * i, 9, sub.rotation);
         sub.view = view_of(rotations + 9 * i, centres + 3 * i);
         project(sub);
         sort(sub);

@@ -11,7 +11,6 @@ namespace raster {
 // Everything of one sub-pose that the backward pass needs again.
 struct SubPose {
     View view;
-    double rotation[9];  // camera to world
     int visible = 0;
     uint32_t pairs = 0;
     Buffer<Record> records;       // [visible], by depth

@@ -67,7 +67,7 @@ class Verdict:
     tried: list[Hypothesis]
 
 
-def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = 3.0) -> Verdict:
+def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = 0.8) -> Verdict:
     """Try all guesses on `views`. Accepts when inliers > 60 % and the depth-reversed rival is worse."""
     if len(views.ids) < 30:
         return Verdict(None, f"only {len(views.ids)} tracks span the views; more texture or light is needed", [])

@@ -55,7 +55,7 @@ class Fit:
 
 
 BOOT_VIEWS = 10
-MIN_PARALLAX_PX = 1.5
+MIN_PARALLAX_PX = 0.8
 """Motion that rotation cannot explain before a bootstrap is tried; tracks are good to 0.05 px."""
 MIN_POINTS = 15
 KEY_EVERY = 8
@@ -118,7 +118,9 @@ class Odometry:
 
     def end(self) -> None:
         """No more views will come: a last try to begin, then the adjustment of the whole path."""
-        if self.state is State.BOOT and self.views:
+        if self.state is State.BOOT and len(self.views) < BOOT_VIEWS:
+            self.reason = f"the recording is too short: {len(self.views)} views, a first map needs {BOOT_VIEWS}"
+        elif self.state is State.BOOT:
             self._try_bootstrap(final=True)
         self.settle()
 

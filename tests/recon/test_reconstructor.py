@@ -1,0 +1,158 @@
+"""The whole reconstruction on the simulated camera, on good days and on bad ones."""
+
+import numpy as np
+import pytest
+
+from spiked.errors import ConfigurationError
+from spiked.evaluate import psnr, score_trajectory, similarity_of_trajectories
+from spiked.recon import Options, Reconstructor, State
+from spiked.sensor import Intrinsics, Mosaic, Sensor
+from spiked.simulate import MotionKind, SimulatedCamera
+from spiked.trajectory import Trajectory
+
+FRAMES = 480
+
+
+def sensor(mosaic: Mosaic | None = None) -> Sensor:
+    return Sensor(240, 160, 20000.0, intrinsics=Intrinsics.from_fov(240, 160, 60), mosaic=mosaic)
+
+
+def record(camera: SimulatedCamera, count: int) -> tuple[np.ndarray, Trajectory]:
+    frames = camera.next_frames(count)
+    k = np.arange(count)
+    return frames, Trajectory((k + 0.5) / camera.sensor.frame_rate_hz, *camera.truth(k))
+
+
+@pytest.fixture(scope="module")
+def shaken() -> tuple[SimulatedCamera, np.ndarray, Trajectory]:
+    camera = SimulatedCamera(sensor(), seed=2, motion=MotionKind.ARC, flow_px=0.3, parallax=0.5)
+    return camera, *record(camera, FRAMES)
+
+
+def feed(reconstructor: Reconstructor, frames: np.ndarray, first: int = 0, chunk: int = 40) -> None:
+    for i in range(0, len(frames), chunk):
+        reconstructor.feed(first + i, frames[i : i + chunk])
+
+
+def finite(reconstructor: Reconstructor) -> bool:
+    scene, path = reconstructor.scene(), reconstructor.trajectory()
+    arrays = (*scene.arrays(), path.rotations, path.centres)
+    return all(np.isfinite(a).all() for a in arrays)
+
+
+def test_a_shaken_camera_gives_its_path_and_a_scene_that_looks_right(
+    shaken: tuple[SimulatedCamera, np.ndarray, Trajectory],
+) -> None:
+    camera, frames, truth = shaken
+    reconstructor = Reconstructor(sensor(), Options(steps=300))
+    feed(reconstructor, frames)
+    assert reconstructor.status().state is State.TRACK, reconstructor.status().reason
+    reconstructor.finish()
+    path = reconstructor.trajectory()
+    score = score_trajectory(truth, path, 20000.0)
+    assert score.coverage > 0.98
+    assert score.errors is not None and score.errors.ate_percent < 3.0 and score.errors.rpe_r_deg < 0.1
+    carried = similarity_of_trajectories(truth, path, 20000.0)
+    k = FRAMES // 2
+    rotation, centre = carried.poses(truth.rotations[k : k + 1], truth.centres[k : k + 1])
+    seen = camera.view(truth.rotations[k], truth.centres[k])
+    rendered = reconstructor.view(rotation[0], centre[0])[..., 0]
+    assert psnr(rendered / reconstructor.white, seen / reconstructor.white) > 24
+
+
+def test_the_scene_grows_while_frames_arrive(shaken: tuple[SimulatedCamera, np.ndarray, Trajectory]) -> None:
+    _, frames, _ = shaken
+    reconstructor = Reconstructor(sensor())
+    versions, splats = [], []
+    for i in range(0, FRAMES, 40):
+        reconstructor.feed(i, frames[i : i + 40])
+        reconstructor.improve(0.02)
+        versions.append(reconstructor.status().version)
+        splats.append(reconstructor.status().splats)
+    assert versions == sorted(versions) and splats[-1] > 500
+    assert len(reconstructor.trajectory()) > 0.9 * FRAMES
+    report = reconstructor.report()
+    assert report["frames"] == FRAMES and report["states"]
+
+
+def test_same_seed_same_bits(shaken: tuple[SimulatedCamera, np.ndarray, Trajectory]) -> None:
+    _, frames, _ = shaken
+    scenes = []
+    for threads, chunk in ((1, 40), (2, 64)):
+        reconstructor = Reconstructor(sensor(), Options(steps=20, threads=threads))
+        feed(reconstructor, frames, chunk=chunk)
+        reconstructor.finish()
+        scenes.append(reconstructor.scene())
+    for a, b in zip(scenes[0].arrays(), scenes[1].arrays(), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_given_poses_are_kept(shaken: tuple[SimulatedCamera, np.ndarray, Trajectory]) -> None:
+    _, frames, truth = shaken
+    reconstructor = Reconstructor(sensor(), Options(steps=100, poses=truth))
+    feed(reconstructor, frames)
+    reconstructor.finish()
+    path = reconstructor.trajectory()
+    found = path.nearest(truth.times_s, 1e-6)
+    assert (found >= 0).mean() > 0.95
+    np.testing.assert_allclose(path.centres[found[found >= 0]], truth.centres[found >= 0], atol=1e-3)
+    assert len(reconstructor.scene()) > 500
+
+
+@pytest.mark.parametrize("lost", [1, 10, 100])
+def test_a_gap_is_crossed(shaken: tuple[SimulatedCamera, np.ndarray, Trajectory], lost: int) -> None:
+    _, frames, truth = shaken
+    reconstructor = Reconstructor(sensor(), Options(steps=0))
+    at = 300
+    feed(reconstructor, frames[:at])
+    reconstructor.gap(at, lost)
+    feed(reconstructor, frames[at + lost :], first=at + lost)
+    reconstructor.finish()
+    assert reconstructor.status().state is State.TRACK, reconstructor.report()["states"]
+    score = score_trajectory(truth, reconstructor.trajectory(), 20000.0)
+    assert score.errors is not None and score.errors.ate_percent < 5.0
+    assert finite(reconstructor)
+
+
+def test_a_recording_of_forty_frames_says_that_it_is_too_short() -> None:
+    reconstructor = Reconstructor(sensor())
+    feed(reconstructor, SimulatedCamera(sensor(), seed=1).next_frames(40))
+    reconstructor.finish()
+    assert reconstructor.status().state is State.BOOT and "too short" in reconstructor.status().reason
+    assert len(reconstructor.trajectory()) == 0 and len(reconstructor.scene()) == 0
+
+
+@pytest.mark.parametrize("value", [0x00, 0xFF])
+def test_all_dark_and_all_bright_stay_in_boot_with_a_reason(value: int) -> None:
+    reconstructor = Reconstructor(sensor())
+    feed(reconstructor, np.full((320, sensor().frame_bytes), value, np.uint8))
+    reconstructor.finish()
+    status = reconstructor.status()
+    assert status.state is State.BOOT and "texture or light" in status.reason
+    assert finite(reconstructor)
+
+
+def test_pure_rotation_makes_no_depth() -> None:
+    camera = SimulatedCamera(sensor(), seed=3, motion=MotionKind.ROTATION)
+    reconstructor = Reconstructor(sensor())
+    feed(reconstructor, camera.next_frames(400))
+    reconstructor.finish()
+    assert reconstructor.status().state is State.BOOT and "sideways" in reconstructor.status().reason
+
+
+def test_a_mosaic_camera_gives_a_coloured_scene() -> None:
+    colour = sensor(Mosaic.BGGR)
+    camera = SimulatedCamera(colour, seed=2, motion=MotionKind.ARC, flow_px=0.3, parallax=0.5)
+    frames, truth = record(camera, FRAMES)
+    reconstructor = Reconstructor(colour, Options(steps=150))
+    feed(reconstructor, frames)
+    reconstructor.finish()
+    score = score_trajectory(truth, reconstructor.trajectory(), 20000.0)
+    assert score.errors is not None and score.errors.ate_percent < 5.0
+    assert reconstructor.scene().colours.shape[1] == 3
+    assert np.std(reconstructor.scene().colours, axis=1).mean() > 0.003
+
+
+def test_without_a_focal_length_it_says_what_to_give() -> None:
+    with pytest.raises(ConfigurationError, match="--fov"):
+        Reconstructor(Sensor(240, 160, 20000.0))

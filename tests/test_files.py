@@ -1,0 +1,91 @@
+"""Trajectory and scene files: what is written is read back, and what is no such file is refused."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spiked.errors import SceneError
+from spiked.pose import exp_so3
+from spiked.scene import Scene
+from spiked.sensor import Intrinsics, Sensor
+from spiked.trajectory import Trajectory
+
+
+@pytest.fixture
+def path() -> Trajectory:
+    rng = np.random.default_rng(0)
+    return Trajectory(np.arange(5) / 20000, exp_so3(rng.normal(size=(5, 3))), rng.normal(size=(5, 3)))
+
+
+@pytest.fixture
+def scene() -> Scene:
+    rng = np.random.default_rng(0)
+    shapes = ((7, 3), (7, 4), (7, 3), (7,), (7, 1))
+    return Scene(*(rng.normal(size=shape).astype(np.float32) for shape in shapes))
+
+
+def test_tum_round_trip(path: Trajectory, tmp_path: Path) -> None:
+    path.write_tum(tmp_path / "t.tum")
+    back = Trajectory.read_tum(tmp_path / "t.tum")
+    np.testing.assert_allclose(back.matrices(), path.matrices(), atol=1e-8)
+    np.testing.assert_allclose(back.times_s, path.times_s, atol=1e-9)
+
+
+def test_colmap_holds_world_to_camera(path: Trajectory) -> None:
+    words = path.colmap().splitlines()[1].split()
+    t = np.array([float(x) for x in words[5:8]])
+    np.testing.assert_allclose(-path.rotations[0] @ t, path.centres[0], atol=1e-7)
+
+
+def test_kitti_and_nerfstudio_hold_every_pose(path: Trajectory) -> None:
+    rows = np.array([[float(x) for x in line.split()] for line in path.kitti().splitlines()])
+    np.testing.assert_allclose(rows.reshape(5, 3, 4), path.matrices()[:, :3], atol=1e-8)
+    sensor = Sensor(400, 250, 20000, intrinsics=Intrinsics.from_fov(400, 250, 60))
+    frames = json.loads(path.nerfstudio(sensor))["frames"]
+    first = np.array(frames[0]["transform_matrix"])
+    np.testing.assert_allclose(first[:3, 2], -path.rotations[0][:, 2])  # OpenGL looks along -z
+
+
+def test_nerfstudio_without_intrinsics_says_what_to_give(path: Trajectory) -> None:
+    with pytest.raises(SceneError, match="--fov"):
+        path.nerfstudio(Sensor(400, 250, 20000))
+
+
+@pytest.mark.parametrize(
+    "text", ["", "# nothing\n", "1 2 3\n", "0 0 0 0 0 0 0 0\n", "0 nan 0 0 0 0 0 1\n", "a b c d e f g h\n"]
+)
+def test_bad_tum_files_are_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "t.tum").write_text(text)
+    with pytest.raises(SceneError):
+        Trajectory.read_tum(tmp_path / "t.tum")
+
+
+@pytest.mark.parametrize("white", [1.0, 0.3])
+def test_ply_round_trip(scene: Scene, tmp_path: Path, white: float) -> None:
+    scene.write_ply(tmp_path / "s.ply", white)
+    back = Scene.read_ply(tmp_path / "s.ply")
+    np.testing.assert_allclose(back.colours, scene.colours, atol=1e-6)
+    np.testing.assert_allclose(back.quats, scene.quats / np.linalg.norm(scene.quats, axis=1, keepdims=True), atol=1e-6)
+    for a, b in zip(
+        (back.means, back.log_scales, back.opacity_logits),
+        (scene.means, scene.log_scales, scene.opacity_logits),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_bad_scenes_are_refused(scene: Scene, tmp_path: Path) -> None:
+    file = tmp_path / "s.ply"
+    good = scene.ply()
+    broken = {
+        "not a PLY": b"hello",
+        "cut short": good[:-10],
+        "only binary_little_endian": good.replace(b"binary_little_endian", b"ascii"),
+        "no property 'opacity'": good.replace(b"opacity", b"opasity"),
+    }
+    for message, raw in broken.items():
+        file.write_bytes(raw)
+        with pytest.raises(SceneError, match=message):
+            Scene.read_ply(file)

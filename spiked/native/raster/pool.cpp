@@ -25,14 +25,16 @@ void Pool::run(int tasks, const std::function<void(int, int)>& work) {
         work_ = &work;
         tasks_ = tasks;
         next_ = 0;
-        busy_ = static_cast<int>(workers_.size());
         failure_ = nullptr;
         ++round_;
+        open_ = true;
     }
     begin_.notify_all();
     take(0);
     std::unique_lock lock(mutex_);
-    end_.wait(lock, [this] { return busy_ == 0; });
+    // A worker that has not woken by now finds the round closed: on a busy machine nobody waits for it.
+    open_ = false;
+    end_.wait(lock, [this] { return active_ == 0; });
     if (failure_) std::rethrow_exception(failure_);
 }
 
@@ -51,13 +53,14 @@ void Pool::serve(int thread) {
     for (;;) {
         {
             std::unique_lock lock(mutex_);
-            begin_.wait(lock, [&] { return stopping_ || round_ != seen; });
+            begin_.wait(lock, [&] { return stopping_ || (open_ && round_ != seen); });
             if (stopping_) return;
             seen = round_;
+            ++active_;
         }
         take(thread);
         std::lock_guard lock(mutex_);
-        if (--busy_ == 0) end_.notify_one();
+        if (--active_ == 0) end_.notify_one();
     }
 }
 

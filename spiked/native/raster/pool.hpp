@@ -32,7 +32,8 @@ class Pool {
     std::mutex mutex_;
     std::condition_variable begin_, end_;
     uint64_t round_ = 0;
-    int busy_ = 0;
+    int active_ = 0;     // workers in the round
+    bool open_ = false;  // workers may still join
     bool stopping_ = false;
     const std::function<void(int, int)>* work_ = nullptr;
     int tasks_ = 0;

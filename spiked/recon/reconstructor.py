@@ -2,11 +2,14 @@
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 from spiked.errors import ConfigurationError
 from spiked.pose import Array, log_so3
@@ -91,14 +94,20 @@ class Reconstructor:
         self._unit = 1.0
         self._spent = {"tracking": 0.0, "mapping": 0.0, "refining": 0.0}
         self._curve: list[tuple[float, float]] = []
+        # The matrices are small: on busy cores several BLAS threads made tracking three times slower than one.
+        self._blas = ThreadpoolController()
 
     def feed(self, first_frame: int, frames: NDArray[np.uint8]) -> None:
         """Take stored frames uint8 [n, frame_bytes] that begin at absolute index `first_frame`."""
         begin = time.perf_counter()
-        for view in self._windows.feed(first_frame, frames):
-            self._add(view)
+        with self._one_blas_thread():
+            for view in self._windows.feed(first_frame, frames):
+                self._add(view)
         self._frames = first_frame + len(frames)
         self._spent["tracking"] += time.perf_counter() - begin
+
+    def _one_blas_thread(self) -> AbstractContextManager[object]:
+        return cast(AbstractContextManager[object], self._blas.limit(limits=1, user_api="blas"))
 
     def gap(self, first_frame: int, count: int) -> None:
         """Frames [first_frame, first_frame + count) were lost."""
@@ -231,12 +240,13 @@ class Reconstructor:
     ) -> None:
         """Use what is left in the buffers and refine path and map together. Stops early when `cancelled` says so."""
         begin = time.perf_counter()
-        for view in self._windows.flush():
-            self._add(view)
-        if self.options.poses is None:
-            self._odometry.end()
-        else:
-            self._take_given_poses()
+        with self._one_blas_thread():
+            for view in self._windows.flush():
+                self._add(view)
+            if self.options.poses is None:
+                self._odometry.end()
+            else:
+                self._take_given_poses()
         self._spent["tracking"] += time.perf_counter() - begin
         begin = time.perf_counter()
         if self._ready():

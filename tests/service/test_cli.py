@@ -112,6 +112,11 @@ def test_reconstruct_with_known_poses_writes_all_results(room: Path, tmp_path: P
     assert json.loads((tmp_path / "report.json").read_text())["frames"] == 512
     picture = cv2.imread(str(tmp_path / "overview.png"))
     assert picture is not None and picture.shape[1] > 1000 and picture.std() > 10
+    scored = run("evaluate", tmp_path, "--recording", room / "room.dat", "--json", tmp_path / "score.json")
+    assert scored.returncode == 0, scored.stderr
+    figures = json.loads((tmp_path / "score.json").read_text())
+    assert figures["ate_percent"] < 0.5
+    assert figures["psnr_db"] > 20
 
 
 def test_ctrl_c_keeps_what_there_is(room: Path, tmp_path: Path) -> None:

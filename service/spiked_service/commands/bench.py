@@ -1,18 +1,26 @@
-"""`spiked bench`: the kernels' speed as ratios that mean something on any machine."""
+"""`spiked bench`: the kernels' speed, with ratios that mean something on any machine."""
 
 from spiked import blocks
-from spiked.ring.benchmark import benchmark as benchmark_ring
+from spiked.render import benchmark as renderer
+from spiked.ring import benchmark as ring
 from spiked.sensor import Sensor
 from spiked_service.console import output
 
 
 def bench() -> None:
-    """Measure the reduction of frames and the ring on this machine, against copying the same bytes."""
-    output.print(f"{'what':52s} {'measured':>16s}  {'ratio':>6s}")
-    for row in blocks.benchmark():
-        output.print(f"{row.name:52s} {row.ns_per_frame:10.0f} ns/frame  {row.memcpy_ratio:5.1f}x memcpy's time")
-    ring = benchmark_ring(Sensor(400, 250, 20_000.0))
-    speed = f"{ring.ring_bytes_a_second / 1e6:10.0f} MB/s"
-    output.print(f"{'ring 400x250, between two processes':52s} {speed}    {ring.ratio:5.2f}x memcpy's speed")
-    spare = ring.ring_bytes_a_second / ring.camera_bytes_a_second
-    output.print(f"{'ring 400x250, against the camera':52s} {'':15s}  {spare:6.1f}x the camera's rate")
+    """Measure the reduction of frames, the ring and the renderer on this machine.
+
+    The last column compares: with copying the same bytes, with the camera's rate, with the processor's peak.
+    """
+    for reduced in blocks.benchmark():
+        _row(reduced.name, reduced.ns_per_frame, "ns/frame", f"{reduced.memcpy_ratio:.1f} times memcpy's time")
+    moved = ring.benchmark(Sensor(400, 250, 20_000.0))
+    speed = moved.ring_bytes_a_second
+    _row("ring 400x250 between two processes", speed * 1e-6, "MB/s", f"{moved.ratio:.2f} of memcpy's speed")
+    _row("", speed * 1e-6, "MB/s", f"{speed / moved.camera_bytes_a_second:.1f} times the camera's rate")
+    for row in renderer.measure():
+        _row(row.name, row.value, row.unit, "" if row.ratio is None else f"{row.ratio:.2f} of {row.against}")
+
+
+def _row(name: str, value: float, unit: str, comparison: str) -> None:
+    output.print(f"{name:52s} {value:10.2f} {unit:9s} {comparison}", markup=False)

@@ -5,7 +5,7 @@ import signal
 import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -69,9 +69,8 @@ def serve(
         if plan is not None:
             captures.start(plan)
         output.print(f"spiked listens at http://{_shown(host)}:{listener.getsockname()[1]}/", markup=False)
-        if follow:
-            threading.Thread(target=_follow, args=(captures,), name="follow", daemon=True).start()
-        _Server(config, captures).run(sockets=[listener])
+        with _followed(captures) if follow else nullcontext():
+            _Server(config, captures).run(sockets=[listener])
     finally:
         captures.close()
         folder.remove()
@@ -123,17 +122,27 @@ def _shown(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def _follow(captures: Captures) -> None:
-    """Print a line whenever something has changed, until the process ends."""
-    last = ""
-    pause = threading.Event()
-    while True:
-        for capture in captures.all()[-1:]:
-            line = _line(capture.snapshot())
-            if line != last:
-                output.print(line, markup=False)
-                last = line
-        pause.wait(_FOLLOW_S)
+@contextmanager
+def _followed(captures: Captures) -> Iterator[None]:
+    """Print a line whenever something has changed."""
+    over = threading.Event()
+
+    def follow() -> None:
+        last = ""
+        while not over.wait(_FOLLOW_S):
+            for capture in captures.all()[-1:]:
+                line = _line(capture.snapshot())
+                if line != last:
+                    output.print(line, markup=False)
+                    last = line
+
+    thread = threading.Thread(target=follow, name="follow")
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 def _line(snapshot: Snapshot) -> str:

@@ -19,7 +19,7 @@ def bench() -> None:
     _row("ring 400x250 between two processes", speed * 1e-6, "MB/s", f"{moved.ratio:.2f} of memcpy's speed")
     _row("", speed * 1e-6, "MB/s", f"{speed / moved.camera_bytes_a_second:.1f} times the camera's rate")
     for row in renderer.measure():
-        _row(row.name, row.value, row.unit, "" if row.ratio is None else f"{row.ratio:.2f} of {row.against}")
+        _row(row.name, row.value, row.unit, "" if row.ratio is None else f"{row.ratio:.2f} {row.against}")
 
 
 def _row(name: str, value: float, unit: str, comparison: str) -> None:

@@ -13,6 +13,8 @@ from spiked.recon import Reconstructor, Sample
 from spiked.trajectory import Trajectory
 
 _SAMPLES = 4
+_WIDTH_IN = 14.0
+_PATHS_IN = 4.3
 _INK = "#1d2330"
 _PATH = "viridis"
 
@@ -20,11 +22,12 @@ _PATH = "viridis"
 def draw_overview(reconstructor: Reconstructor, title: str, curve: Sequence[tuple[float, float]], path: Path) -> None:
     """Write the picture as PNG; `curve` is the loss over seconds of work."""
     samples = reconstructor.samples(_SAMPLES)
-    figure = Figure(figsize=(14, 9.2), facecolor="white", layout="constrained")
+    heights = (_PATHS_IN, _samples_height(samples))
+    figure = Figure(figsize=(_WIDTH_IN, sum(heights)), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     status = reconstructor.status()
     figure.suptitle(f"{title}   ·   {status.frames} frames, {status.splats} splats, {status.state}", color=_INK)
-    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.0, 1.15))[:, 0]
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)[:, 0]
     top, side, fit = above.subplots(1, 3)
     trajectory = reconstructor.trajectory()
     _draw_path(top, trajectory, (0, 2), ("x, right", "z, forward"), "path from above")
@@ -36,6 +39,14 @@ def draw_overview(reconstructor: Reconstructor, title: str, curve: Sequence[tupl
     else:
         below.text(0.5, 0.5, f"no scene: {status.reason or status.stage}", ha="center", color=_INK)
     figure.savefig(path, dpi=110)
+
+
+def _samples_height(samples: list[Sample]) -> float:
+    """Inches for two rows of pictures that fill the width."""
+    if not samples:
+        return 1.0
+    rows, columns = samples[0].observed.shape[:2]
+    return float(2 * (0.95 * _WIDTH_IN / len(samples)) * rows / columns + 0.5)
 
 
 def _draw_path(

@@ -2,6 +2,7 @@
 
 import json
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -119,6 +120,18 @@ def test_reconstruct_with_known_poses_writes_all_results(room: Path, tmp_path: P
     assert figures["psnr_db"] > 20
 
 
+def test_a_recording_without_a_path_in_it_says_why_and_exits_with_1(tmp_path: Path) -> None:
+    noise = tmp_path / "noise.dat"
+    noise.write_bytes(np.random.default_rng(0).bytes(12_500 * 128))
+    done = run("reconstruct", noise, "-o", tmp_path / "out", "--width", "400", "--height", "250", "--fov", "60")
+    assert done.returncode == 1
+    assert "no pose was found: " in done.stderr
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["state"] == "boot"
+    assert report["reason"]
+    assert (tmp_path / "out" / "overview.png").stat().st_size > 0
+
+
 def test_ctrl_c_keeps_what_there_is(room: Path, tmp_path: Path) -> None:
     arguments = ("reconstruct", room / "room.dat", "-o", tmp_path / "out", "--poses", room / "groundtruth.tum")
     with subprocess.Popen(command(*arguments, "--steps", "1000000"), stderr=subprocess.PIPE, text=True) as process:
@@ -137,3 +150,12 @@ def test_a_service_beyond_loopback_needs_a_token() -> None:
     done = run("serve", "--host", "0.0.0.0", "--port", "0")
     assert done.returncode == 2
     assert "--token" in done.stderr
+
+
+def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        done = run("serve", "--port", str(taken.getsockname()[1]), "--runtime", tmp_path / "runtime")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: cannot listen at 127.0.0.1:")
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "runtime").exists()

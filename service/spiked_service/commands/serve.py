@@ -1,6 +1,7 @@
 """`spiked serve`: the daemon."""
 
 import ipaddress
+import os
 import signal
 import socket
 import threading
@@ -115,7 +116,8 @@ def _listen(host: str, port: int) -> socket.socket:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         return socket.create_server((host, port), family=family)
     except OSError as error:
-        raise ConfigurationError(f"cannot listen at {host}:{port}: {error.strerror}; choose another --port") from error
+        why = str(error) if error.errno is None or error.errno < 0 else os.strerror(error.errno)
+        raise ConfigurationError(f"cannot listen at {host}:{port}: {why}; choose another --host or --port") from error
 
 
 def _shown(host: str) -> str:

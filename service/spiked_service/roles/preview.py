@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.blocks import aligned_window
+from spiked.recon.mapping import fill_mosaic
 from spiked.ring import End, Frames, Gap, Policy, RingReader
 from spiked_service.images import ImageFormat, display_white, encode
 from spiked_service.messages import PreviewOrder
@@ -46,7 +47,8 @@ def run_preview(order: PreviewOrder, link: Link) -> None:
 
 
 def _write(frames: NDArray[np.uint8], first: int, reader: RingReader, file: Path) -> None:
-    block = reader.geometry.block_frames
-    window = aligned_window(frames, reader.geometry.sensor, first, first + block, first + len(frames) - block)
-    image = window.rate(fill=True)
+    block, sensor = reader.geometry.block_frames, reader.geometry.sensor
+    window = aligned_window(frames, sensor, first, first + block, first + len(frames) - block)
+    channels = sensor.mosaic.channels(sensor.height, sensor.width) if sensor.mosaic else None
+    image = fill_mosaic(window.rate(fill=True), channels)
     write_atomically(file, encode(image, ImageFormat.PNG, display_white(image)))

@@ -15,6 +15,7 @@ import typer
 import uvicorn
 
 from spiked.errors import ConfigurationError
+from spiked.recon import State
 from spiked_service.api import create_app
 from spiked_service.capture import CaptureState, Plan, Snapshot
 from spiked_service.captures import Captures, unhurried
@@ -155,4 +156,5 @@ def _line(snapshot: Snapshot) -> str:
     loss = "" if status.loss is None else f"  loss {status.loss:.1e}"
     left = f"  {100 * status.progress:.0f} % refined" if snapshot.state is CaptureState.FINISHING else ""
     growth = f"{status.frames} frames  {status.poses} poses  {status.splats} splats"
-    return f"{snapshot.state}  {status.state}  {growth}{loss}  version {status.version}{left}"
+    why = "" if status.state is State.TRACK or not status.reason else f"  ({status.reason})"
+    return f"{snapshot.state}  {status.state}{why}  {growth}{loss}  version {status.version}{left}"

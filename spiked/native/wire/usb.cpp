@@ -1,0 +1,167 @@
+#include "usb.hpp"
+
+namespace spiked::wire {
+namespace {
+
+constexpr size_t stride = UsbParser::row_bytes + 2;
+
+bool has_magic(const uint8_t* p) { return load32(p) == UsbParser::magic; }
+uint32_t session_offset(const uint8_t* header) { return load32(header + 8) - 50 * load32(header + 12); }
+
+// Whether the whole rows among `bytes` bytes behind the header have the numbers 0, 1, 2, ...
+bool rows_run(const uint8_t* header, size_t bytes) {
+    const uint8_t* tag = header + UsbParser::header_bytes + UsbParser::row_bytes;
+    const size_t whole = std::min(UsbParser::rows, (bytes - UsbParser::header_bytes) / stride);
+    for (size_t row = 0; row < whole; ++row)
+        if (load16(tag + row * stride) != row) return false;
+    return true;
+}
+
+void copy_rows(const uint8_t* header, uint8_t* out) {
+    const uint8_t* row = header + UsbParser::header_bytes;
+    for (size_t i = 0; i < UsbParser::rows; ++i)
+        std::memcpy(out + i * UsbParser::row_bytes, row + i * stride, UsbParser::row_bytes);
+}
+
+// Frames from counter `from` to `to`. Lines are counted modulo 2^32, which is no multiple of 250: only one direction
+// gives whole frames, so a step back cannot be taken for a long way forward.
+std::optional<int64_t> frames_between(uint32_t from, uint32_t to) {
+    const uint32_t ahead = to - from, back = from - to;
+    if (ahead % UsbParser::rows == 0) return ahead / UsbParser::rows;
+    if (back % UsbParser::rows == 0) return -static_cast<int64_t>(back / UsbParser::rows);
+    return std::nullopt;
+}
+
+}  // namespace
+
+void UsbParser::feed(const uint8_t* chunk, size_t bytes) {
+    if (finished_) throw std::logic_error("a finished stream takes no more bytes");
+    stream_.feed(chunk, bytes);
+    counters_.bytes += bytes;
+}
+
+void UsbParser::mark_loss() { contiguous_ = false; }
+
+Event UsbParser::restart(int64_t lost) {
+    counters_.skipped += stream_.available();
+    stream_.keep();
+    stream_.advance(stream_.available());
+    ++counters_.restarts;
+    lock_.reset();
+    contiguous_ = true;
+    lost = std::max(lost, seen_index_ + 1 - next_index_);
+    return lost > 0 ? lose(lost, Kind::device_gap) : Event{};
+}
+
+Event UsbParser::next(uint8_t* out, size_t capacity) {
+    Event frames{Kind::frames, next_index_, 0};
+    while (static_cast<size_t>(frames.count) < capacity) {
+        Event gap;
+        const Step step = look(gap);
+        if (step == Step::frame) {
+            copy_rows(stream_.data(), out + static_cast<size_t>(frames.count) * compact_bytes);
+            stream_.advance(frame_bytes);
+            seen_index_ = std::max(seen_index_, next_index_);
+            ++next_index_;
+            ++counters_.received;
+            ++frames.count;
+            lock_->expected += rows;
+            contiguous_ = true;
+        } else if (step == Step::gap || step == Step::starve) {
+            if (step == Step::starve && finished_ && frames.count == 0 && seen_index_ >= next_index_)
+                return lose(seen_index_ + 1 - next_index_, Kind::host_gap);
+            // A gap is found again by the next call, after the frames before it.
+            if (frames.count == 0) return step == Step::gap ? lose(gap.count, gap.kind) : Event{};
+            return frames;
+        }
+    }
+    return frames.count ? frames : Event{};
+}
+
+// Looks at what lies ahead without delivering it; skips what is nothing.
+UsbParser::Step UsbParser::look(Event& gap) {
+    const uint8_t* p = stream_.data();
+    const size_t available = stream_.available();
+    if (available < header_bytes) {
+        if (finished_) {
+            counters_.skipped += available;
+            stream_.advance(available);
+        }
+        return Step::starve;
+    }
+    if (!has_magic(p)) return damaged(p, available);
+    const std::optional<int64_t> ahead = lock_ ? frames_ahead(p) : std::nullopt;
+    if (!ahead) return look_for_lock(p, available);
+    const bool sound = rows_run(p, available);
+    if (*ahead >= 0) {
+        seen_index_ = std::max(seen_index_, next_index_ + *ahead);
+        // The header alone tells of what the camera did not send; damage blurs whose loss it was.
+        if (*ahead > 0 && (contiguous_ || (sound && available >= frame_bytes))) {
+            gap = Event{contiguous_ ? Kind::device_gap : Kind::host_gap, next_index_, *ahead};
+            return Step::gap;
+        }
+    }
+    if (!sound || (finished_ && available < frame_bytes)) return damaged(p, available);
+    if (available < frame_bytes) return Step::starve;
+    if (*ahead >= 0) return Step::frame;
+    ++counters_.duplicates;
+    stream_.advance(frame_bytes);
+    return Step::skip;
+}
+
+// A first frame counts when its rows are right and the next header follows and agrees: a header by itself may be junk.
+UsbParser::Step UsbParser::look_for_lock(const uint8_t* p, size_t available) {
+    if (!rows_run(p, available)) return damaged(p, available);
+    const bool whole = available >= frame_bytes;
+    if (available < frame_bytes + header_bytes) {
+        if (!finished_) return Step::starve;
+        if (!whole || lock_) return damaged(p, available);
+        lock_on(p);
+        return Step::frame;
+    }
+    const uint8_t* following = p + frame_bytes;
+    const auto step = frames_between(load32(p + 12), load32(following + 12));
+    const bool confirmed = has_magic(following) && load32(p + 4) == load32(following + 4) &&
+                           session_offset(p) == session_offset(following) && step && *step > 0;
+    if (!confirmed) return damaged(p, available);
+    const bool again = lock_.has_value();
+    lock_on(p);
+    if (!again) return Step::frame;
+    // The camera began anew without being told to. How long it was away is not to be seen; it was away.
+    ++counters_.restarts;
+    lock_->expected -= rows * static_cast<uint32_t>(std::max<int64_t>(1, seen_index_ + 1 - next_index_));
+    contiguous_ = true;
+    return Step::skip;
+}
+
+// Moves on to the next place where a header may begin. Damage may be of any length, so every byte is such a place; the
+// 4-byte steps in which the camera sends are among them.
+UsbParser::Step UsbParser::damaged(const uint8_t* p, size_t available) {
+    static constexpr uint8_t pattern[4] = {0x00, 0x63, 0x60, 0x63};
+    if (contiguous_ && lock_) ++counters_.resyncs;
+    if (lock_) contiguous_ = false;
+    const void* found = memmem(p + 1, available - 1, pattern, sizeof pattern);
+    const size_t skip = found ? static_cast<size_t>(static_cast<const uint8_t*>(found) - p) : available - 3;
+    counters_.skipped += skip;
+    stream_.advance(skip);
+    return Step::skip;
+}
+
+std::optional<int64_t> UsbParser::frames_ahead(const uint8_t* header) const {
+    if (load32(header + 4) != lock_->word1 || session_offset(header) != lock_->offset) return std::nullopt;
+    return frames_between(lock_->expected, load32(header + 12));
+}
+
+void UsbParser::lock_on(const uint8_t* header) {
+    lock_ = Lock{load32(header + 4), session_offset(header), load32(header + 12)};
+}
+
+Event UsbParser::lose(int64_t count, Kind kind) {
+    const Event gap{kind, next_index_, count};
+    next_index_ += count;
+    counters_.lost += static_cast<uint64_t>(count);
+    if (lock_) lock_->expected += static_cast<uint32_t>(count) * static_cast<uint32_t>(rows);
+    return gap;
+}
+
+}  // namespace spiked::wire

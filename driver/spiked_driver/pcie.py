@@ -1,0 +1,158 @@
+"""The raw stream of the PCIe camera (flavour E): parsing, and a source that reads a file, a pipe or a device node."""
+
+import os
+import select
+import stat
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from spiked.native._wire import PcieParser
+
+from spiked.errors import SourceError
+from spiked.ring import Condition, DeviceState, End, EndReason, Gap
+from spiked.sensor import Sensor
+from spiked_driver.framing import Framing, FramingBenchmark, benchmark_framing
+from spiked_driver.source import READ_WAIT_S, Chunk
+
+PCIE_SIZE = 1000
+PCIE_FRAME_BYTES = 128_000
+"""A frame in the stream: 2000 half-lines of 64 bytes."""
+PCIE_COMPACT_BYTES = 125_000
+BLOCK_BYTES = 1 << 20
+"""What is read at once; the capture card gives multiples of 64 bytes."""
+
+
+class PcieFraming(Framing):
+    """The parser of the M1K40's raw stream.
+
+    A frame is delivered when all its 2000 half-lines have the right line and channel. Their order is learnt from the
+    first two frames that agree. This wire has no frame counter: a gap counts a frame for every 128,000 bytes skipped,
+    at least one; frames that left no trace are not noticed.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(PcieParser())
+
+
+class PcieSource:
+    """A camera that is read from a path: the capture card's device node, a pipe, or a file of its raw stream."""
+
+    def __init__(self, path: str | os.PathLike[str], *, frame_rate_hz: float = 20_000.0) -> None:
+        self.path = Path(path)
+        self._sensor = Sensor(PCIE_SIZE, PCIE_SIZE, frame_rate_hz)
+        self._framing = PcieFraming()
+        self._block = bytearray(BLOCK_BYTES)
+        self._file: int | None = None
+        self._is_file = False
+        self._ended = False
+        self._condition = Condition(DeviceState.IDLE)
+
+    @property
+    def sensor(self) -> Sensor:
+        """1000x1000, rows as the camera sends them."""
+        return self._sensor
+
+    @property
+    def frames(self) -> int | None:
+        """Not known before the end."""
+        return None
+
+    @property
+    def waits(self) -> bool:
+        """Only a file can be read late without a loss."""
+        return self._is_file
+
+    @property
+    def condition(self) -> Condition:
+        """Armed once open, streaming from the first frame, idle after the end."""
+        return self._condition
+
+    def open(self) -> None:
+        """Open the path for reading. Raises SourceError."""
+        self.close()
+        try:
+            self._file = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)
+        except OSError as error:
+            raise SourceError(
+                f"{self.path}: cannot be read: {error.strerror}; check the path and its permissions"
+            ) from error
+        self._is_file = stat.S_ISREG(os.fstat(self._file).st_mode)
+        self._framing = PcieFraming()
+        self._ended = False
+        self._condition = Condition(DeviceState.ARMED)
+
+    def close(self) -> None:
+        """Close the path."""
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
+        self._condition = Condition(DeviceState.IDLE)
+
+    def read_into(self, view: NDArray[np.uint8]) -> Chunk | Gap | End | None:
+        """See `Source.read_into`."""
+        while (item := self._framing.read_into(view)) is None:
+            if self._ended:
+                self._condition = Condition(DeviceState.IDLE, "the stream is at its end")
+                return End(self._framing.next_index, EndReason.FINISHED)
+            if not self._read_block():
+                return None
+        self._condition = Condition(DeviceState.STREAMING)
+        return item
+
+    def _read_block(self) -> bool:
+        """Read once; false if nothing came within READ_WAIT_S."""
+        if self._file is None:
+            raise SourceError(f"{self.path}: the source is not open")
+        if not select.select([self._file], [], [], READ_WAIT_S)[0]:
+            return False
+        self._framing.keep()
+        try:
+            count = os.readv(self._file, [self._block])
+        except BlockingIOError:
+            return False
+        except OSError as error:
+            raise SourceError(
+                f"{self.path}: reading failed: {error.strerror}; check the card and its driver"
+            ) from error
+        if count:
+            self._framing.feed(memoryview(self._block)[:count])
+        else:
+            self._framing.finish()
+            self._ended = True
+        return True
+
+
+def encode_pcie(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The raw stream, uint8 [n, 128000], of compact frames, uint8 [n, 125000].
+
+    The order of lines and channels within a frame is inferred from where a frame begins and ends, not published: rows 0
+    to 499 are lines 500 to 1 of channels 0 and 1, rows 500 to 999 lines 1 to 500 of channels 2 and 3.
+    """
+    count = len(frames)
+    pixels = frames.reshape(count, PCIE_SIZE, 125)
+    halves = np.zeros((count, PCIE_SIZE, 2, 64), np.uint8)
+    halves[:, :, 0, :63] = pixels[:, :, :63]
+    halves[:, :, 0, 62] &= 0x0F
+    second = pixels[:, :, 62:]
+    halves[:, :, 1, :63] = second >> 4
+    halves[:, :, 1, :62] |= second[:, :, 1:] << 4
+    tags = _tags() << 4
+    halves[..., 62] |= (tags & 0xFF).astype(np.uint8)
+    halves[..., 63] = tags >> 8
+    return halves.reshape(count, PCIE_FRAME_BYTES)
+
+
+def _tags() -> NDArray[np.uint16]:
+    """Line and channel (bits 10-11) of every half-line, uint16 [1000, 2]."""
+    row = np.arange(PCIE_SIZE)
+    upper = row < 500
+    line = np.where(upper, 500 - row, row - 499)
+    channel = np.where(upper, 0, 2)[:, None] + np.arange(2)
+    return (line[:, None] | channel << 10).astype(np.uint16)
+
+
+def benchmark_pcie(frames: int = 150, repeat: int = 3) -> FramingBenchmark:
+    """Best of `repeat` passes over so many random frames in blocks of 1 MiB."""
+    pixels = np.random.default_rng(0).integers(0, 256, (frames, PCIE_COMPACT_BYTES), np.uint8)
+    return benchmark_framing(PcieFraming, encode_pcie(pixels), PCIE_COMPACT_BYTES, BLOCK_BYTES, repeat)

@@ -1,0 +1,198 @@
+"""The PCIe camera's raw stream: what comes out was sent, in order, whatever happened on the way."""
+
+import os
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from spiked_driver.pcie import (
+    PCIE_COMPACT_BYTES,
+    PCIE_FRAME_BYTES,
+    PcieFraming,
+    PcieSource,
+    benchmark_pcie,
+    encode_pcie,
+)
+from spiked_driver.source import Chunk
+
+from spiked.errors import SourceError
+from spiked.ring import Cause, DeviceState, End, EndReason, Gap
+
+SENT = 6
+FRAMES = np.random.default_rng(3).integers(0, 256, (SENT, PCIE_COMPACT_BYTES), np.uint8)
+WIRE = encode_pcie(FRAMES)
+
+
+def take(data: bytes, cuts: list[int]) -> tuple[PcieFraming, list[NDArray[np.uint8]], list[Gap]]:
+    """All frames and gaps of a stream fed in pieces, with every index accounted for."""
+    framing, view = PcieFraming(), np.zeros((2, PCIE_COMPACT_BYTES), np.uint8)
+    frames: list[NDArray[np.uint8]] = []
+    gaps: list[Gap] = []
+    expected = 0
+    bounds = sorted({0, *(cut for cut in cuts if cut < len(data))})
+    for start, stop in zip(bounds, [*bounds[1:], len(data)], strict=True):
+        framing.feed(data[start:stop])
+        if stop == len(data):
+            for _ in range(2):
+                expected = drain(framing, view, frames, gaps, expected)
+                framing.finish()
+        expected = drain(framing, view, frames, gaps, expected)
+    counters = framing.counters
+    assert (counters.received, counters.lost) == (len(frames), sum(gap.count for gap in gaps))
+    assert counters.received + counters.lost == framing.next_index == expected
+    assert counters.skipped_bytes + counters.received * PCIE_FRAME_BYTES == counters.bytes == len(data)
+    return framing, frames, gaps
+
+
+def drain(
+    framing: PcieFraming, view: NDArray[np.uint8], frames: list[NDArray[np.uint8]], gaps: list[Gap], expected: int
+) -> int:
+    while item := framing.read_into(view):
+        assert item.first == expected
+        if isinstance(item, Gap):
+            gaps.append(item)
+            expected += item.count
+        else:
+            frames.extend(view[: item.frames].copy())
+            expected += item.frames
+    return expected
+
+
+def sent_index(frame: NDArray[np.uint8]) -> int:
+    wrong = np.bitwise_count(FRAMES ^ frame).sum(axis=1)
+    best = int(wrong.argmin())
+    assert wrong[best] < 0.001 * 8 * frame.size, "a frame that was never sent"
+    return best
+
+
+@pytest.mark.parametrize("cut", [1, 62, 64, 100_000, PCIE_FRAME_BYTES, PCIE_FRAME_BYTES + 1])
+def test_pixels_come_back_whatever_the_chunks(cut: int) -> None:
+    _, frames, gaps = take(WIRE.tobytes(), [cut, 2 * cut, 3 * cut + 7])
+    np.testing.assert_array_equal(np.stack(frames), FRAMES)
+    assert not gaps
+
+
+def test_a_half_line_holds_500_pixels_a_line_and_a_channel() -> None:
+    frame = np.zeros((1, 1000, 1000), np.uint8)
+    frame[0, 0, [0, 499, 500, 999]] = 1
+    wire = np.unpackbits(encode_pcie(np.packbits(frame, bitorder="little").reshape(1, -1)), bitorder="little")
+    first, second = wire[:512], wire[512:1024]
+    assert np.flatnonzero(first[:500]).tolist() == [0, 499]
+    assert np.flatnonzero(second[:500]).tolist() == [0, 499]
+    numbers = [int(half[500:510] @ (1 << np.arange(10))) for half in (first, second)]
+    assert numbers == [500, 500]
+    last = wire[-512:]
+    assert int(last[500:512] @ (1 << np.arange(12))) == 500 | 3 << 10
+
+
+def test_a_stream_may_begin_within_a_frame() -> None:
+    framing, frames, gaps = take(WIRE.reshape(-1)[64_000:].tobytes(), [])
+    np.testing.assert_array_equal(np.stack(frames), FRAMES[1:])
+    assert not gaps
+    assert framing.counters.skipped_bytes == 64_000
+
+
+def test_one_frame_by_itself_is_taken_at_the_end() -> None:
+    _, frames, _ = take(WIRE[0].tobytes(), [])
+    np.testing.assert_array_equal(frames[0], FRAMES[0])
+
+
+def test_a_wrong_line_number_costs_its_frame_and_no_other() -> None:
+    wire = WIRE.copy()
+    wire[3, 64 * 700 + 63] ^= 0x04
+    framing, frames, gaps = take(wire.tobytes(), [])
+    assert [sent_index(frame) for frame in frames] == [0, 1, 2, 4, 5]
+    assert gaps == [Gap(3, 1, Cause.USB)]
+    assert framing.counters.resyncs == 1
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    damages=st.lists(
+        st.tuples(st.sampled_from(["flip", "drop", "junk", "repeat"]), st.floats(0, 0.999), st.integers(1, 60_000)),
+        max_size=4,
+    ),
+    cuts=st.lists(st.integers(1, SENT * PCIE_FRAME_BYTES), max_size=5),
+)
+def test_no_damage_makes_a_frame_that_was_not_sent(damages: list[tuple[str, float, int]], cuts: list[int]) -> None:
+    data = bytearray(WIRE.tobytes())
+    for kind, place, span in damages:
+        at = int(place * len(data))
+        if kind == "flip":
+            data[at] ^= 1 + span % 255
+        elif kind == "drop":
+            del data[at : at + span]
+        elif kind == "junk":
+            data[at:at] = np.random.default_rng(span).bytes(span)
+        else:
+            data[at:at] = data[max(0, at - span) : at]
+    _, frames, _ = take(bytes(data), cuts)
+    indices = [sent_index(frame) for frame in frames]
+    assert indices == sorted(set(indices))
+
+
+def read_all(source: PcieSource) -> tuple[list[NDArray[np.uint8]], End]:
+    frames: list[NDArray[np.uint8]] = []
+    view = np.zeros((4, PCIE_COMPACT_BYTES), np.uint8)
+    while not isinstance(item := source.read_into(view), End):
+        if isinstance(item, Chunk):
+            assert item.first == len(frames)
+            frames.extend(view[: item.frames].copy())
+    return frames, item
+
+
+def test_a_file_is_a_source(tmp_path: Path) -> None:
+    path = tmp_path / "raw.dat"
+    path.write_bytes(WIRE.tobytes())
+    source = PcieSource(path)
+    for _ in range(2):
+        source.open()
+        assert source.waits
+        frames, end = read_all(source)
+        np.testing.assert_array_equal(np.stack(frames), FRAMES)
+        assert end == End(SENT, EndReason.FINISHED)
+        assert source.condition.state is DeviceState.IDLE
+        source.close()
+
+
+def test_a_pipe_is_a_source_that_cannot_wait(tmp_path: Path) -> None:
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    source = PcieSource(path)
+    source.open()
+    sender = threading.Thread(target=path.write_bytes, args=(WIRE.tobytes(),))
+    view = np.zeros((4, PCIE_COMPACT_BYTES), np.uint8)
+    with path.open("wb"):  # held open, so that the pipe does not end before the sender begins
+        assert source.read_into(view) is None
+        sender.start()
+        first = source.read_into(view)
+        while first is None:
+            first = source.read_into(view)
+    assert isinstance(first, Chunk)
+    assert not source.waits
+    np.testing.assert_array_equal(view[: first.frames], FRAMES[: first.frames])
+    _rest_of(source, first.frames)
+    sender.join()
+    source.close()
+
+
+def _rest_of(source: PcieSource, received: int) -> None:
+    view = np.zeros((4, PCIE_COMPACT_BYTES), np.uint8)
+    while not isinstance(item := source.read_into(view), End):
+        if isinstance(item, Chunk):
+            np.testing.assert_array_equal(view[: item.frames], FRAMES[received : received + item.frames])
+            received += item.frames
+    assert received == SENT
+
+
+def test_a_missing_device_says_where_to_look(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="check the path"):
+        PcieSource(tmp_path / "JR6101").open()
+
+
+def test_the_benchmark_parses_every_frame_it_times() -> None:
+    assert benchmark_pcie(frames=4, repeat=1).parsed_bytes_a_second > 0

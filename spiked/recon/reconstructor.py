@@ -274,6 +274,7 @@ class Reconstructor:
         self._odometry.spline = replace(spline, centres=spline.centres / self._unit)
 
     def _refine(self, progress: Callable[[Status], None] | None, cancelled: Callable[[], bool]) -> None:
+        begin = time.perf_counter()
         self._stage = "refining"
         usable = self._mappable()
         self._queue = []
@@ -288,7 +289,7 @@ class Reconstructor:
                 self._align()
             if done % 50 == 49:
                 self._progress = (done + 1) / steps
-                self._note()
+                self._note(time.perf_counter() - begin)
                 if progress:
                     progress(self.status())
         self._version += 1
@@ -303,10 +304,11 @@ class Reconstructor:
         views = [self._views[i] for i in self._mappable()]
         self._refined = align_spline(spline, views, self._mapper)
 
-    def _note(self) -> None:
+    def _note(self, running_s: float = 0.0) -> None:
+        """Add the loss to the curve over seconds of work; `running_s` are not counted as spent yet."""
         loss = self._mapper.loss
         if loss is not None:
-            self._curve.append((sum(self._spent.values()), float(-10 * np.log10(loss))))
+            self._curve.append((sum(self._spent.values()) + running_s, float(-10 * np.log10(loss))))
 
     def status(self) -> Status:
         """Where the work stands."""

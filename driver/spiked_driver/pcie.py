@@ -149,7 +149,7 @@ def _tags() -> NDArray[np.uint16]:
     upper = row < 500
     line = np.where(upper, 500 - row, row - 499)
     channel = np.where(upper, 0, 2)[:, None] + np.arange(2)
-    return (line[:, None] | channel << 10).astype(np.uint16)
+    return np.asarray(line[:, None] | channel << 10, np.uint16)
 
 
 def benchmark_pcie(frames: int = 150, repeat: int = 3) -> FramingBenchmark:

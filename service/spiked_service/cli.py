@@ -6,6 +6,7 @@ import typer
 
 from spiked.errors import SpikedError
 from spiked_service.commands.bench import bench
+from spiked_service.commands.convert import convert
 from spiked_service.commands.devices import devices
 from spiked_service.commands.evaluate import evaluate
 from spiked_service.commands.info import info
@@ -26,7 +27,7 @@ app = typer.Typer(
 )
 for _group, _commands in {
     "Live": (serve, devices),
-    "Files": (info, verify, simulate),
+    "Files": (info, verify, convert, simulate),
     "Scenes": (reconstruct, render, evaluate),
     "This program": (bench, version),
 }.items():

@@ -12,9 +12,9 @@ class MapOptions:
 
     stride_px: float = 2.0
     """Spacing of the pixels that become the first splats."""
-    splats_a_pixel: float = 0.4
+    splats_a_pixel: float = 0.5
     """Cap of the number of splats, in splats for each sensor pixel."""
-    rate_means: float = 1.2e-3
+    rate_means: float = 2e-3
     """Learning rates at the start, per step; those of the means and of colour are in units of depth and of white."""
     rate_quats: float = 8e-3
     rate_scales: float = 1.2e-2

@@ -75,9 +75,7 @@ def guess(name: str, data: NDArray[np.uint8]) -> Format:
     if data.size % tagged.frame_bytes == 0 and tags_agree(data[: tagged.frame_bytes][None], 250, 50).all():
         return tagged
     if WIRE_MAGIC in data[: 4 * Flavour.C.value.frame_bytes].tobytes() and data.size % 12_500:
-        raise RecordingError(
-            f"{name}: this looks like {Flavour.C.value.name}, which must be unpacked by the driver first"
-        )
+        raise RecordingError(f"{name}: this looks like {Flavour.C.value.name}, which `spiked convert` unpacks")
     fits: list[Format] = [f.value for f in Flavour if data.size % f.value.frame_bytes == 0 and f is not Flavour.B]
     readable = [f for f in fits if f.layout is not None]
     if len(readable) == 1:

@@ -4,11 +4,13 @@ from spiked import blocks
 from spiked.render import benchmark as renderer
 from spiked.ring import benchmark as ring
 from spiked.sensor import Sensor
+from spiked_driver.framing import benchmark_usb
+from spiked_driver.pcie import benchmark_pcie
 from spiked_service.console import output
 
 
 def bench() -> None:
-    """Measure the reduction of frames, the ring and the renderer on this machine.
+    """Measure the reduction of frames, the ring, the wire parsers and the renderer on this machine.
 
     The last column compares: with copying the same bytes, with the camera's rate, with the processor's peak.
     """
@@ -18,6 +20,8 @@ def bench() -> None:
     speed = moved.ring_bytes_a_second
     _row("ring 400x250 between two processes", speed * 1e-6, "MB/s", f"{moved.ratio:.2f} of memcpy's speed")
     _row("", speed * 1e-6, "MB/s", f"{speed / moved.camera_bytes_a_second:.1f} times the camera's rate")
+    for name, wire in (("parse the USB3 wire", benchmark_usb()), ("parse the raw PCIe stream", benchmark_pcie())):
+        _row(name, wire.parsed_bytes_a_second * 1e-6, "MB/s", f"{wire.ratio:.2f} of memcpy's speed")
     for row in renderer.measure():
         _row(row.name, row.value, row.unit, "" if row.ratio is None else f"{row.ratio:.2f} {row.against}")
 

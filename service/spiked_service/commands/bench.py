@@ -1,11 +1,12 @@
 """`spiked bench`: the kernels' speed, with ratios that mean something on any machine."""
 
+from spiked_driver.framing import benchmark_usb
+from spiked_driver.pcie import benchmark_pcie
+
 from spiked import blocks
 from spiked.render import benchmark as renderer
 from spiked.ring import benchmark as ring
 from spiked.sensor import Sensor
-from spiked_driver.framing import benchmark_usb
-from spiked_driver.pcie import benchmark_pcie
 from spiked_service.console import output
 
 

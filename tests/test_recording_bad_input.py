@@ -152,9 +152,35 @@ def test_one_wrong_row_number_is_found_by_verify(tmp_path: Path) -> None:
     with path.open("r+b") as file:
         file.seek(13_000 + 50)
         file.write(b"\x07")
+    refuse(path, "row numbers of frame 1")
     result = verify(path)
     assert (result.verdict, result.wrong_tags) == ("bad", 1)
-    assert result.reasons == ("1 of 8 frames have wrong row numbers",)
+    assert result.reasons[-1] == "1 of 8 frames have wrong row numbers"
+
+
+def test_a_wrong_row_number_anywhere_in_a_short_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.dat"
+    with RecordingWriter(path, Sensor(400, 250, 20_000.0, Layout.ROW_TAGGED)) as writer:
+        writer.append(np.full((20, 12_500), 0x11, np.uint8))
+    sidecar_path(path).unlink()
+    stored = bytearray(path.read_bytes())
+    stored[5 * 13_000 + 50] = 7
+    path.write_bytes(stored)
+    refuse(path, "row numbers of frame 5")
+    stored[50] = 7
+    path.write_bytes(stored)
+    refuse(path, "looks row-tagged")
+
+
+def test_a_row_tagged_file_cut_within_a_frame_is_still_told_by_its_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "a.dat"
+    with RecordingWriter(path, Sensor(400, 250, 20_000.0, Layout.ROW_TAGGED)) as writer:
+        writer.append(np.full((4, 12_500), 0x11, np.uint8))
+    sidecar_path(path).unlink()
+    path.write_bytes(path.read_bytes()[:-100])
+    recording = open_recording(path)
+    assert (recording.frames, recording.sensor.layout) == (3, Layout.ROW_TAGGED)
+    assert "truncated" in recording.warnings[-1]
 
 
 @pytest.mark.parametrize(

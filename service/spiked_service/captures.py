@@ -4,7 +4,9 @@ import threading
 from pathlib import Path
 from urllib.parse import urlencode
 
-from spiked.errors import SpikedError
+from spiked_driver import open_source
+
+from spiked.errors import ConfigurationError, SpikedError
 from spiked_service.capture import Capture, Plan
 
 _CLOSE_S = 1.0
@@ -29,7 +31,9 @@ class Captures:
         self._closing = False
 
     def start(self, plan: Plan) -> Capture:
-        """Raises BusyError while another capture runs, and when the service is about to end."""
+        """Raises BusyError while another capture runs, and when the service is about to end; SourceError,
+        RecordingError or ConfigurationError for a source that cannot be captured from."""
+        _check(plan)
         with self._lock:
             if self._closing:
                 raise BusyError("the service is about to end; start it again to capture")
@@ -66,6 +70,16 @@ class Captures:
         self.dismiss()
         for capture in self.all():
             capture.join(_CLOSE_S)
+
+
+def _check(plan: Plan) -> None:
+    """Refuse at once what would fail a moment later in a worker."""
+    sensor = open_source(plan.source).sensor
+    if sensor.intrinsics is None and plan.intrinsics is None and plan.source.startswith("replay:"):
+        raise ConfigurationError(
+            f"the focal length of {plan.source} is not known: give intrinsics (fx, fy, cx, cy) with the capture, "
+            "as `spiked serve --intrinsics`, or in the recording's sidecar"
+        )
 
 
 def unhurried(source: str) -> str:

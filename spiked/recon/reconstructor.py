@@ -1,5 +1,6 @@
 """Frames in, trajectory and scene out, at any time: the one object that the command line and the daemon hold."""
 
+import platform
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -375,7 +376,8 @@ class Reconstructor:
         odometry = self._odometry
         options = asdict(replace(self.options, poses=None)) | {"poses": self.options.poses is not None}
         return {
-            "spiked": release,
+            "versions": {"spiked": release, "python": platform.python_version()}
+            | {name: version(name) for name in ("numpy", "opencv-python-headless")},
             "sensor": {"width": self.sensor.width, "height": self.sensor.height, "frame_rate_hz": rate},
             "options": options,
             "frames": self._frames,
@@ -398,7 +400,7 @@ class Reconstructor:
             "steps": self._mapper.steps,
             "loss": self._mapper.loss,
             "psnr_of_views_over_seconds": [[round(s, 2), round(p, 2)] for s, p in self._curve],
-            "seconds": {k: round(s, 3) for k, s in self._spent.items()},
+            "seconds": {k: round(s, 3) for k, s in (self._spent | {"total": sum(self._spent.values())}).items()},
             "correction_deg": self._correction(),
         }
 

@@ -72,8 +72,16 @@ def guess(name: str, data: NDArray[np.uint8]) -> Format:
     or several fit.
     """
     tagged: Format = Flavour.B.value
-    if data.size % tagged.frame_bytes == 0 and tags_agree(data[: tagged.frame_bytes][None], 250, 50).all():
-        return tagged
+    if data.size >= tagged.frame_bytes:
+        head = data[: tagged.frame_bytes][None]
+        if tags_agree(head, 250, 50).all():
+            return tagged
+        last_row = data[tagged.frame_bytes - 2 : tagged.frame_bytes]
+        if data.size % tagged.frame_bytes == 0 and last_row.tobytes() == (249).to_bytes(2, "little"):
+            raise RecordingError(
+                f"{name}: this looks row-tagged 400x250, but the row numbers of frame 0 are not 0..249: the file is "
+                "damaged; cut the damaged frames off, or give its layout and geometry"
+            )
     if WIRE_MAGIC in data[: 4 * Flavour.C.value.frame_bytes].tobytes() and data.size % 12_500:
         raise RecordingError(f"{name}: this looks like {Flavour.C.value.name}, which `spiked convert` unpacks")
     fits: list[Format] = [f.value for f in Flavour if data.size % f.value.frame_bytes == 0 and f is not Flavour.B]

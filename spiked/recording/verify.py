@@ -68,7 +68,7 @@ def verify(
     rate = scan.spikes / (recording.frames * sensor.width * sensor.height)
 
     bad, degraded = list(recording.contradictions), list(recording.warnings)
-    if scan.wrong_tags and not bad:
+    if scan.wrong_tags:
         bad.append(f"{scan.wrong_tags} of {recording.frames} frames have wrong row numbers")
     if rate in (0.0, 1.0):
         bad.append("no pixel ever fires" if rate == 0 else "every pixel fires in every frame")

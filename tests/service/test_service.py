@@ -1,6 +1,8 @@
 """The daemon over HTTP, and what becomes of it when parts of it die."""
 
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -87,12 +89,27 @@ def test_a_token_is_asked_for_and_taken_in_three_ways(daemon: Callable[..., Any]
         assert browser.get(f"{one.address}api/v1/captures").status_code == 200
 
 
-def test_a_source_that_cannot_be_opened_fails_the_capture_with_its_reason(
-    daemon: Callable[..., Any], tmp_path: Path
-) -> None:
-    one = daemon("--device", f"replay:{tmp_path / 'none.dat'}")
-    wait_for(lambda: one_capture(one)["state"] == "failed", "the capture fails")
-    assert "none.dat" in one_capture(one)["reason"]
+@pytest.mark.parametrize("source", ["usb0", "foo:", "sim:?bogus=1", "sim:?pace=abc", "replay:none.dat"])
+def test_a_source_that_cannot_be_opened_is_refused_at_once(daemon: Callable[..., Any], source: str) -> None:
+    one = daemon()
+    answer = one.http.post("captures", json={"source": source})
+    assert answer.status_code == 422
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert source.partition("?")[0].removeprefix("replay:") in answer.json()["detail"]
+    assert one.http.get("captures").json() == []
+
+
+def test_serving_a_device_that_cannot_be_opened_ends_with_one_line(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "spiked_service", "serve", "--port", "0", "--runtime", str(tmp_path / "runtime")]
+    done = subprocess.run(
+        [*command, "--device", f"replay:{tmp_path / 'none.dat'}"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ") and "none.dat" in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_one_capture_at_a_time_and_the_account_of_frames(daemon: Callable[..., Any]) -> None:

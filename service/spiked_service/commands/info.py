@@ -14,7 +14,7 @@ _SAMPLED_FRAMES = 4096
 
 
 def info(
-    file: Annotated[Path, typer.Argument(help="A recording.")],
+    file: Annotated[Path, typer.Argument(help="A recording.", readable=False)],
     width: g.Width = None,
     height: g.Height = None,
     rate: g.Rate = None,

@@ -25,7 +25,7 @@ _FEED_SHARE = 0.3
 
 
 def reconstruct(
-    file: Annotated[Path, typer.Argument(help="A recording.")],
+    file: Annotated[Path, typer.Argument(help="A recording.", readable=False)],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; made if it is not there.")],
     poses: Annotated[Path | None, typer.Option(help="Known poses, a TUM file, camera-to-world.")] = None,
     seconds: Annotated[float | None, typer.Option(help="Stop after so long with what there is.", min=0.0)] = None,
@@ -80,7 +80,7 @@ def reconstruct(
 
 
 class _Interrupt:
-    """Set by the first Ctrl-C; the second one ends the program."""
+    """Set by the first Ctrl-C or SIGTERM; the second one ends the program."""
 
     def __init__(self) -> None:
         self._set = False
@@ -98,11 +98,12 @@ class _Interrupt:
 @contextmanager
 def _interruptible() -> Iterator[_Interrupt]:
     interrupt = _Interrupt()
-    before = signal.signal(signal.SIGINT, interrupt.handle)
+    before = {number: signal.signal(number, interrupt.handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield interrupt
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class _Display:

@@ -19,7 +19,7 @@ from spiked_service.images import ImageFormat, encode
 
 
 def render(
-    scene: Annotated[Path, typer.Argument(help="A 3DGS PLY.")],
+    scene: Annotated[Path, typer.Argument(help="A 3DGS PLY.", readable=False)],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures.")],
     poses: Annotated[Path, typer.Option(help="Where to look from, a TUM file, camera-to-world.")],
     count: Annotated[int, typer.Option(help="Pictures, spread evenly over the path.", min=1)] = 8,

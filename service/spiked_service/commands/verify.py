@@ -5,14 +5,15 @@ from typing import Annotated
 
 import typer
 
+from spiked.errors import RecordingError
 from spiked.recording import Verdict
 from spiked.recording import verify as verify_recording
 from spiked_service import geometry as g
-from spiked_service.console import output
+from spiked_service.console import output, report_error
 
 
 def verify(
-    files: Annotated[list[Path], typer.Argument(help="Recordings.")],
+    files: Annotated[list[Path], typer.Argument(help="Recordings.", readable=False)],
     width: g.Width = None,
     height: g.Height = None,
     rate: g.Rate = None,
@@ -21,26 +22,33 @@ def verify(
     flipped: g.Flipped = None,
     mosaic: g.Colours = None,
 ) -> None:
-    """Check recordings byte by byte: sizes, row numbers, sidecar, dead and stuck rows; exit code 1 if one is bad.
+    """Check recordings byte by byte: sizes, row numbers, sidecar, dead and stuck rows.
+
+    The exit code is 1 if a recording is bad, and 2 if a file is no recording at all; the others are still checked.
 
     Example: `spiked verify *.dat`
     """
-    bad = False
+    worst = 0
     for file in files:
-        found = verify_recording(
-            file,
-            width=width,
-            height=height,
-            frame_rate_hz=rate,
-            layout=layout,
-            bit_order=bit_order,
-            flipped=flipped,
-            mosaic=mosaic,
-        )
-        bad = bad or found.verdict is Verdict.BAD
+        try:
+            found = verify_recording(
+                file,
+                width=width,
+                height=height,
+                frame_rate_hz=rate,
+                layout=layout,
+                bit_order=bit_order,
+                flipped=flipped,
+                mosaic=mosaic,
+            )
+        except RecordingError as error:
+            report_error(error)
+            worst = 2
+            continue
+        worst = max(worst, int(found.verdict is Verdict.BAD))
         figures = f"{found.recording.frames} frames, {found.spikes} spikes, {found.spike_rate:.4f} a pixel and frame"
         output.print(f"{file}: {found.verdict}, {figures}", markup=False)
         for reason in found.reasons:
             output.print(f"  {reason}", markup=False)
-    if bad:
-        raise typer.Exit(1)
+    if worst:
+        raise typer.Exit(worst)

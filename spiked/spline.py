@@ -53,7 +53,7 @@ class Spline:
         guess = _interpolate_linear(t, centres, knots)
         smooth = 1e-4 * np.diff(np.eye(count), 2, axis=0)
         lhs = np.vstack([basis, smooth])
-        rhs = np.vstack([centres - basis @ guess, -smooth @ guess * 0])
+        rhs = np.vstack([centres - basis @ guess, np.zeros((count - 2, 3))])
         spline.centres = guess + np.linalg.lstsq(lhs, rhs, rcond=None)[0]
         for _ in range(3):
             error = log_so3(rotations @ spline.poses(t)[0].swapaxes(-1, -2))

@@ -33,7 +33,7 @@ class Sweep:
 
 
 def neighbours(centres: Array, forward: Array, reference: int, count: int) -> NDArray[np.int64]:
-    """The views with about the right baseline: spread from half of the widest down, seen from `reference`.
+    """The views with about the right baseline: spread from 0.3 of the widest up, seen from `reference`.
 
     centres [V, 3]; forward [V, 3] viewing directions, to leave out views that look elsewhere.
     """

@@ -67,6 +67,14 @@ class Scene:
         body = np.concatenate([*columns, self.log_scales, quats], 1).astype("<f4")
         return "\n".join(head).encode() + body.tobytes()
 
+    def sample(self, count: int) -> "Scene":
+        """At most `count` Gaussians in their order: a fixed sample, which stays much the same while the scene grows."""
+        if len(self) <= count:
+            return self
+        # Multiples of the golden ratio spread evenly, so that the lowest ones are spread evenly over the rows too.
+        lot = (np.arange(len(self), dtype=np.uint64) * np.uint64(2654435769)) & np.uint64(0xFFFFFFFF)
+        return self.select(np.sort(np.argpartition(lot, count)[:count]))
+
     @classmethod
     def read_ply(cls, path: Path | str) -> "Scene":
         """Read a 3DGS PLY. View-dependent colour (f_rest) is left out; a `radiance` comment written by us is undone;

@@ -50,8 +50,10 @@ class Message:
         payload: BaseModel,
         capture_id: str | None = None,
         reconstruction_id: str | None = None,
+        topic_seq: int = 0,
     ) -> None:
         self.seq = seq
+        self.topic_seq = topic_seq
         self.topic = topic
         self.at = at
         self.payload = payload
@@ -67,12 +69,17 @@ class Message:
     @cached_property
     def packed(self) -> bytes:
         """As it goes over ZeroMQ: msgpack, the same fields, pictures as bytes."""
-        return pack({**self._head(), "data": self.payload.model_dump()})
+        return pack(self.plain())
+
+    def plain(self) -> dict[str, Any]:
+        """The message as `pack` takes it."""
+        return {**self._head(), "data": self.payload.model_dump()}
 
     def _head(self) -> dict[str, Any]:
         return {
             "seq": self.seq,
             "topic": self.topic,
+            "topic_seq": self.topic_seq,
             "at": _text(self.at),
             "capture_id": self.capture_id,
             "reconstruction_id": self.reconstruction_id,
@@ -210,9 +217,11 @@ class Bus:
     def __init__(self, history: int = _HISTORY) -> None:
         self._lock = threading.Lock()
         self._seq = 0
+        self._topic_seqs: Counter[Topic] = Counter()
         self._history: deque[Message] = deque(maxlen=history)
         self._states: dict[Topic, OrderedDict[str | None, Message]] = {topic: OrderedDict() for topic in _WITH_STATE}
         self._subscriptions: tuple[Subscription, ...] = ()
+        self._dropped: Counter[Topic] = Counter()
 
     @property
     def seq(self) -> int:
@@ -230,7 +239,9 @@ class Bus:
         assert topic in PUBLISHED, "only a subscription says what it has lost"
         with self._lock:
             self._seq += 1
-            message = Message(self._seq, topic, datetime.now(UTC), payload, capture_id, reconstruction_id)
+            self._topic_seqs[topic] += 1
+            now, number = datetime.now(UTC), self._topic_seqs[topic]
+            message = Message(self._seq, topic, now, payload, capture_id, reconstruction_id, number)
             if topic is not Topic.PREVIEW:
                 self._history.append(message)
             if topic in _WITH_STATE:
@@ -268,6 +279,19 @@ class Bus:
         """How many subscriptions there are."""
         return len(self._subscriptions)
 
+    def published(self) -> dict[Topic, int]:
+        """Messages since the start, by topic."""
+        with self._lock:
+            return dict(self._topic_seqs)
+
+    def dropped(self) -> dict[Topic, int]:
+        """Messages that listeners lost by being slow since the start, by topic."""
+        with self._lock:
+            total = self._dropped.copy()
+            for subscription in self._subscriptions:
+                total.update(subscription.lost)
+            return dict(total)
+
     def _missed(self, since: int) -> LostPayload | None:
         if since > self._seq:
             return LostPayload(why=Why.RESTARTED, messages=None, by_topic={}, first_seq=None, last_seq=None)
@@ -291,7 +315,9 @@ class Bus:
 
     def _forget(self, subscription: Subscription) -> None:
         with self._lock:
-            self._subscriptions = tuple(one for one in self._subscriptions if one is not subscription)
+            if subscription in self._subscriptions:
+                self._subscriptions = tuple(one for one in self._subscriptions if one is not subscription)
+                self._dropped.update(subscription.lost)
 
 
 def _set_soon(loop: asyncio.AbstractEventLoop, arrived: asyncio.Event) -> None:

@@ -39,7 +39,7 @@ def test_a_message_reads_the_same_in_json_and_msgpack() -> None:
     message = listener.take()
     assert message is not None
     as_json, as_packed = json.loads(message.json), msgpack.unpackb(message.packed)
-    assert list(as_json) == ["seq", "topic", "at", "capture_id", "reconstruction_id", "data"]
+    assert list(as_json) == ["seq", "topic", "topic_seq", "at", "capture_id", "reconstruction_id", "data"]
     assert as_json["at"].endswith("Z")
     assert as_json["data"].pop("image") == "AP8="
     assert as_packed["data"].pop("image") == b"\x00\xff"

@@ -10,6 +10,7 @@ from starlette.exceptions import HTTPException
 
 from spiked.errors import SpikedError
 from spiked_service.captures import BusyError, UnknownCaptureError
+from spiked_service.limits import OverloadedError
 
 
 class Problem(BaseModel):
@@ -29,6 +30,7 @@ _STATUS: dict[type[SpikedError], HTTPStatus] = {
     UnknownCaptureError: HTTPStatus.NOT_FOUND,
     BusyError: HTTPStatus.CONFLICT,
     NotReadyError: HTTPStatus.NOT_FOUND,
+    OverloadedError: HTTPStatus.SERVICE_UNAVAILABLE,
 }
 
 

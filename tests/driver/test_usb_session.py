@@ -22,7 +22,7 @@ def configuration(clock: int = 0, mode: int = 0) -> bytes:
 
 def test_a_read_request_is_the_twenty_bytes_that_the_bridge_expects() -> None:
     assert READ_REQUEST_BYTES == 20
-    expected = "05000000" "82" "01" "0000" "00000400" "00000000" "00000000"
+    expected = "0500000082010000000004000000000000000000"
     assert read_request(5, 262_144).hex() == expected
 
 

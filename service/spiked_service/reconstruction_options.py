@@ -1,0 +1,37 @@
+"""What can be chosen about a reconstruction, as it goes over HTTP and into workers; its JSON schema describes it."""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from spiked.recon import Options
+
+
+class ReconstructionOptions(BaseModel):
+    """A reconstruction's options; the defaults suit a hand-held camera."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", json_schema_extra={"examples": [{"steps": 4000, "seed": 0}]})
+
+    steps: int = Field(
+        default=4000, ge=0, le=200_000, description="Gradient steps of the refinement after the last frame."
+    )
+    seed: int = Field(default=0, ge=0, le=2**32 - 1, description="Same input, options and seed: same result.")
+    window_frames: int | None = Field(
+        default=None, ge=2, le=256, description="Frames of a view; follows the motion (8 to 64) if not given."
+    )
+    threads: int | None = Field(
+        default=None, ge=1, le=256, description="Threads of the rasteriser; all cores if not given."
+    )
+    max_views: int = Field(
+        default=400, ge=20, le=5000, description="Views kept for mapping; beyond it older ones thin out."
+    )
+    refine_poses: bool = Field(default=True, description="Whether the map corrects the trajectory.")
+
+    def options(self) -> Options:
+        """The same for the library."""
+        return Options(
+            window_frames=self.window_frames,
+            steps=self.steps,
+            seed=self.seed,
+            threads=self.threads,
+            max_views=self.max_views,
+            refine_poses=self.refine_poses,
+        )

@@ -1,0 +1,1 @@
+"""What the service keeps: files in one data folder, and a catalogue of what they are."""

@@ -1,0 +1,285 @@
+"""The catalogue: one SQLite file in WAL mode, one writer at a time, readers that never wait for it."""
+
+import sqlite3
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+from pydantic import TypeAdapter
+
+from spiked.errors import SpikedError
+from spiked_service.store.rows import CaptureRow, CaptureState, JobState, ReconstructionRow, UploadRow, VersionRow
+
+_WAIT_S = 5.0
+
+_MIGRATIONS = (
+    """
+    CREATE TABLE captures (
+        id TEXT PRIMARY KEY, document TEXT NOT NULL,
+        state TEXT GENERATED ALWAYS AS (json_extract(document, '$.state')) VIRTUAL,
+        deleted_at TEXT GENERATED ALWAYS AS (json_extract(document, '$.deleted_at')) VIRTUAL
+    ) WITHOUT ROWID;
+    CREATE INDEX captures_by_state ON captures (state);
+    CREATE TABLE reconstructions (
+        id TEXT PRIMARY KEY, document TEXT NOT NULL,
+        capture_id TEXT GENERATED ALWAYS AS (json_extract(document, '$.capture_id')) VIRTUAL,
+        state TEXT GENERATED ALWAYS AS (json_extract(document, '$.state')) VIRTUAL,
+        priority INTEGER GENERATED ALWAYS AS (json_extract(document, '$.priority')) VIRTUAL
+    ) WITHOUT ROWID;
+    CREATE INDEX reconstructions_by_capture ON reconstructions (capture_id);
+    CREATE INDEX reconstructions_by_state ON reconstructions (state, priority);
+    CREATE TABLE uploads (id TEXT PRIMARY KEY, document TEXT NOT NULL) WITHOUT ROWID;
+    CREATE TABLE versions (
+        reconstruction_id TEXT NOT NULL, version INTEGER NOT NULL, document TEXT NOT NULL,
+        PRIMARY KEY (reconstruction_id, version)
+    ) WITHOUT ROWID;
+    """,
+)
+"""Script n brings a catalogue from version n to n + 1; the file's user_version says where it stands."""
+
+
+class StoreError(SpikedError):
+    """The catalogue cannot be read or written: the disk is full, broken or read-only."""
+
+
+class UnknownIdError(SpikedError):
+    """There is nothing with this id."""
+
+
+class Row(Protocol):
+    """What has an id of its own."""
+
+    @property
+    def id(self) -> str:
+        """A UUID version 7."""
+        ...
+
+
+_Row = TypeVar("_Row", bound=Row)
+
+
+@dataclass(frozen=True)
+class Page(Generic[_Row]):
+    """Some rows, newest first, and where the next page begins."""
+
+    items: list[_Row]
+    next_cursor: str | None
+    """None: there are no more."""
+
+
+class Catalogue:
+    """Rows by id. Every method may be called from any thread, raises StoreError, and is one short transaction.
+
+    A row is kept as one JSON document; columns made from it serve the queries. `synchronous = NORMAL`: a kill loses
+    nothing, a power cut at most the last moments, and what lies on disk then is put right when the service starts.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._local = threading.local()
+        self._writing = threading.RLock()
+        with _told(path):
+            self._writer = _connect(path)
+            self._writer.execute("PRAGMA journal_mode = WAL")
+            self._writer.execute("PRAGMA synchronous = NORMAL")
+        self._migrate()
+        self.captures = Table(self, "captures", CaptureRow)
+        self.reconstructions = Table(self, "reconstructions", ReconstructionRow)
+        self.uploads = Table(self, "uploads", UploadRow)
+
+    @contextmanager
+    def transaction(self) -> Iterator[sqlite3.Connection]:
+        """The writer, alone; committed at the end, rolled back by an exception. May be nested in one thread."""
+        with self._writing, _told(self._path):
+            if self._writer.in_transaction:
+                yield self._writer
+                return
+            self._writer.execute("BEGIN IMMEDIATE")
+            try:
+                yield self._writer
+            except BaseException:
+                # A full disk may have rolled back by itself.
+                with suppress(sqlite3.OperationalError):
+                    self._writer.execute("ROLLBACK")
+                raise
+            self._writer.execute("COMMIT")
+
+    def read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+        """Rows of a query, by a connection that only reads and belongs to this thread."""
+        with _told(self._path):
+            connection = getattr(self._local, "connection", None)
+            if connection is None:
+                connection = self._local.connection = _connect(self._path)
+                connection.execute("PRAGMA query_only = ON")
+            return list(connection.execute(query, values).fetchall())
+
+    def capture_page(
+        self,
+        limit: int = 50,
+        cursor: str | None = None,
+        query: str | None = None,
+        state: CaptureState | None = None,
+        deleted: bool = False,
+    ) -> Page[CaptureRow]:
+        """Captures, newest first; `query` is looked for in name, notes and source; deleted ones only if asked for."""
+        where, values = ["deleted_at IS NOT NULL" if deleted else "deleted_at IS NULL"], list[Any]()
+        if state is not None:
+            where.append("state = ?")
+            values.append(str(state))
+        if query:
+            fields = ("$.name", "$.notes", "$.plan.source")
+            where.append("(" + " OR ".join(f"instr(lower(json_extract(document, '{f}')), ?)" for f in fields) + ")")
+            values += [query.lower()] * len(fields)
+        return self.captures.page(where, values, limit, cursor)
+
+    def reconstruction_page(
+        self, limit: int = 50, cursor: str | None = None, capture_id: str | None = None, state: JobState | None = None
+    ) -> Page[ReconstructionRow]:
+        """Reconstructions, newest first."""
+        where, values = list[str](), list[Any]()
+        if capture_id is not None:
+            where.append("capture_id = ?")
+            values.append(capture_id)
+        if state is not None:
+            where.append("state = ?")
+            values.append(str(state))
+        return self.reconstructions.page(where, values, limit, cursor)
+
+    def reconstructions_of(self, capture_id: str) -> list[ReconstructionRow]:
+        """Oldest first."""
+        return self.reconstructions.where("capture_id = ? ORDER BY id", (capture_id,))
+
+    def put_version(self, row: VersionRow, kept: set[int]) -> None:
+        """Note a version, and forget those that are not kept."""
+        with self.transaction() as connection:
+            connection.execute(
+                "INSERT OR REPLACE INTO versions VALUES (?, ?, ?)",
+                (row.reconstruction_id, row.version, _VERSION.dump_json(row).decode()),
+            )
+            for (number,) in connection.execute(
+                "SELECT version FROM versions WHERE reconstruction_id = ?", (row.reconstruction_id,)
+            ).fetchall():
+                if number not in kept:
+                    connection.execute(
+                        "DELETE FROM versions WHERE reconstruction_id = ? AND version = ?",
+                        (row.reconstruction_id, number),
+                    )
+
+    def versions(self, reconstruction_id: str) -> list[VersionRow]:
+        """The versions of a reconstruction that are still there, oldest first."""
+        found = self.read(
+            "SELECT document FROM versions WHERE reconstruction_id = ? ORDER BY version", (reconstruction_id,)
+        )
+        return [_VERSION.validate_json(document) for (document,) in found]
+
+    def forget_versions(self, reconstruction_id: str) -> None:
+        """A reconstruction begins anew, or goes."""
+        with self.transaction() as connection:
+            connection.execute("DELETE FROM versions WHERE reconstruction_id = ?", (reconstruction_id,))
+
+    def close(self) -> None:
+        """Write the log back into the file and close it; readers of other threads close with their threads."""
+        with self._writing:
+            with suppress(sqlite3.Error):
+                self._writer.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            self._writer.close()
+
+    def _migrate(self) -> None:
+        with self.transaction() as connection:
+            (version,) = connection.execute("PRAGMA user_version").fetchone()
+            if version > len(_MIGRATIONS):
+                raise StoreError(
+                    f"{self._path} was written by a newer spiked (version {version} of the catalogue, this one knows "
+                    f"{len(_MIGRATIONS)}): use that one, or another data folder"
+                )
+            for number in range(version, len(_MIGRATIONS)):
+                for statement in _MIGRATIONS[number].split(";"):
+                    connection.execute(statement)
+                connection.execute(f"PRAGMA user_version = {number + 1}")
+
+
+class Table(Generic[_Row]):
+    """Rows of one kind, by id."""
+
+    def __init__(self, catalogue: Catalogue, name: str, kind: type[_Row]) -> None:
+        self._catalogue = catalogue
+        self._name = name
+        self._kind: TypeAdapter[_Row] = TypeAdapter(kind)
+
+    def put(self, row: _Row) -> None:
+        """Insert a row, or replace the one with its id."""
+        with self._catalogue.transaction() as connection:
+            connection.execute(
+                f"INSERT OR REPLACE INTO {self._name} (id, document) VALUES (?, ?)",
+                (row.id, self._kind.dump_json(row).decode()),
+            )
+
+    def find(self, row_id: str) -> _Row | None:
+        """The row, or None."""
+        found = self._catalogue.read(f"SELECT document FROM {self._name} WHERE id = ?", (row_id,))
+        return self._kind.validate_json(found[0][0]) if found else None
+
+    def get(self, row_id: str) -> _Row:
+        """The row. Raises UnknownIdError."""
+        row = self.find(row_id)
+        if row is None:
+            raise UnknownIdError(f"there is no {self._name[:-1]} {row_id}; GET {self._name} lists them")
+        return row
+
+    def change(self, row_id: str, change: Callable[[_Row], _Row]) -> _Row:
+        """Replace a row by what `change` makes of it, with no other writer in between. Raises UnknownIdError."""
+        with self._catalogue.transaction():
+            before = self.get_for_change(row_id)
+            after = change(before)
+            if after != before:
+                self.put(after)
+            return after
+
+    def set(self, row_id: str, **fields: Any) -> _Row:
+        """Replace fields of a row. Raises UnknownIdError."""
+        return self.change(row_id, lambda row: replace(row, **fields))  # type: ignore[type-var]
+
+    def get_for_change(self, row_id: str) -> _Row:
+        """The row as the open transaction sees it. Raises UnknownIdError."""
+        with self._catalogue.transaction() as connection:
+            found = connection.execute(f"SELECT document FROM {self._name} WHERE id = ?", (row_id,)).fetchone()
+        if found is None:
+            raise UnknownIdError(f"there is no {self._name[:-1]} {row_id}; GET {self._name} lists them")
+        return self._kind.validate_json(found[0])
+
+    def remove(self, row_id: str) -> None:
+        """Forget a row; fine if it is gone."""
+        with self._catalogue.transaction() as connection:
+            connection.execute(f"DELETE FROM {self._name} WHERE id = ?", (row_id,))
+
+    def where(self, condition: str = "1", values: tuple[Any, ...] = ()) -> list[_Row]:
+        """Rows that fulfil an SQL condition, which may end in an order."""
+        found = self._catalogue.read(f"SELECT document FROM {self._name} WHERE {condition}", values)
+        return [self._kind.validate_json(document) for (document,) in found]
+
+    def page(self, where: list[str], values: list[Any], limit: int, cursor: str | None) -> Page[_Row]:
+        """Rows that fulfil all conditions, newest first, from before the cursor."""
+        if cursor is not None:
+            where, values = [*where, "id < ?"], [*values, cursor]
+        rows = self.where(f"{' AND '.join(where) or '1'} ORDER BY id DESC LIMIT ?", (*values, limit + 1))
+        return Page(rows[:limit], rows[limit - 1].id if len(rows) > limit else None)
+
+
+_VERSION = TypeAdapter(VersionRow)
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    return sqlite3.connect(path, timeout=_WAIT_S, isolation_level=None, check_same_thread=False)
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except sqlite3.DatabaseError as error:
+        raise StoreError(
+            f"the catalogue {path} cannot be used: {error}; look whether its disk is full or broken"
+        ) from error

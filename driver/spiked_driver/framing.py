@@ -109,10 +109,13 @@ class UsbFraming(Framing):
         self._usb = UsbParser()
         super().__init__(self._usb)
 
-    def restart(self, lost: int) -> Gap | None:
-        """The camera was away for `lost` frames by the host's clock, and may count anew. Unread bytes are dropped."""
-        item = event_item(self._usb.restart(lost))
-        return item if isinstance(item, Gap) else None
+    def resume(self, lost: int, tolerance: int, cause: Cause) -> None:
+        """The stream broke off, and the camera may count anew: half frames are dropped, a gap follows with that cause.
+
+        By the host's clock `lost` frames are missing; the camera's own count is taken instead if it runs on and differs
+        by at most `tolerance`. Called again before a frame came, the later call counts.
+        """
+        self._usb.resume(lost, tolerance, Kind.DEVICE_GAP if cause is Cause.DEVICE else Kind.HOST_GAP)
 
 
 def event_item(event: Event) -> Chunk | Gap | None:

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from spiked_driver.framing import USB_COMPACT_BYTES, USB_FRAME_BYTES, Framing, UsbFraming, benchmark_usb, encode_usb
+from spiked_driver.source import Chunk
 
 from spiked.ring import Cause, Gap
 
@@ -198,16 +199,64 @@ def test_a_camera_that_counts_anew_goes_on_after_a_gap() -> None:
     np.testing.assert_array_equal(taken.frames[5], FRAMES[4])
 
 
-def test_a_restart_drops_half_a_frame_and_counts_what_the_clock_says() -> None:
+def resumed(lost: int, tolerance: int, wire: NDArray[np.uint8], cause: Cause = Cause.DEVICE) -> tuple[Gap, Chunk]:
+    """What follows two and a half frames of FRAMES after a break: the gap and the frames."""
     framing, view = UsbFraming(), np.zeros((SENT, USB_COMPACT_BYTES), np.uint8)
     framing.feed(encode_usb(FRAMES[:3]).reshape(-1)[:-100])
-    framing.read_into(view)
-    assert framing.restart(500) == Gap(2, 500, Cause.DEVICE)
-    framing.feed(encode_usb(FRAMES[3:], lines=123).reshape(-1))
-    item = framing.read_into(view)
-    assert item is not None
-    assert item.first == 502
-    np.testing.assert_array_equal(view[: SENT - 4], FRAMES[3 : SENT - 1])
+    assert framing.read_into(view) == Chunk(0, 2)
+    framing.resume(1, tolerance, Cause.USB)
+    framing.resume(lost, tolerance, cause)
+    framing.feed(wire.reshape(-1))
+    gap, chunk = framing.read_into(view), framing.read_into(view)
+    assert isinstance(gap, Gap)
+    assert isinstance(chunk, Chunk)
+    assert gap.first + gap.count == chunk.first
+    np.testing.assert_array_equal(view[: chunk.frames], FRAMES[-chunk.frames - 1 : -1])
+    assert framing.counters.skipped_bytes == USB_FRAME_BYTES - 100
+    return gap, chunk
+
+
+def test_after_a_break_the_cameras_own_count_is_taken_if_it_runs_on() -> None:
+    wire = encode_usb(FRAMES[6:], first=506)[:-1]
+    wire = np.concatenate([wire.reshape(-1), encode_usb(FRAMES[-1:], first=511).reshape(-1)[:16]])
+    assert resumed(500, 20, wire)[0] == Gap(2, 504, Cause.DEVICE)
+    assert resumed(500, 20, wire, Cause.USB)[0] == Gap(2, 504, Cause.USB)
+
+
+@pytest.mark.parametrize(("first", "lines"), [(506, 77), (900, 0), (0, 0)], ids=["anew", "too far", "from zero"])
+def test_after_a_break_a_camera_that_counts_anew_has_lost_what_the_clock_says(first: int, lines: int) -> None:
+    wire = encode_usb(FRAMES[6:], first=first, lines=lines).reshape(-1)[: 5 * USB_FRAME_BYTES + 16]
+    assert resumed(500, 20, wire)[0] == Gap(2, 500, Cause.DEVICE)
+
+
+def test_a_break_without_a_loss_leaves_no_gap() -> None:
+    framing, view, wire = UsbFraming(), np.zeros((SENT, USB_COMPACT_BYTES), np.uint8), encode_usb(FRAMES)
+    framing.feed(wire[:2].reshape(-1))
+    assert framing.read_into(view) == Chunk(0, 2)
+    framing.resume(3, 100, Cause.USB)
+    framing.feed(wire[2:].reshape(-1))
+    assert framing.read_into(view) == Chunk(2, SENT - 2)
+
+
+def test_a_break_before_the_first_frame_is_no_gap() -> None:
+    framing, view = UsbFraming(), np.zeros((SENT, USB_COMPACT_BYTES), np.uint8)
+    framing.feed(encode_usb(FRAMES).reshape(-1)[:5000])
+    framing.resume(3, 100, Cause.USB)
+    framing.feed(encode_usb(FRAMES[:3]).reshape(-1))
+    assert framing.read_into(view) == Chunk(0, 3)
+
+
+def test_a_camera_that_counts_anew_from_below_is_not_dropped_for_ever_as_late() -> None:
+    """Both its counters at zero again agree with each other as before, and look like very old frames."""
+    count = 1010
+    frames = np.repeat(FRAMES[:1], count, axis=0)
+    framing = UsbFraming()
+    wire = np.concatenate([encode_usb(frames[:4], first=5000).reshape(-1), encode_usb(frames).reshape(-1)])
+    taken = take(framing, wire.tobytes(), [])
+    assert taken.gaps == [Gap(4, 1000, Cause.DEVICE)]
+    assert len(taken.frames) == 4 + count - 1000
+    assert framing.counters.restarts == 1
+    assert framing.counters.duplicates == 0
 
 
 def test_the_structure_of_the_real_sample() -> None:

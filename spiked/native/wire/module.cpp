@@ -69,9 +69,10 @@ NB_MODULE(_wire, m) {
         .def_ro("skipped", &Counters::skipped)
         .def_ro("resyncs", &Counters::resyncs)
         .def_ro("restarts", &Counters::restarts);
-    bind<UsbParser>(m, "UsbParser").def("restart", [](Holder<UsbParser>& held, int64_t lost) {
-        return held.parser.restart(lost);
-    });
+    bind<UsbParser>(m, "UsbParser")
+        .def("resume", [](Holder<UsbParser>& held, int64_t lost, int64_t tolerance, Kind kind) {
+            held.parser.resume(lost, tolerance, kind);
+        });
     bind<PcieParser>(m, "PcieParser");
 }
 

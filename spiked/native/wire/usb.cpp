@@ -1,5 +1,7 @@
 #include "usb.hpp"
 
+#include <cstdlib>
+
 namespace spiked::wire {
 namespace {
 
@@ -42,15 +44,16 @@ void UsbParser::feed(const uint8_t* chunk, size_t bytes) {
 
 void UsbParser::mark_loss() { contiguous_ = false; }
 
-Event UsbParser::restart(int64_t lost) {
+void UsbParser::resume(int64_t lost, int64_t tolerance, Kind kind) {
     counters_.skipped += stream_.available();
     stream_.keep();
     stream_.advance(stream_.available());
-    ++counters_.restarts;
+    if (lock_)
+        broken_ = Break{*lock_, lost, tolerance, kind};
+    else if (broken_)
+        broken_ = Break{broken_->former, lost, tolerance, kind};
     lock_.reset();
     contiguous_ = true;
-    lost = std::max(lost, seen_index_ + 1 - next_index_);
-    return lost > 0 ? lose(lost, Kind::device_gap) : Event{};
 }
 
 Event UsbParser::next(uint8_t* out, size_t capacity) {
@@ -103,7 +106,23 @@ UsbParser::Step UsbParser::look(Event& gap) {
     }
     if (!sound || (finished_ && available < frame_bytes)) return damaged(p, available);
     if (available < frame_bytes) return Step::starve;
-    if (*ahead >= 0) return Step::frame;
+    if (*ahead < 0) return late(*ahead);
+    late_run_ = 0;
+    return Step::frame;
+}
+
+UsbParser::Step UsbParser::late(int64_t ahead) {
+    late_run_ = late_run_ && ahead == late_ahead_ + 1 ? late_run_ + 1 : 1;
+    late_ahead_ = ahead;
+    if (late_run_ > anew_frames) {
+        ++counters_.restarts;
+        counters_.duplicates -= anew_frames;
+        counters_.skipped += anew_frames * frame_bytes;
+        lock_->expected += static_cast<uint32_t>(ahead) * static_cast<uint32_t>(rows);
+        go_on_after(anew_frames);
+        contiguous_ = true;
+        return Step::skip;
+    }
     ++counters_.duplicates;
     stream_.advance(frame_bytes);
     return Step::skip;
@@ -115,7 +134,7 @@ UsbParser::Step UsbParser::look_for_lock(const uint8_t* p, size_t available) {
     const bool whole = available >= frame_bytes;
     if (available < frame_bytes + header_bytes) {
         if (!finished_) return Step::starve;
-        if (!whole || lock_) return damaged(p, available);
+        if (!whole || lock_ || broken_) return damaged(p, available);
         lock_on(p);
         return Step::frame;
     }
@@ -126,12 +145,36 @@ UsbParser::Step UsbParser::look_for_lock(const uint8_t* p, size_t available) {
     if (!confirmed) return damaged(p, available);
     const bool again = lock_.has_value();
     lock_on(p);
+    if (broken_) {
+        come_back(*broken_);
+        return Step::skip;
+    }
     if (!again) return Step::frame;
     // The camera began anew without being told to. How long it was away is not to be seen; it was away.
     ++counters_.restarts;
-    lock_->expected -= rows * static_cast<uint32_t>(std::max<int64_t>(1, seen_index_ + 1 - next_index_));
+    go_on_after(1);
     contiguous_ = true;
     return Step::skip;
+}
+
+void UsbParser::come_back(const Break& broken) {
+    const bool same = broken.former.word1 == lock_->word1 && broken.former.offset == lock_->offset;
+    const auto ahead = same ? frames_between(broken.former.expected, lock_->expected) : std::nullopt;
+    if (ahead && *ahead >= 0 && std::abs(*ahead - broken.lost) <= broken.tolerance) {
+        lock_->expected = broken.former.expected;
+    } else {
+        ++counters_.restarts;
+        go_on_after(std::max<int64_t>(1, broken.lost));
+    }
+    contiguous_ = broken.kind == Kind::device_gap;
+    broken_.reset();
+}
+
+// The frame that the lock now expects comes after so many lost ones, and after all whose header was seen.
+void UsbParser::go_on_after(int64_t lost) {
+    lost = std::max(lost, seen_index_ + 1 - next_index_);
+    lock_->expected -= static_cast<uint32_t>(lost) * static_cast<uint32_t>(rows);
+    late_run_ = 0;
 }
 
 // Moves on to the next place where a header may begin. Damage may be of any length, so every byte is such a place; the

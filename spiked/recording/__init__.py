@@ -1,24 +1,36 @@
 """Recordings: raw `.dat` files read by memory map, the sidecars that say what they hold, writing and checking them."""
 
+from spiked.recording.durability import LIVE, PLAIN, Durability, Sync
 from spiked.recording.geometry import Flavour, Origin, OriginKind
+from spiked.recording.index import Index, index_path, read_index
 from spiked.recording.reader import Recording, open_recording
+from spiked.recording.recover import Recovered, recover
 from spiked.recording.sidecar import ClockPair, Gap, Sidecar, read_sidecar, sidecar_path, write_sidecar
 from spiked.recording.verify import Verdict, Verification, verify
 from spiked.recording.writer import RecordingWriter
 
 __all__ = [
+    "LIVE",
+    "PLAIN",
     "ClockPair",
+    "Durability",
     "Flavour",
     "Gap",
+    "Index",
     "Origin",
     "OriginKind",
     "Recording",
     "RecordingWriter",
+    "Recovered",
     "Sidecar",
+    "Sync",
     "Verdict",
     "Verification",
+    "index_path",
     "open_recording",
+    "read_index",
     "read_sidecar",
+    "recover",
     "sidecar_path",
     "verify",
     "write_sidecar",

@@ -10,6 +10,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from spiked.errors import ConfigurationError, RecordingError
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
 
+RESERVED_BYTES = 256 << 10
+"""Enough for some thousand losses."""
+
 
 class _Strict(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -60,6 +63,8 @@ class Sidecar(BaseModel):
     pixel_centre: float = Field(0.5, ge=0, le=0.5)
     """Where the intrinsics put the centre of the first pixel."""
     note: str = ""
+    first_frame: int = Field(default=0, ge=0)
+    """Index in the capture of the file's first frame."""
     gaps: tuple[Gap, ...] = ()
     clock: tuple[ClockPair, ...] = ()
     calibration: str | None = None
@@ -131,12 +136,25 @@ def _first_problem(error: ValidationError) -> str:
 
 def write_sidecar(path: Path, sidecar: Sidecar) -> None:
     """Write a sidecar so that after a crash there is the old one or the new one, whole. Raises OSError."""
-    temporary = path.with_name(path.name + ".part")
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(sidecar.model_dump_json(indent=1))
+    temporary = _temporary(path)
+    content = sidecar.model_dump_json(indent=1).encode()
+    # Into the reserved space if there is some: opening it anew would give that back first.
+    with temporary.open("r+b" if temporary.exists() else "wb") as file:
+        file.write(content)
+        file.truncate()
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)
+
+
+def reserve_sidecar(path: Path) -> None:
+    """Take the space that the next `write_sidecar` needs, so that it succeeds on a full disk. Raises OSError."""
+    with _temporary(path).open("wb") as file:
+        os.posix_fallocate(file.fileno(), 0, RESERVED_BYTES)
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(path.name + ".part")
 
 
 class SpikeCvConfig(BaseModel):

@@ -8,8 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from spiked.errors import RecordingError
 from spiked.recording.geometry import tags_agree
+from spiked.recording.index import index_path, read_index
 from spiked.recording.reader import Given, Recording, open_unchecked
+from spiked.recording.recover import damaged_blocks
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic
 
 _CHUNK_BYTES = 4 << 20
@@ -74,6 +77,7 @@ def verify(
         bad.append("no pixel ever fires" if rate == 0 else "every pixel fires in every frame")
     elif scan.dead_rows or scan.stuck_rows:
         degraded += _rows("never fire", scan.dead_rows) + _rows("always fire", scan.stuck_rows)
+    degraded += _index_problems(recording)
     if recording.gaps:
         lost = sum(gap.count for gap in recording.gaps)
         degraded.append(f"{lost} frames were lost in {len(recording.gaps)} gaps")
@@ -88,6 +92,26 @@ def verify(
         scan.dead_rows,
         scan.stuck_rows,
     )
+
+
+def _index_problems(recording: Recording) -> list[str]:
+    """What the checksums say, where the recording has an index."""
+    if not index_path(recording.path).exists():
+        return []
+    try:
+        index = read_index(index_path(recording.path))
+        damaged = damaged_blocks(recording.path, index)
+    except RecordingError as error:
+        return [str(error)]
+    problems = []
+    if damaged:
+        lost = sum(block.count for block in damaged)
+        problems.append(f"{lost} frames are not as they were written, the first at frame {damaged[0].first}")
+    if index.damaged_bytes:
+        problems.append(f"the last {index.damaged_bytes} bytes of its index are damaged")
+    if index.frames != recording.frames:
+        problems.append(f"its index knows {index.frames} frames, the file has {recording.frames}")
+    return problems
 
 
 def _rows(what: str, rows: tuple[int, ...]) -> list[str]:

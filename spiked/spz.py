@@ -6,8 +6,9 @@ forward): positions and rotations are turned by 180 degrees about x, which is it
 
 What is stored is rounded, and no further from the scene than these bounds (`tests/test_spz.py` holds them):
 positions `position_step(scene) / 2`; opacities 1/510; logarithms of scales 1/32, and only -10 to 5.94 can be stored;
-colours 0.5 / 255 / 0.15 * C0 = 0.0037 of white, and only -0.44 to 1.44 of white can be stored; rotations 0.3
-degrees (version 3), or 0.8 degrees divided by the cosine of half their angle (version 2). View-dependent colour is left out on reading; we write none.
+colours 0.5 / 255 / 0.15 * C0 = 0.0037 of white, and only -0.44 to 1.44 of white can be stored; rotations 0.3 degrees
+(version 3), or 0.8 degrees divided by the cosine of half their angle (version 2). View-dependent colour is left out on
+reading; we write none.
 """
 
 import gzip
@@ -90,7 +91,7 @@ def decode(raw: bytes, white: float = 1.0) -> Scene:
     Raises SceneError for anything that is no such file, one cut short, and one that grows beyond what its header says.
     """
     header, body = _inflate(raw)
-    magic, version, count, degree, bits, _, _ = header
+    magic, version, count, _, bits, _, _ = header
     if magic != _MAGIC:
         raise SceneError("this is a gzip file, but not an SPZ scene: its first bytes are not NGSP")
     if version not in tuple(SpzVersion):
@@ -111,7 +112,7 @@ def decode(raw: bytes, white: float = 1.0) -> Scene:
     return Scene(
         (coordinates.reshape(count, 3) * 2.0**-bits).astype(np.float32) * _TO_RUB,
         _turned(quats),
-        scales / np.float32(16) - np.float32(10),
+        (scales / np.float32(16) - np.float32(10)).astype(np.float32),
         np.log(opacity / (1 - opacity)).astype(np.float32),
         np.ascontiguousarray(rgb[:, :1] if grey else rgb, np.float32),
     )
@@ -170,7 +171,8 @@ def _smallest_three(quats: Array) -> Bytes:
     word = largest.astype(np.uint32)
     for i in range(4):
         word = np.where(largest == i, word, word << 10 | part[:, i])
-    return word.astype("<u4")[:, None].view(np.uint8)
+    packed: Bytes = word.astype("<u4")[:, None].view(np.uint8)
+    return packed
 
 
 def _from_smallest_three(packed: Bytes) -> Array:

@@ -124,7 +124,7 @@ def test_a_sample_is_fixed_and_spread_evenly() -> None:
 
 
 def _splat_transform() -> list[str]:
-    """The command of @playcanvas/splat-transform: named in SPIKED_SPLAT_TRANSFORM, installed in web/, or on the path."""
+    """@playcanvas/splat-transform: as named in SPIKED_SPLAT_TRANSFORM, installed in web/, or on the path."""
     named = os.environ.get("SPIKED_SPLAT_TRANSFORM")
     local = Path(__file__).parents[1] / "web" / "node_modules" / ".bin" / "splat-transform"
     found = named or (str(local) if local.exists() else shutil.which("splat-transform"))

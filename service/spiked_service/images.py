@@ -1,4 +1,4 @@
-"""Radiance images to PNG and EXR bytes in memory, by OpenImageIO."""
+"""Pictures to PNG, WebP, JPEG and EXR bytes in memory, by OpenImageIO."""
 
 import os
 from enum import StrEnum
@@ -11,36 +11,73 @@ from spiked.errors import ConfigurationError
 
 
 class ImageFormat(StrEnum):
-    """What an image is encoded as."""
+    """What a picture is encoded as: 8 bits a channel, a value divided by the white given and clipped, or floats."""
 
     PNG = "png"
-    """8 bits a channel, radiance divided by the white given and clipped."""
+    WEBP = "webp"
+    JPEG = "jpeg"
+    """Without alpha."""
     EXR = "exr"
-    """32-bit floats, radiance in expected spikes a frame."""
+    """32-bit floats, values as they are: radiance in expected spikes a frame, depth in the scene's unit of length."""
 
     @property
     def media_type(self) -> str:
         """Its name in HTTP."""
-        return "image/png" if self is ImageFormat.PNG else "image/x-exr"
+        return "image/x-exr" if self is ImageFormat.EXR else f"image/{self}"
+
+    @classmethod
+    def accepted(cls, accept: str) -> "ImageFormat | None":
+        """The best of an HTTP Accept header; PNG where anything will do, None where none of ours will."""
+        wishes = []
+        for part in accept.split(","):
+            kind, *parameters = (word.strip() for word in part.split(";"))
+            quality = next((p[2:] for p in parameters if p.startswith("q=")), "1")
+            try:
+                wishes.append((float(quality), kind))
+            except ValueError:
+                continue
+        for quality, kind in sorted(wishes, key=lambda wish: -wish[0]):
+            for one in cls:
+                if quality > 0 and kind in (one.media_type, "image/*", "*/*"):
+                    return one
+        return None
 
 
-_WRITERS = {ImageFormat.PNG: "png", ImageFormat.EXR: "openexr"}
+_WRITERS = {
+    ImageFormat.PNG: ("png", {"png:compressionLevel": 1}),
+    # The quickest that libpng has: twice the speed of level 3 for 3 % more bytes.
+    ImageFormat.WEBP: ("webp", {"Compression": "webp:85"}),
+    ImageFormat.JPEG: ("jpeg", {"Compression": "jpeg:90"}),
+    ImageFormat.EXR: ("openexr", {"Compression": "zip"}),
+}
 
 
 def encode(image: NDArray[np.float32], kind: ImageFormat, white: float) -> bytes:
-    """Encode radiance [H, W] or [H, W, C], C 1 or 3; `white` is the radiance of PNG's 255.
+    """Encode an image [H, W] or [H, W, C], C 1 or 3; `white` is the value of 255 in all but EXR.
 
     Raises ConfigurationError.
     """
     pixels = np.ascontiguousarray(image[..., None] if image.ndim == 2 else image, np.float32)
-    if kind is ImageFormat.PNG:
-        pixels = np.clip(np.nan_to_num(pixels) / max(white, 1e-9), 0, 1)
+    if kind is ImageFormat.EXR:
+        return _written(pixels, kind)
+    # Done here and not by OpenImageIO, which takes four times as long over floats.
+    levels = np.clip(np.nan_to_num(pixels) * np.float32(255 / max(white, 1e-9)) + np.float32(0.5), 0, 255)
+    pixels = levels.astype(np.uint8)
+    if kind is ImageFormat.WEBP and pixels.shape[2] == 1:
+        pixels = np.repeat(pixels, 3, axis=2)  # there is no grey WebP
+    return _written(pixels, kind)
+
+
+def _written(pixels: NDArray[np.float32] | NDArray[np.uint8], kind: ImageFormat) -> bytes:
     height, width, channels = pixels.shape
-    spec = oiio.ImageSpec(width, height, channels, "uint8" if kind is ImageFormat.PNG else "float")
+    spec = oiio.ImageSpec(width, height, channels, str(pixels.dtype).replace("float32", "float"))
+    name, attributes = _WRITERS[kind]
+    for attribute, value in attributes.items():
+        spec.attribute(attribute, value)
     # OpenImageIO's Python face writes to names only; the name of a file that lives in memory will do.
     file = os.memfd_create(f"spiked.{kind}")
     try:
-        writer = oiio.ImageOutput.create(_WRITERS[kind])
+        writer = oiio.ImageOutput.create(name)
         if writer is None:
             raise ConfigurationError(f"this OpenImageIO cannot write {kind} images: {oiio.geterror()}")
         if not (writer.open(f"/proc/self/fd/{file}", spec) and writer.write_image(pixels) and writer.close()):

@@ -1,39 +1,149 @@
-"""Pictures of published scenes from any pose."""
+"""Pictures of published scenes from any pose: scenes are read once, renderers kept, and only so many draw at a time."""
 
 import threading
+from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.render import Camera
-from spiked.render.cpu import Rasteriser
+from spiked.errors import SpikedError
+from spiked.render import Camera, Image
+from spiked.render.cpu import Rasteriser, usable_cores
 from spiked.scene import Scene
-from spiked_service.publication import Published
+
+Floats = NDArray[np.float32]
+
+_SCENES = 4
+"""Scenes remembered: the newest versions of a few reconstructions."""
+_CAMERAS = 4
+"""Renderers that each slot keeps, by camera; their memory is then warm, which makes them 1.6 times as fast."""
+
+
+class OverloadedError(SpikedError):
+    """So many requests wait already that another would wait for too long."""
+
+
+class Output(StrEnum):
+    """What a view shows."""
+
+    COLOR = "color"
+    """Radiance, expected spikes a frame."""
+    DEPTH = "depth"
+    """Expected z along the camera's axis, in the scene's unit of length; 0 where nothing is."""
+    ALPHA = "alpha"
+    """How opaque the scene is, 0 to 1."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Camera to world, OpenCV axes."""
+
+    rotation: NDArray[np.float64]  # [3, 3]
+    centre: NDArray[np.float64]  # [3]
+
+
+class _Slot:
+    """Renderers for one request at a time."""
+
+    def __init__(self) -> None:
+        self._rasterisers: OrderedDict[Camera, Rasteriser] = OrderedDict()
+
+    def draw(self, scene: Scene, camera: Camera, pose: Pose) -> Image:
+        rasteriser = self._rasterisers.pop(camera, None) or Rasteriser(camera, threads=1)
+        self._rasterisers[camera] = rasteriser
+        if len(self._rasterisers) > _CAMERAS:
+            self._rasterisers.popitem(last=False)
+        return rasteriser.forward(scene, pose.rotation[None], pose.centre[None])
 
 
 class ViewRenderer:
-    """Renders with one thread, so that the reconstruction keeps its cores, and remembers the last scene it read.
+    """Renders with one thread for each of a few requests at a time; the others wait their turn, up to a limit.
 
-    Blocks while it renders: not for an event loop.
+    Blocks while it renders: not for an event loop. The renderer's own code runs without Python's lock.
     """
+
+    def __init__(self, concurrent: int | None = None, waiting: int = 64) -> None:
+        """`concurrent` renders at a time (as many as cores if not given), and `waiting` more in line."""
+        self._slots = [_Slot() for _ in range(concurrent or usable_cores())]
+        self._most = len(self._slots) + waiting
+        self._inside = 0
+        self._turn = threading.Condition()
+        self._scenes = _Scenes()
+
+    def render(self, scene: Path, camera: Camera, pose: Pose) -> Image:
+        """What a camera sees of the scene in a PLY file. Raises SceneError if it is gone, OverloadedError."""
+        with self._slot() as slot:
+            return slot.draw(self._scenes.get(scene), camera, pose)
+
+    @contextmanager
+    def _slot(self) -> Iterator[_Slot]:
+        with self._turn:
+            if self._inside >= self._most:
+                raise OverloadedError(f"{self._inside} views are being rendered or wait; ask again in a second")
+            self._inside += 1
+            self._turn.wait_for(lambda: bool(self._slots))
+            slot = self._slots.pop()  # the one used last, whose memory is warm
+        try:
+            yield slot
+        finally:
+            with self._turn:
+                self._slots.append(slot)
+                self._inside -= 1
+                self._turn.notify()
+
+
+class _Scenes:
+    """The scenes used last. Each is read by one thread, and the others wait for it."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._path: Path | None = None
+        self._known: OrderedDict[Path, _Once] = OrderedDict()
+
+    def get(self, path: Path) -> Scene:
+        with self._lock:
+            once = self._known.setdefault(path, _Once(path))
+            self._known.move_to_end(path)
+            if len(self._known) > _SCENES:
+                self._known.popitem(last=False)
+        try:
+            return once.scene()
+        except SpikedError:
+            with self._lock:
+                self._known.pop(path, None)
+            raise
+
+
+class _Once:
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = threading.Lock()
         self._scene: Scene | None = None
 
-    def render(
-        self,
-        folder: Path,
-        published: Published,
-        camera: Camera,
-        rotation: NDArray[np.float64],
-        centre: NDArray[np.float64],
-    ) -> NDArray[np.float32]:
-        """Radiance [H, W] or [H, W, 3] from a camera-to-world pose. Raises SceneError if the version is gone."""
+    def scene(self) -> Scene:
         with self._lock:
-            path = folder / published.scene
-            if self._scene is None or path != self._path:
-                self._scene, self._path = Scene.read_ply(path), path
-            return Rasteriser(camera, threads=1).forward(self._scene, rotation[None], centre[None]).values
+            if self._scene is None:
+                self._scene = Scene.read_ply(self._path)
+            return self._scene
+
+
+def shown(image: Image, output: Output, background: tuple[float, float, float]) -> Floats:
+    """The plane of an output, [H, W] or [H, W, 3]; `background` is radiance, red, green, blue."""
+    match output:
+        case Output.DEPTH:
+            return image.depth
+        case Output.ALPHA:
+            return image.alpha
+        case Output.COLOR:
+            if not any(background):
+                return image.values
+            behind = np.array(background, np.float32)
+            through = 1 - image.alpha
+            if image.values.ndim == 2 and (behind == behind[0]).all():
+                return image.values + through * behind[0]
+            values = image.values if image.values.ndim == 3 else image.values[..., None]
+            return values + through[..., None] * behind

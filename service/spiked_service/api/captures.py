@@ -12,13 +12,13 @@ from spiked.errors import ConfigurationError
 from spiked.pose import quaternion
 from spiked.render import Camera
 from spiked.trajectory import Trajectory
+from spiked_service.api.old_schemas import CaptureOut, CaptureRequest, TrajectoryOut, ViewRequest
 from spiked_service.api.problems import NotReadyError, Problem
-from spiked_service.api.schemas import CaptureOut, CaptureRequest, TrajectoryOut, ViewRequest
 from spiked_service.capture import Capture, Plan
 from spiked_service.captures import Captures, unhurried
 from spiked_service.images import ImageFormat, encode
 from spiked_service.publication import Published, newest
-from spiked_service.views import ViewRenderer
+from spiked_service.views import Pose, ViewRenderer
 
 
 class TrajectoryFormat(StrEnum):
@@ -131,8 +131,8 @@ def capture_routes(captures: Captures, views: ViewRenderer) -> APIRouter:
         published = _published(capture)
         kind = format or (ImageFormat.EXR if ImageFormat.EXR.media_type in accept else ImageFormat.PNG)
         rotation, centre = request.pose()
-        image = views.render(capture.folder, published, _camera(capture, request), rotation, centre)
-        picture = encode(image, kind, request.white or published.white)
+        image = views.render(capture.folder / published.scene, _camera(capture, request), Pose(rotation, centre))
+        picture = encode(image.values, kind, request.white or published.white)
         return Response(picture, media_type=kind.media_type, headers={"X-Scene-Version": str(published.version)})
 
     @router.get(

@@ -1,0 +1,303 @@
+"""Devices, captures and what was recorded."""
+
+from datetime import datetime
+from typing import Any, Self
+
+from pydantic import ConfigDict, Field, model_validator
+
+from spiked.ring import DeviceState, Policy
+from spiked.sensor import Mosaic, Sensor
+from spiked_service.api.schemas.base import (
+    ID_EXAMPLE,
+    LARGEST_INTEGER,
+    Id,
+    In,
+    IntrinsicsModel,
+    Name,
+    Notes,
+    Out,
+    example,
+    examples,
+)
+from spiked_service.reconstruction_options import ReconstructionOptions
+from spiked_service.store.rows import CaptureRow, CaptureState, Counters, Grade, Judgement, Origin, Recorded
+
+
+class ConsumerOut(Out):
+    """One reader of the ring."""
+
+    name: str
+    policy: Policy = Field(description="latest skips frames by intention; the others want them all.")
+    received: int
+    lost: int
+    lag_frames: int
+    fill: float = Field(description="Its lag as a part of what it may lag; at 1 it loses frames.")
+    lagging: bool
+
+
+class CountersOut(Out):
+    """Frames of a capture; received + lost is the index of the next frame."""
+
+    device: DeviceState
+    device_reason: str
+    received: int
+    lost: dict[str, int] = Field(description="By cause: device, usb, ring, disk.")
+    next_frame: int
+    consumers: list[ConsumerOut]
+
+    @classmethod
+    def of(cls, counters: Counters | None) -> "CountersOut | None":
+        """As it is shown."""
+        if counters is None:
+            return None
+        return cls(
+            device=counters.device,
+            device_reason=counters.device_reason,
+            received=counters.received,
+            lost=dict(counters.lost),
+            next_frame=counters.next_frame,
+            consumers=[ConsumerOut(**vars(consumer)) for consumer in counters.consumers],
+        )
+
+
+class CapabilityOut(Out):
+    """Something that cameras differ in."""
+
+    supported: bool
+    value: Any | None = None
+
+
+class DeviceOut(Out):
+    """Something to capture from."""
+
+    id: str = Field(description="Its name here; the same after a restart.", examples=["usb0", "sim:"])
+    kind: str = Field(description="usb, pcie, replay or sim.")
+    source: str = Field(description="To be given as `source` of a capture.", examples=["sim:"])
+    description: str
+    state: DeviceState
+    reason: str = Field(description="Why it is absent or lost.")
+    serial: str | None = None
+    port: str | None = None
+    speed: str | None = None
+    firmware: str | None = None
+    capabilities: dict[str, CapabilityOut] = Field(default_factory=dict)
+    counters: CountersOut | None = None
+    capture_id: str | None = Field(None, description="The capture that uses it now.")
+
+
+class DevicesOut(Out):
+    """All devices."""
+
+    items: list[DeviceOut]
+
+
+class ArmRequest(In):
+    """Keep a device's newest frames at hand."""
+
+    model_config = example(pretrigger_s=0.5)
+
+    pretrigger_s: float = Field(1.0, ge=0, le=60, description="How far back a capture shall be able to begin, seconds.")
+
+
+class CaptureRequest(In):
+    """A capture to start."""
+
+    model_config = examples(
+        {"source": "sim:?seed=1", "frames": 1280, "name": "desk, by hand"},
+        {"source": "sim:", "seconds": 0.1, "reconstruct": False},
+    )
+
+    source: str | None = Field(
+        None,
+        min_length=1,
+        max_length=4096,
+        description="usb0, pcie0, sim: or replay:FILE, with options after a question mark. "
+        "A file or simulation without `pace` waits for its readers.",
+    )
+    device: str | None = Field(
+        None, min_length=1, max_length=4096, description="Id of a device, instead of a source; `GET devices`."
+    )
+    frames: int | None = Field(
+        None, gt=0, le=LARGEST_INTEGER, description="Length; until the source ends or is stopped if not given."
+    )
+    seconds: float | None = Field(None, gt=0, le=1e7, description="Length in seconds of the camera, instead of frames.")
+    pretrigger_s: float = Field(0.0, ge=0, le=60, description="Begin so much earlier, from an armed device's ring.")
+    name: Name = ""
+    notes: Notes = ""
+    record: bool = Field(True, description="Keep the frames in the data folder.")
+    reconstruct: bool = Field(True, description="Reconstruct while it runs.")
+    options: ReconstructionOptions = Field(default_factory=ReconstructionOptions)
+    intrinsics: IntrinsicsModel | None = Field(None, description="If the source does not know its own.")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if (self.source is None) == (self.device is None):
+            raise ValueError("give either source or device")
+        if self.frames is not None and self.seconds is not None:
+            raise ValueError("frames and seconds both say how long to capture; give one of them")
+        if not (self.record or self.reconstruct):
+            raise ValueError("neither record nor reconstruct: nothing would be left of the capture")
+        return self
+
+
+class CaptureChange(In):
+    """What can be changed of a capture; fields that are not given stay."""
+
+    model_config = example(name="desk, second try", keep=True)
+
+    name: Name | None = None
+    notes: Notes | None = None
+    keep: bool | None = Field(None, description="Retention leaves it alone.")
+
+
+class SensorOut(Out):
+    """The camera of a capture."""
+
+    width: int
+    height: int
+    frame_rate_hz: float
+    intrinsics: IntrinsicsModel | None
+    mosaic: Mosaic | None = Field(description="Colour pattern of the upright image; null for a grey camera.")
+
+    @classmethod
+    def of(cls, sensor: Sensor | None) -> "SensorOut | None":
+        """As it is shown."""
+        if sensor is None:
+            return None
+        return cls(
+            width=sensor.width,
+            height=sensor.height,
+            frame_rate_hz=sensor.frame_rate_hz,
+            intrinsics=IntrinsicsModel.of(sensor.intrinsics),
+            mosaic=sensor.mosaic,
+        )
+
+
+class VerdictOut(Out):
+    """What a recording is good for."""
+
+    grade: Grade
+    reasons: list[str] = Field(description="Why it is not good, the worst first.")
+
+    @classmethod
+    def of(cls, verdict: Judgement | None) -> "VerdictOut | None":
+        """As it is shown."""
+        return None if verdict is None else cls(grade=verdict.grade, reasons=list(verdict.reasons))
+
+
+class RecordingOut(Out):
+    """What lies on disk of a capture."""
+
+    bytes: int
+    frames: int
+    first_frame: int = Field(description="Index in the capture of the first frame recorded.")
+    lost: int = Field(description="Frames missing between its first and its last.")
+    sha256: str | None
+
+    @classmethod
+    def of(cls, recorded: Recorded | None) -> "RecordingOut | None":
+        """As it is shown."""
+        return None if recorded is None else cls(**vars(recorded))
+
+
+class CaptureOut(Out):
+    """A capture: frames of a camera from here or elsewhere, recorded, reconstructed, or both."""
+
+    model_config = ConfigDict(
+        json_schema_serialization_defaults_required=True,
+        json_schema_extra={
+            "examples": [
+                {
+                    "id": ID_EXAMPLE,
+                    "name": "desk, by hand",
+                    "notes": "",
+                    "keep": False,
+                    "origin": "live",
+                    "source": "sim:?seed=1&pace=0",
+                    "state": "complete",
+                    "reason": "",
+                    "warnings": [],
+                    "verdict": {"grade": "good", "reasons": []},
+                    "started_at": "2026-11-21T07:10:00.123456Z",
+                    "ended_at": "2026-11-21T07:10:31.654321Z",
+                    "deleted_at": None,
+                    "frames_planned": 1280,
+                    "recording": {
+                        "bytes": 16000000,
+                        "frames": 1280,
+                        "first_frame": 0,
+                        "lost": 0,
+                        "sha256": None,
+                    },
+                    "reconstruction_ids": ["01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e11"],
+                    "counters": None,
+                    "sensor": {
+                        "width": 400,
+                        "height": 250,
+                        "frame_rate_hz": 20000.0,
+                        "intrinsics": {"fx": 346.4, "fy": 346.4, "cx": 200.0, "cy": 125.0},
+                        "mosaic": None,
+                    },
+                }
+            ]
+        },
+    )
+
+    id: Id
+    name: str
+    notes: str
+    keep: bool = Field(description="Retention leaves it alone.")
+    origin: Origin = Field(description="live: captured here; upload: a recording from elsewhere.")
+    source: str
+    state: CaptureState
+    reason: str = Field(description="Why, if the capture has failed or is about to.")
+    warnings: list[str]
+    verdict: VerdictOut | None = Field(description="Null until the recording is closed.")
+    started_at: datetime
+    ended_at: datetime | None
+    deleted_at: datetime | None = Field(description="Not null: removed; `:restore` brings it back.")
+    frames_planned: int | None = Field(description="Length of the capture if it is known.")
+    recording: RecordingOut | None
+    reconstruction_ids: list[str] = Field(description="Oldest first.")
+    counters: CountersOut | None
+    sensor: SensorOut | None = Field(description="Null until the source is open.")
+
+    @classmethod
+    def of(cls, row: CaptureRow, counters: Counters | None, reconstruction_ids: list[str]) -> "CaptureOut":
+        """A row with what is known beyond it."""
+        return cls(
+            id=row.id,
+            name=row.name,
+            notes=row.notes,
+            keep=row.keep,
+            origin=row.origin,
+            source=row.source,
+            state=row.state,
+            reason=row.reason,
+            warnings=list(row.warnings),
+            verdict=VerdictOut.of(row.verdict),
+            started_at=row.started_at,
+            ended_at=row.ended_at,
+            deleted_at=row.deleted_at,
+            frames_planned=row.frames_planned,
+            recording=RecordingOut.of(row.recording),
+            reconstruction_ids=reconstruction_ids,
+            counters=CountersOut.of(counters),
+            sensor=SensorOut.of(row.sensor),
+        )
+
+
+class RateHistogram(Out):
+    """How many pixels fire how often."""
+
+    edges: list[float] = Field(description="Spikes a frame; one more than counts.")
+    counts: list[int]
+
+
+class StatsOut(Out):
+    """Statistics of a few frames."""
+
+    frame: int = Field(description="Absolute index of the middle one.")
+    rate_histogram: RateHistogram
+    hot_pixels: list[tuple[int, int]] = Field(description="x, y in the upright image.")
+    mean_rate: float = Field(description="Spikes a pixel and frame.")

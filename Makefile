@@ -10,32 +10,43 @@ VENV := .venv
 BIN := $(VENV)/bin
 NATIVE_SOURCES := CMakeLists.txt $(shell find spiked/native -name '*.cpp' -o -name '*.hpp' -o -name '*.inl' -o -name CMakeLists.txt)
 CPP := $(filter-out %CMakeLists.txt,$(NATIVE_SOURCES))
-PAGE := $(shell find service/spiked_service/page -name '*.js')
+WEB := $(shell find web -path web/node_modules -prune -o -type f -print)
+PAGE := service/spiked_service/page/index.html
+NPM_CI := web/node_modules/.package-lock.json
 
-.PHONY: demo test test-slow lint bench clean
+.PHONY: demo test test-slow lint bench page wheel clean
 .DELETE_ON_ERROR:
 
+# Without Node the daemon runs all the same; its page then says how to build it.
 demo: $(VENV)/.native
+	@$(MAKE) --no-print-directory page || echo "the page is not built; the API works without it" >&2
 	$(BIN)/spiked serve --device sim: --frames 1280 --follow
 
-test: lint
+test: lint $(PAGE) $(VENV)/.chromium
+	cd web && npm run --silent test
 	$(BIN)/pytest -m "not slow"
 
-test-slow: $(VENV)/.native
+test-slow: $(VENV)/.native $(PAGE) $(VENV)/.chromium
 	$(BIN)/pytest -m slow
 
-lint: $(VENV)/.native
+lint: $(VENV)/.native $(NPM_CI)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(if $(CPP),$(BIN)/clang-format --dry-run -Werror $(CPP))
 	$(BIN)/lint-imports
-	for script in $(PAGE); do node --check $$script || exit 1; done
+	cd web && npm run --silent lint
 
 bench: $(VENV)/.native
 	$(BIN)/spiked bench
 
+page: $(PAGE)
+
+wheel: $(VENV)/.native $(PAGE)
+	$(BIN)/pip wheel --quiet --no-build-isolation --no-deps --wheel-dir dist .
+
 clean:
+	rm -rf web/node_modules service/spiked_service/page
 	rm -rf $(VENV) build dist out .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find spiked -name '*.so' -delete
 
@@ -63,4 +74,21 @@ $(VENV)/.packages: $(VENV)/.python pyproject.toml
 # Without build isolation CMake finds the same nanobind each time and compiles only what changed.
 $(VENV)/.native: $(VENV)/.packages $(NATIVE_SOURCES)
 	$(BIN)/pip install --quiet --no-build-isolation --no-deps --editable .
+	touch $@
+
+# The packages of the lock file, and the page made with them, which goes into the wheel.
+$(NPM_CI): web/package.json web/package-lock.json
+	@node -e 'process.exit(parseInt(process.versions.node) < 20 ? 1 : 0)' 2>/dev/null && command -v npm >/dev/null || \
+	  { echo "the page needs Node 20 or newer, with npm" >&2; exit 1; }
+	cd web && npm ci --silent --no-audit --no-fund
+	touch $@
+
+$(PAGE): $(NPM_CI) $(WEB)
+	cd web && npm run --silent build
+
+# The browser of the page's tests, which are skipped where it cannot be had.
+$(VENV)/.chromium: $(VENV)/.python
+	@command -v chromium >/dev/null || { [ "$$(id -u)" = 0 ] && apt-get update -q && \
+	  DEBIAN_FRONTEND=noninteractive apt-get install -q -y --no-install-recommends chromium; } || \
+	  echo "no chromium: the tests of the page will be skipped" >&2
 	touch $@

@@ -4,15 +4,14 @@ import hmac
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from http import HTTPStatus
-from pathlib import Path
 
 from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from fastapi.staticfiles import StaticFiles
 from pydantic import BaseModel
 
 from spiked_service.api.captures import capture_routes
 from spiked_service.api.old_schemas import DeviceOut
+from spiked_service.api.page import mount_page
 from spiked_service.api.problems import install, problem
 from spiked_service.captures import Captures
 from spiked_service.commands.version import installed_version
@@ -20,7 +19,6 @@ from spiked_service.devices import known_devices
 from spiked_service.limits import Gate
 from spiked_service.views import ViewRenderer
 
-PAGE = Path(__file__).parents[1] / "page"
 _COOKIE = "spiked_token"
 _DESCRIPTION = """Captures from spike cameras, reconstructed while they run.
 
@@ -75,7 +73,7 @@ def create_app(captures: Captures, devices: list[str], token: str | None) -> Fas
     app.include_router(api)
     if token is not None:
         _require(app, token)
-    app.mount("/", StaticFiles(directory=PAGE, html=True))
+    mount_page(app)
     return app
 
 

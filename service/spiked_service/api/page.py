@@ -1,0 +1,41 @@
+"""The page that people see: files built from `web/`, or word of how to build them."""
+
+from pathlib import Path
+
+from fastapi import FastAPI
+from fastapi.responses import HTMLResponse
+from fastapi.staticfiles import StaticFiles
+from starlette.responses import Response
+from starlette.types import Scope
+
+PAGE = Path(__file__).parents[1] / "page"
+_UNBUILT = """<!doctype html>
+<html lang="en">
+<title>spiked</title>
+<h1>spiked is running; its page is not built</h1>
+<p>In a checkout, <code>make page</code> builds it (with Node 20 or newer, and npm); then load this address again.
+Wheels contain it.</p>
+<p>Everything else works without: <a href="docs">API</a>, <a href="healthz">health</a>.</p>
+</html>
+"""
+
+
+class _Page(StaticFiles):
+    """Files with a hash in their name never change; the index that names them is asked for anew each time."""
+
+    async def get_response(self, path: str, scope: Scope) -> Response:
+        response = await super().get_response(path, scope)
+        forever = path.startswith("assets/") and response.status_code == 200
+        response.headers["Cache-Control"] = "public, max-age=31536000, immutable" if forever else "no-cache"
+        return response
+
+
+def mount_page(app: FastAPI, folder: Path = PAGE) -> None:
+    """Serve the built page below `/`, after all other routes; without one, say at `/` how to build it."""
+    if (folder / "index.html").is_file():
+        app.mount("/", _Page(directory=folder, html=True))
+        return
+
+    @app.get("/", include_in_schema=False)
+    def unbuilt() -> HTMLResponse:
+        return HTMLResponse(_UNBUILT)

@@ -1,0 +1,56 @@
+/** How often pixels fire. */
+
+import type { JSX } from "react";
+
+import type { RateHistogram } from "../api/types";
+
+const HEIGHT = 40;
+
+/** Bars of a histogram: square root of the counts, so that the few bright pixels are seen too. */
+export function bars(counts: readonly number[]): number[] {
+  const most = Math.max(1, ...counts);
+  return counts.map((n) => Math.sqrt(Math.max(n, 0) / most));
+}
+
+export function Histogram({
+  histogram,
+  meanRate,
+  frameRateHz,
+}: {
+  histogram: RateHistogram | null;
+  meanRate: number | null;
+  frameRateHz: number | null;
+}): JSX.Element {
+  const heights = histogram === null ? [] : bars(histogram.counts);
+  const first = histogram?.edges[0] ?? 0;
+  const last = histogram?.edges.at(-1) ?? 1;
+  const told = (rate: number): string =>
+    frameRateHz === null ? `${rate.toFixed(2)} /frame` : `${((rate * frameRateHz) / 1000).toFixed(1)} kHz`;
+  return (
+    <figure className="histogram">
+      <figcaption>
+        Spike rate{" "}
+        <span className="dim">{meanRate === null ? "" : `mean ${meanRate.toFixed(3)} /frame · ${told(meanRate)}`}</span>
+      </figcaption>
+      <svg
+        viewBox={`0 0 ${Math.max(heights.length, 1)} ${HEIGHT}`}
+        preserveAspectRatio="none"
+        role="img"
+        aria-label={
+          histogram === null
+            ? "Histogram of spike rate: nothing yet"
+            : `Histogram of spike rate from ${first.toFixed(2)} to ${last.toFixed(2)} spikes a frame`
+        }
+      >
+        {heights.map((height, i) => (
+          <rect key={i} x={i + 0.08} y={HEIGHT * (1 - height)} width={0.84} height={HEIGHT * height} />
+        ))}
+      </svg>
+      <div className="scale" aria-hidden="true">
+        <span>{first.toFixed(2)}</span>
+        <span>spikes a frame, √ of pixels</span>
+        <span>{last.toFixed(2)}</span>
+      </div>
+    </figure>
+  );
+}

@@ -1,0 +1,59 @@
+/** How the live reconstruction stands. */
+
+import type { JSX } from "react";
+
+import type { Reconstruction } from "../api/types";
+import { count, decibel, duration, percent, small } from "../state/format";
+import { go } from "../state/route";
+import { Badge, jobTone, Meter, Panel, Stat, trackingTone } from "../ui/parts";
+import { Icon } from "../ui/icons";
+
+export function Progress({ job }: { job: Reconstruction | null }): JSX.Element {
+  if (job === null)
+    return (
+      <Panel title="Reconstruction">
+        <p className="dim">None for this capture.</p>
+      </Panel>
+    );
+  const running = job.state === "running" || job.state === "queued";
+  return (
+    <Panel
+      title="Reconstruction"
+      aside={
+        running && job.tracking_state !== null ? (
+          <Badge tone={trackingTone[job.tracking_state]}>{job.tracking_state}</Badge>
+        ) : (
+          <Badge tone={jobTone[job.state]}>{job.state}</Badge>
+        )
+      }
+    >
+      <dl className="stats">
+        <Stat name="Stage">{job.stage}</Stat>
+        <Stat name="Poses">{count(job.poses)}</Stat>
+        <Stat name="Splats">{count(job.splats)}</Stat>
+        <Stat name="PSNR" hint="Estimate from the views it was made of">
+          {decibel(job.psnr_db)}
+        </Stat>
+        <Stat name="Loss">{small(job.loss)}</Stat>
+        <Stat name="Version">{job.version === 0 ? "–" : job.version}</Stat>
+      </dl>
+      {running && job.stage === "refining" && (
+        <div className="refining">
+          <Meter share={job.progress} label="Refinement" />
+          <span>
+            {percent(job.progress)}
+            {job.eta_s !== null && `, ${duration(job.eta_s)} left`}
+          </span>
+        </div>
+      )}
+      {job.reason !== "" && <p className={job.state === "failed" ? "problem" : "dim"}>{job.reason}</p>}
+      <button
+        type="button"
+        disabled={job.version === 0}
+        onClick={() => go({ page: "scene", capture: job.capture_id, reconstruction: null, frame: null, camera: null })}
+      >
+        <Icon name="scene" /> Open the scene
+      </button>
+    </Panel>
+  );
+}

@@ -1,0 +1,168 @@
+/** What happens to the frames of a capture, and what became of them. */
+
+import type { JSX } from "react";
+
+import type { Capture, Device, System } from "../api/types";
+import { bytes, count, duration, percent, rate } from "../state/format";
+import { Badge, captureTone, gradeTone, Meter, Panel, Stat } from "../ui/parts";
+
+const CAUSES = ["device", "usb", "ring", "disk"] as const;
+
+export function Frames({ capture, rateHz }: { capture: Capture; rateHz: number | null }): JSX.Element {
+  const counters = capture.counters;
+  const sensor = capture.sensor;
+  const lost = counters === null ? 0 : Object.values(counters.lost).reduce((sum, n) => sum + n, 0);
+  const seconds = counters !== null && sensor !== null ? counters.next_frame / sensor.frame_rate_hz : null;
+  return (
+    <Panel title="Frames" aside={<Badge tone={captureTone[capture.state]}>{capture.state}</Badge>}>
+      <dl className="stats">
+        <Stat name="Received">{counters === null ? "–" : count(counters.received)}</Stat>
+        <Stat name="Length">{seconds === null ? "–" : duration(seconds)}</Stat>
+        <Stat name="Rate" hint={sensor === null ? undefined : `The camera runs at ${rate(sensor.frame_rate_hz)}`}>
+          {rateHz === null ? "–" : rate(rateHz)}
+        </Stat>
+        <Stat name="Lost">
+          {counters === null ? "–" : lost === 0 ? "none" : <b className="problem">{count(lost)}</b>}
+        </Stat>
+      </dl>
+      {counters !== null && (
+        <>
+          <table className="grid">
+            <caption className="hidden">Frames lost, by cause</caption>
+            <thead>
+              <tr>
+                <th scope="col">Lost by</th>
+                {CAUSES.map((cause) => (
+                  <th key={cause} scope="col" className="number">
+                    {cause}
+                  </th>
+                ))}
+              </tr>
+            </thead>
+            <tbody>
+              <tr>
+                <th scope="row">frames</th>
+                {CAUSES.map((cause) => (
+                  <td key={cause} className={`number ${(counters.lost[cause] ?? 0) > 0 ? "problem" : ""}`}>
+                    {count(counters.lost[cause] ?? 0)}
+                  </td>
+                ))}
+              </tr>
+            </tbody>
+          </table>
+          <table className="grid consumers">
+            <caption className="hidden">Consumers of the ring</caption>
+            <thead>
+              <tr>
+                <th scope="col">Consumer</th>
+                <th scope="col">Ring fill</th>
+                <th scope="col" className="number">
+                  Lag
+                </th>
+                <th scope="col" className="number">
+                  Missed
+                </th>
+              </tr>
+            </thead>
+            <tbody>
+              {counters.consumers.map((one) => {
+                const skips = one.policy === "latest";
+                return (
+                  <tr key={one.name}>
+                    <th scope="row">
+                      {one.name}
+                      {one.lagging && !skips && <span className="problem"> lagging</span>}
+                    </th>
+                    <td>
+                      <Meter
+                        share={one.fill}
+                        label={`Ring fill of ${one.name}`}
+                        tone={one.fill > 0.8 && !skips ? "problem" : "active"}
+                      />
+                    </td>
+                    <td className="number">
+                      {sensor === null ? count(one.lag_frames) : duration(one.lag_frames / sensor.frame_rate_hz)}
+                    </td>
+                    <td
+                      className={`number ${one.lost > 0 && !skips ? "problem" : ""}`}
+                      title={skips ? "skips frames by intention" : undefined}
+                    >
+                      {count(one.lost)}
+                      {skips && one.lost > 0 ? " skipped" : ""}
+                    </td>
+                  </tr>
+                );
+              })}
+            </tbody>
+          </table>
+        </>
+      )}
+      {capture.warnings.map((warning) => (
+        <p key={warning} className="warning">
+          {warning}
+        </p>
+      ))}
+    </Panel>
+  );
+}
+
+/** The verdict, the moment the capture has ended. */
+export function VerdictCard({ capture }: { capture: Capture }): JSX.Element | null {
+  if (capture.state === "failed")
+    return (
+      <div className="verdict problem" role="status">
+        <Badge tone="problem">failed</Badge>
+        <p>{capture.reason}</p>
+      </div>
+    );
+  const verdict = capture.verdict;
+  if (verdict == null) return null;
+  return (
+    <div className={`verdict ${gradeTone[verdict.grade]}`} role="status" data-grade={verdict.grade}>
+      <Badge tone={gradeTone[verdict.grade]}>{verdict.grade}</Badge>
+      <div>
+        {verdict.reasons.length === 0 ? (
+          <p>
+            Every frame is there
+            {capture.recording == null
+              ? ""
+              : `: ${count(capture.recording.frames)} frames, ${bytes(capture.recording.bytes)}`}
+            .
+          </p>
+        ) : (
+          verdict.reasons.map((reason) => <p key={reason}>{reason}</p>)
+        )}
+      </div>
+    </div>
+  );
+}
+
+export function DevicePanel({ device }: { device: Device }): JSX.Element {
+  const facts = [device.kind, device.speed, device.port, device.serial, device.firmware].filter(
+    (fact) => fact != null && fact !== "",
+  );
+  return (
+    <div className="device">
+      <strong>{device.description || device.source}</strong>
+      <span className="dim">{facts.join(" · ")}</span>
+      {device.reason !== null && device.reason !== "" && (
+        <p className={device.state === "lost" ? "problem" : "dim"}>{device.reason}</p>
+      )}
+    </div>
+  );
+}
+
+export function Disk({ system, bytesPerSecond }: { system: System; bytesPerSecond: number | null }): JSX.Element {
+  const { free_bytes: free, total_bytes: total } = system.disk;
+  const left = bytesPerSecond === null || bytesPerSecond <= 0 ? null : free / bytesPerSecond;
+  return (
+    <div className="disk">
+      <span>Disk</span>
+      <Meter share={1 - free / Math.max(total, 1)} label="Disk used" tone={free / total < 0.1 ? "problem" : "active"} />
+      <span>
+        <b>{bytes(free)}</b> free
+        {left === null ? ` (${percent(free / Math.max(total, 1))})` : `, ${duration(left)} of recording`}
+      </span>
+    </div>
+  );
+}

@@ -1,0 +1,53 @@
+/** Dark or light: the system's choice unless a person makes their own, which this browser remembers. */
+
+import { useSyncExternalStore } from "react";
+
+export type Theme = "system" | "dark" | "light";
+const KEY = "spiked.theme";
+const listeners = new Set<() => void>();
+const dark = window.matchMedia("(prefers-color-scheme: dark)");
+
+function stored(): Theme {
+  try {
+    const value = localStorage.getItem(KEY);
+    return value === "dark" || value === "light" ? value : "system";
+  } catch {
+    return "system"; // storage may be forbidden; the page works without
+  }
+}
+
+let chosen = stored();
+const tell = (): void => {
+  for (const listener of listeners) listener();
+};
+dark.addEventListener("change", tell);
+
+export const isDark = (): boolean => (chosen === "system" ? dark.matches : chosen === "dark");
+
+export function applyTheme(): void {
+  if (chosen === "system") delete document.documentElement.dataset["theme"];
+  else document.documentElement.dataset["theme"] = chosen;
+}
+
+export function choose(theme: Theme): void {
+  chosen = theme;
+  try {
+    if (theme === "system") localStorage.removeItem(KEY);
+    else localStorage.setItem(KEY, theme);
+  } catch {
+    // as above: the choice lasts until the page is closed
+  }
+  applyTheme();
+  tell();
+}
+
+const subscribe = (listener: () => void): (() => void) => {
+  listeners.add(listener);
+  return () => listeners.delete(listener);
+};
+export const useTheme = (): Theme => useSyncExternalStore(subscribe, () => chosen);
+export const useDark = (): boolean => useSyncExternalStore(subscribe, isDark);
+
+/** A colour of the style sheet, for canvases. */
+export const colour = (name: string): string =>
+  getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();

@@ -6,6 +6,9 @@ PYTHON ?= python3.11
 TORCH ?= torch==2.13.0
 BUILD_REQUIRES := "scikit-build-core>=0.10" "nanobind>=2.4" "cmake>=3.25" ninja
 
+# Debian packages for tests of the USB camera.
+MOCKS := umockdev libusb-1.0-0
+
 VENV := .venv
 BIN := $(VENV)/bin
 NATIVE_SOURCES := CMakeLists.txt $(shell find spiked/native -name '*.cpp' -o -name '*.hpp' -o -name '*.inl' -o -name CMakeLists.txt)
@@ -22,11 +25,11 @@ demo: $(VENV)/.native
 	@$(MAKE) --no-print-directory page || echo "the page is not built; the API works without it" >&2
 	$(BIN)/spiked serve --device sim: --frames 1280 --follow
 
-test: lint $(PAGE) $(VENV)/.chromium
+test: lint $(PAGE) $(VENV)/.chromium $(VENV)/.mocks
 	cd web && npm run --silent test
 	$(BIN)/pytest -m "not slow"
 
-test-slow: $(VENV)/.native $(PAGE) $(VENV)/.chromium
+test-slow: $(VENV)/.native $(PAGE) $(VENV)/.chromium $(VENV)/.mocks
 	$(BIN)/pytest -m slow
 
 lint: $(VENV)/.native $(NPM_CI)
@@ -64,6 +67,16 @@ $(VENV)/.python:
 	fi
 	$(PYTHON) -m venv $(VENV)
 	touch $@
+
+# What stands in for the hardware in tests. Root gets it installed; for others those tests are skipped and say so.
+$(VENV)/.mocks: $(VENV)/.python
+	@missing=""; \
+	for package in $(MOCKS); do dpkg -s $$package >/dev/null 2>&1 || missing="$$missing $$package"; done; \
+	if [ -n "$$missing" ] && [ "$$(id -u)" = 0 ]; then \
+	  apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -q -y --no-install-recommends $$missing; \
+	elif [ -n "$$missing" ]; then \
+	  echo "tests with mocked hardware are skipped; they need: apt-get install$$missing" >&2; exit 0; \
+	fi && touch $@
 
 $(VENV)/.packages: $(VENV)/.python pyproject.toml
 	$(BIN)/pip install --quiet $(BUILD_REQUIRES)

@@ -8,8 +8,14 @@ from contextlib import suppress
 from pathlib import Path
 
 import httpx
+import numpy as np
 import psutil
 import pytest
+
+sys.path.append(str(Path(__file__).parent / "usb"))  # pytest's importlib mode adds no folder by itself
+from virtual_camera.host import CameraSettings
+from virtual_camera.rig import VirtualCameras, missing
+from virtual_camera.stream import COMPACT_BYTES
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 START_S = 60.0
@@ -18,9 +24,13 @@ START_S = 60.0
 class Daemon:
     """`spiked serve` as a process of its own, and a client to talk to it."""
 
-    def __init__(self, *arguments: str, runtime: Path, token: str | None = None) -> None:
+    def __init__(
+        self, *arguments: str, runtime: Path, token: str | None = None, seen: VirtualCameras | None = None
+    ) -> None:
         command = [sys.executable, "-m", "spiked_service", "serve", "--port", "0", "--runtime", str(runtime)]
-        self.process = subprocess.Popen([*command, *arguments], stdout=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(
+            [*command, *arguments], stdout=subprocess.PIPE, text=True, env=seen and seen.environment
+        )
         assert self.process.stdout is not None
         self.output = self.process.stdout
         line = self.output.readline()
@@ -51,11 +61,11 @@ class Daemon:
 
 @pytest.fixture
 def daemon(tmp_path: Path) -> Iterator[Callable[..., Daemon]]:
-    """Starts daemons with the given arguments, and ends them after the test."""
+    """Starts daemons with the given arguments, and ends them after the test; `seen` are cameras that they find."""
     started: list[Daemon] = []
 
-    def start(*arguments: str, token: str | None = None) -> Daemon:
-        started.append(Daemon(*arguments, runtime=tmp_path / "runtime", token=token))
+    def start(*arguments: str, token: str | None = None, seen: VirtualCameras | None = None) -> Daemon:
+        started.append(Daemon(*arguments, runtime=tmp_path / "runtime", token=token, seen=seen))
         return started[-1]
 
     yield start
@@ -69,3 +79,27 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"there is no data folder {SHARED}")
     return SHARED
+
+
+@pytest.fixture
+def cameras() -> Iterator[Callable[..., VirtualCameras]]:
+    """Makes machines with virtual cameras: `cameras(CameraSettings(...), ..., usbfs_memory_mb=16)`."""
+    if reason := missing():
+        pytest.skip(reason)
+    made: list[VirtualCameras] = []
+
+    def make(*settings: CameraSettings, usbfs_memory_mb: int = 16, direct_memory: bool = True) -> VirtualCameras:
+        made.append(VirtualCameras(settings, usbfs_memory_mb=usbfs_memory_mb, direct_memory=direct_memory))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+@pytest.fixture(scope="session")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """200 compact 400x250 frames of noise in a file, all different."""
+    path = tmp_path_factory.mktemp("pictures") / "noise.dat"
+    np.random.default_rng(3).integers(0, 256, (200, COMPACT_BYTES), np.uint8).tofile(path)
+    return path

@@ -1,0 +1,191 @@
+"""The bytes of endpoint 0x82: frames with headers, counters and row tags, at a rate or as fast as they are taken."""
+
+import heapq
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .faults import Fault, Kind
+
+ROWS, ROW_BYTES = 250, 50
+COMPACT_BYTES = ROWS * ROW_BYTES
+FRAME_BYTES = 16 + ROWS * (ROW_BYTES + 2)
+MAGIC, WORD1 = 0x63606300, 0x00100021
+STAMP_BYTES = 8
+
+
+@dataclass(frozen=True)
+class Run:
+    """Frames that were sent one after another."""
+
+    first: int
+    count: int
+
+
+def wire_frames(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Compact frames, uint8 [n, 12500], as they are on the wire, uint8 [n, 13016], with both counters 0."""
+    wire = np.zeros((len(frames), FRAME_BYTES), np.uint8)
+    wire[:, :8] = np.array([MAGIC, WORD1], "<u4").view(np.uint8)
+    lines = wire[:, 16:].reshape(len(frames), ROWS, ROW_BYTES + 2)
+    lines[:, :, :ROW_BYTES] = frames.reshape(len(frames), ROWS, ROW_BYTES)
+    lines[:, :, ROW_BYTES:] = np.arange(ROWS, dtype="<u2").view(np.uint8).reshape(ROWS, 2)
+    return wire
+
+
+class Stream:
+    """An endless camera that plays its pictures over and over.
+
+    With a rate it free-runs by the clock, whether it is read or not: what the host does not take in time is dropped in
+    whole frames and counted. Without one (0) there is always a next frame and none is dropped. With `stamp` the first
+    8 bytes of pixels are the frame's number, so that no two frames are the same.
+    """
+
+    def __init__(
+        self,
+        frames: NDArray[np.uint8],
+        *,
+        rate_hz: float = 0.0,
+        lines: int = 0,
+        nbytes: int = 0,
+        buffer_frames: int = 64,
+        stamp: bool = True,
+        faults: tuple[Fault, ...] = (),
+    ) -> None:
+        self._wire = wire_frames(frames)
+        self._words = self._wire[:, :16].view("<u4")
+        self._rate_hz = rate_hz
+        self._lines, self._nbytes = lines, nbytes
+        self._buffer_frames = buffer_frames
+        self._stamp = stamp
+        self._faults: list[Fault] = list(faults)
+        heapq.heapify(self._faults)
+        self._start_s = time.monotonic()
+        self._silent_until_s = 0.0
+        self._pieces: list[memoryview] = []
+        self._breaks: list[Fault | None] = []
+        """With each piece: what happens behind it."""
+        self.next_frame = 0
+        self.sent: list[Run] = []
+        self.dropped = 0
+        """Frames that the host did not take in time."""
+        self.done: list[Fault] = []
+
+    def add(self, fault: Fault) -> None:
+        """One more fault; at a frame that has gone by: now."""
+        heapq.heappush(self._faults, fault)
+
+    def power_on(self, lines: int, nbytes: int) -> None:
+        """Start anew with the counters at these values for the next frame; what was in the buffer is gone."""
+        self._pieces.clear()
+        self._breaks.clear()
+        self._skip_missed(time.monotonic())
+        self._lines = lines - ROWS * self.next_frame
+        self._nbytes = nbytes - COMPACT_BYTES * self.next_frame
+
+    def wait_s(self, now_s: float) -> float:
+        """How long until there is something to send."""
+        if self._pieces:
+            return 0.0
+        wait_s = self._silent_until_s - now_s
+        if self._rate_hz:
+            wait_s = max(wait_s, self._start_s + (self.next_frame + 1) / self._rate_hz - now_s)
+        return max(0.0, wait_s)
+
+    def pull(self, limit: int, now_s: float) -> tuple[list[memoryview], Fault | None]:
+        """The next bytes, `limit` at most, and what happens then. They are valid until the next call."""
+        taken: list[memoryview] = []
+        while limit > 0:
+            if not self._pieces and not self._compose(limit, now_s):
+                break
+            piece, happens = self._pieces[0], self._breaks[0]
+            if len(piece) > limit:
+                taken.append(piece[:limit])
+                self._pieces[0] = piece[limit:]
+                break
+            if len(piece):
+                taken.append(piece)
+                limit -= len(piece)
+            del self._pieces[0], self._breaks[0]
+            if happens is not None:
+                return taken, happens
+        return taken, None
+
+    def _compose(self, wanted_bytes: int, now_s: float) -> bool:
+        """Put the next frames in front, up to the next fault; false if none is due."""
+        if self.wait_s(now_s) > 0:
+            return False
+        self._skip_missed(now_s)
+        while self._faults and self._faults[0].frame <= self.next_frame:
+            if not self._misbehave(heapq.heappop(self._faults), now_s):
+                return bool(self._pieces)
+        count = -(-wanted_bytes // FRAME_BYTES)
+        if self._rate_hz:
+            count = min(count, int((now_s - self._start_s) * self._rate_hz) - self.next_frame)
+        if self._faults:
+            count = min(count, self._faults[0].frame - self.next_frame)
+        self._push(self._frames(max(1, count)).reshape(-1))
+        return True
+
+    def _frames(self, count: int) -> NDArray[np.uint8]:
+        """The next frames, fewer where the pictures begin again, uint8 [n, 13016]."""
+        at = self.next_frame % len(self._wire)
+        count = min(count, len(self._wire) - at)
+        index = np.arange(self.next_frame, self.next_frame + count, dtype=np.int64)
+        words = self._words[at : at + count]
+        words[:, 2] = (self._nbytes + COMPACT_BYTES * index) & 0xFFFFFFFF
+        words[:, 3] = (self._lines + ROWS * index) & 0xFFFFFFFF
+        wire = self._wire[at : at + count]
+        if self._stamp:
+            wire[:, 16 : 16 + STAMP_BYTES] = index.astype("<i8").view(np.uint8).reshape(count, STAMP_BYTES)
+        if self.sent and self.sent[-1].first + self.sent[-1].count == self.next_frame:
+            self.sent[-1] = Run(self.sent[-1].first, self.sent[-1].count + count)
+        else:
+            self.sent.append(Run(self.next_frame, count))
+        self.next_frame += count
+        return wire
+
+    def _push(self, data: NDArray[np.uint8], happens: Fault | None = None) -> None:
+        self._pieces.append(memoryview(data))  # type: ignore[arg-type]
+        self._breaks.append(happens)
+
+    def _skip_missed(self, now_s: float) -> None:
+        if self._rate_hz:
+            oldest = int((now_s - self._start_s) * self._rate_hz) - self._buffer_frames
+            if oldest > self.next_frame:
+                self.dropped += oldest - self.next_frame
+                self.next_frame = oldest
+
+    def _misbehave(self, fault: Fault, now_s: float) -> bool:
+        """Put what is wrong in front of the next frame; false if nothing may follow for now."""
+        self.done.append(fault)
+        match fault.kind:
+            case Kind.DROP:
+                self.next_frame += fault.count
+            case Kind.REPEAT:
+                again = self._frames(1).copy()
+                for _ in range(1 + fault.count):
+                    self._push(again.reshape(-1))
+            case Kind.FLIP:
+                spoilt = self._frames(1).reshape(-1).copy()
+                spoilt[fault.offset] ^= fault.count
+                self._push(spoilt)
+            case Kind.LOSE:
+                whole = self._frames(1).reshape(-1).copy()
+                self._push(np.delete(whole, slice(fault.offset, fault.offset + fault.count)))
+            case Kind.JUNK:
+                self._push(np.random.default_rng(fault.frame).integers(0, 256, fault.count, np.uint8))
+            case Kind.CUT:
+                whole = self._frames(1).reshape(-1).copy()
+                self._push(whole[: fault.offset], fault)
+                self._push(whole[fault.offset :])
+            case Kind.SILENCE:
+                self._silent_until_s = now_s + fault.seconds
+                return False
+            case Kind.RESTART:
+                self.power_on(fault.offset, fault.count)
+            case Kind.STALL | Kind.BABBLE | Kind.UNPLUG:
+                self._push(np.empty(0, np.uint8), fault)
+                return False
+        return True

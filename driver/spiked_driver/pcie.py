@@ -11,7 +11,7 @@ from spiked.native._wire import PcieParser
 
 from spiked.errors import SourceError
 from spiked.ring import Condition, DeviceState, End, EndReason, Gap
-from spiked.sensor import Sensor
+from spiked.sensor import Intrinsics, Sensor
 from spiked_driver.framing import Framing, FramingBenchmark, benchmark_framing
 from spiked_driver.source import READ_WAIT_S, Chunk
 
@@ -38,9 +38,11 @@ class PcieFraming(Framing):
 class PcieSource:
     """A camera that is read from a path: the capture card's device node, a pipe, or a file of its raw stream."""
 
-    def __init__(self, path: str | os.PathLike[str], *, frame_rate_hz: float = 20_000.0) -> None:
+    def __init__(
+        self, path: str | os.PathLike[str], *, frame_rate_hz: float = 20_000.0, intrinsics: Intrinsics | None = None
+    ) -> None:
         self.path = Path(path)
-        self._sensor = Sensor(PCIE_SIZE, PCIE_SIZE, frame_rate_hz)
+        self._sensor = Sensor(PCIE_SIZE, PCIE_SIZE, frame_rate_hz, intrinsics=intrinsics)
         self._framing = PcieFraming()
         self._block = bytearray(BLOCK_BYTES)
         self._file: int | None = None

@@ -1,6 +1,7 @@
-"""Sources by a line of text: `replay:FILE?pace=1&repeat=2&range=0:8000` and `sim:?seed=1&seconds=2`, with faults."""
+"""Sources by a line of text: `replay:FILE?pace=1&repeat=2&range=0:8000`, `sim:?seed=1&seconds=2`, `usb0?fov=40`, ..."""
 
-from typing import Annotated, Any, TypeVar
+import re
+from typing import Annotated, Any, Literal, TypeVar
 from urllib.parse import parse_qs
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
@@ -8,12 +9,17 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from spiked.errors import SourceError
 from spiked.recording import open_recording
 from spiked.ring import Cause
-from spiked.sensor import Sensor
+from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import MotionKind
 from spiked_driver.faults import Faults, FaultySource, Loss, Stall
+from spiked_driver.framing import USB_HEIGHT, USB_WIDTH
+from spiked_driver.pcie import PCIE_SIZE, PcieSource
 from spiked_driver.replay import ReplaySource
 from spiked_driver.simulated import SimulatedSource
 from spiked_driver.source import Source
+from spiked_driver.usb import RATE_HZ, SILENCE_S, UsbOptions, UsbSource
+from spiked_driver.usb_budget import TRANSFER_BYTES
+from spiked_driver.usb_cameras import CameraChoice
 
 Pace = Annotated[float, Field(ge=0), BeforeValidator(lambda value: 0.0 if value == "max" else value)]
 
@@ -92,17 +98,56 @@ class SimulationOptions(SourceOptions):
     """For the simulation; they change its speed, not its frames."""
 
 
-_Kind = TypeVar("_Kind", bound=SourceOptions)
+class CameraOptions(_Options):
+    """Options of every real camera."""
+
+    rate: float = Field(RATE_HZ, gt=0)
+    """Frames a second; the stream does not tell."""
+    fov: float | None = Field(None, ge=1, le=170)
+    """Horizontal field of view in degrees, for a pinhole camera with square pixels; without it optics are unknown."""
+
+    def intrinsics(self, width: int, height: int) -> Intrinsics | None:
+        """The optics, where known."""
+        return None if self.fov is None else Intrinsics.from_fov(width, height, self.fov)
+
+
+class UsbCameraOptions(CameraOptions):
+    """Options of `usb0`, `usb:SERIAL` and `usb:BUS-PORT`."""
+
+    hide_ms: float | None = Field(None, gt=0, le=10_000)
+    """How long the host may be busy without a loss; not given: 250, or what the kernel's limit allows."""
+    transfer_kib: int = Field(TRANSFER_BYTES >> 10, ge=16, le=16 << 10)
+    transfers: Literal["queued", "single"] = "queued"
+    """`single`: one read at a time, for machines where queued reads do not work."""
+    silence_s: float = Field(SILENCE_S, gt=0)
+    """When nothing came for so long, the camera is lost."""
+
+
+_Kind = TypeVar("_Kind", bound=_Options)
+_USB = re.compile(r"usb\d*(:|\?|$)")
+
+
+def is_camera(spec: str) -> bool:
+    """Whether the text names a real camera, which cannot wait and whose reader should not either."""
+    return spec.startswith("pcie:") or _USB.match(spec) is not None
 
 
 def open_source(spec: str) -> Source:
     """The source that a line of text names; `open` it to start. Raises SourceError or RecordingError in one line."""
+    if _USB.match(spec):
+        return _usb(spec)
     kind, separator, rest = spec.partition(":")
     if not separator:
-        raise SourceError(f"source {spec!r} names no kind: write replay:FILE or sim:")
+        raise SourceError(f"source {spec!r} names no kind: write usb0, pcie:PATH, replay:FILE or sim:")
     target, _, query = rest.partition("?")
     source: Source
     match kind:
+        case "pcie":
+            if not target:
+                raise SourceError(f"source {spec!r} names no path: write pcie:PATH, a device node, a pipe or a file")
+            card = _parse(CameraOptions, query, spec)
+            optics = card.intrinsics(PCIE_SIZE, PCIE_SIZE)
+            return PcieSource(target, frame_rate_hz=card.rate, intrinsics=optics)
         case "replay":
             replay = _parse(ReplayOptions, query, spec)
             source, faults = _replay(target, replay), replay.faults()
@@ -112,8 +157,24 @@ def open_source(spec: str) -> Source:
             simulation = _parse(SimulationOptions, query, spec)
             source, faults = _simulated(simulation), simulation.faults()
         case _:
-            raise SourceError(f"source {spec!r}: there is no kind {kind!r}, only replay:FILE and sim:")
+            raise SourceError(f"source {spec!r}: there is no kind {kind!r}, only usb0, pcie:PATH, replay:FILE and sim:")
     return source if faults == Faults(seed=faults.seed) else FaultySource(source, faults)
+
+
+def _usb(spec: str) -> Source:
+    target, _, query = spec.partition("?")
+    options = _parse(UsbCameraOptions, query, spec)
+    return UsbSource(
+        CameraChoice.parse(target),
+        UsbOptions(
+            rate_hz=options.rate,
+            intrinsics=options.intrinsics(USB_WIDTH, USB_HEIGHT),
+            hide_s=None if options.hide_ms is None else options.hide_ms / 1e3,
+            transfer_bytes=options.transfer_kib << 10,
+            asynchronous=options.transfers == "queued",
+            silence_s=options.silence_s,
+        ),
+    )
 
 
 def _replay(path: str, options: ReplayOptions) -> Source:

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from spiked_driver import Chunk, Faults, FaultySource, Loss, Source, Stall, acquire
 from spiked_driver.replay import ReplaySource
 from spiked_driver.simulated import SimulatedSource
-from spiked_driver.spec import open_source
+from spiked_driver.spec import is_camera, open_source
 
 from spiked.errors import SourceError, SpikedError
 from spiked.recording import RecordingWriter, open_recording
 from spiked.ring import Cause, DeviceState, End, EndReason, Frames, Gap, Policy, RingReader, RingWriter
-from spiked.sensor import BitOrder, Layout, Sensor
+from spiked.sensor import BitOrder, Intrinsics, Layout, Sensor
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared"
 FRAMES = 50
@@ -161,11 +161,35 @@ def test_a_simulation_is_described_by_its_options() -> None:
     assert source.frames == 100
 
 
+def test_cameras_are_described_without_being_there() -> None:
+    usb, card = open_source("usb:2-1.4?fov=40&rate=10000"), open_source("pcie:/dev/JR6101?fov=50")
+    assert (usb.sensor.width, usb.sensor.height, usb.sensor.frame_rate_hz) == (400, 250, 10_000)
+    assert usb.sensor.intrinsics == Intrinsics.from_fov(400, 250, 40)
+    assert (card.sensor.width, card.sensor.height, card.sensor.frame_rate_hz) == (1000, 1000, 20_000)
+    assert card.sensor.intrinsics == Intrinsics.from_fov(1000, 1000, 50)
+    assert open_source("usb0").sensor.intrinsics is None
+    assert not open_source("usb0").waits
+
+
+@pytest.mark.parametrize(
+    ("spec", "camera"),
+    [("usb0", True), ("usb0?fov=4", True), ("usb:7", True), ("pcie:/dev/JR6101", True), ("sim:", False)],
+)
+def test_cameras_are_told_from_files_and_simulations(spec: str, camera: bool) -> None:
+    assert is_camera(spec) is camera
+
+
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
         ("camera", "names no kind"),
-        ("usb9:", "no kind 'usb9'"),
+        ("parallel:", "no kind 'parallel'"),
+        ("usb9:", "names no USB camera"),
+        ("usb:", "names no USB camera"),
+        ("usb0?pace=1", "no option pace.*rate.*hide_ms"),
+        ("usb0?fov=500", "fov=500"),
+        ("pcie:", "names no path"),
+        ("pcie:/dev/JR6101?rate=0", "rate=0"),
         ("sim:room.ply", "options only"),
         ("sim:?sead=1", "no option sead.*seed"),
         ("sim:?width=wide", "width=wide"),

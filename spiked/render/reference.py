@@ -6,6 +6,7 @@ rounding of a float64 decides which side of 1/255 an alpha falls on. Formulas: Z
 used by 3D Gaussian splatting (Kerbl et al. 2023).
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,43 +92,122 @@ def render(
     return (values[:, :, 0] if values.shape[2] == 1 else values), alpha, depth
 
 
-def _render_one(
-    parameters: Parameters, camera: Camera, pose: tuple[Tensor, Tensor], background: float, near: float
-) -> tuple[Tensor, Tensor, Tensor]:
+def render_moving(
+    parameters: Parameters,
+    camera: Camera,
+    rotations: ArrayLike,
+    windows: ArrayLike,
+    *,
+    channels: NDArray[np.uint8] | None = None,
+    background: float = 0.0,
+    near: float = 0.01,
+) -> Tensor:
+    """Values as of `Rasteriser.forward_moving`, differentiable in the parameters; windows [2, H, W]."""
+    turns = torch.tensor(np.asarray(rotations, np.float64))
+    start, stop = torch.tensor(np.asarray(windows, np.float64))
+    projections = [
+        _project(
+            parameters,
+            camera,
+            (torch.linalg.matrix_exp(_cross(parameters.turns[s])) @ turns[s], parameters.centres[s]),
+        )
+        for s in range(len(turns))
+    ]
+    values = torch.zeros(camera.height, camera.width, parameters.colours.shape[1], dtype=torch.float64)
+    for s, (begin, end) in enumerate(itertools.pairwise(projections)):
+        low, high = start.clamp(min=s), stop.clamp(max=s + 1)
+        length = (high - low).clamp(min=0)
+        weight = torch.where(length > 0, length / (stop - start), 0.0)
+        if not weight.any():
+            continue
+        blur = (weight * length**2).sum() / weight.sum() / 12
+        time = torch.where(length > 0, (low + high) / 2 - s - 0.5, 0.0)
+        motion = end.centres - begin.centres
+        half = (begin.halves + end.halves) / 2
+        sharp = half @ half.transpose(1, 2) + DILATION_PX2 * torch.eye(2, dtype=torch.float64)
+        blurred = sharp + blur * motion[:, :, None] * motion[:, None, :]
+        fade = torch.sqrt(torch.linalg.det(sharp) / torch.linalg.det(blurred))
+        order = torch.argsort((begin.z + end.z).detach(), stable=True)
+        order = order[(torch.minimum(begin.z, end.z)[order].detach() >= near)]
+        centres = (begin.centres + end.centres) / 2
+        splats = _OnScreen(centres[order], blurred[order], ((begin.z + end.z) / 2)[order], motion[order])
+        opacity = (torch.sigmoid(parameters.opacity_logits) * fade)[order]
+        one, _, _ = _composite(camera, splats, opacity, parameters.colours[order], background, time)
+        values = values + weight[:, :, None] * one
+    if channels is not None:
+        values = torch.gather(values, 2, torch.tensor(channels.astype(np.int64))[:, :, None])
+    return values[:, :, 0] if values.shape[2] == 1 else values
+
+
+@dataclass(frozen=True)
+class _Projection:
+    centres: Tensor
+    """Means on screen, px; [N, 2]."""
+    halves: Tensor
+    """M whose M M^T is the covariance on screen without dilation; [N, 2, 3]."""
+    z: Tensor
+
+
+@dataclass(frozen=True)
+class _OnScreen:
+    """By depth: means [N, 2], covariances [N, 2, 2], depths [N], and motion over a sub-frame [N, 2]."""
+
+    centres: Tensor
+    covariances: Tensor
+    z: Tensor
+    motion: Tensor | None = None
+
+
+def _project(parameters: Parameters, camera: Camera, pose: tuple[Tensor, Tensor]) -> _Projection:
     rotation, centre = pose
     k = camera.intrinsics
-    to_camera = rotation.T
-    points = (parameters.means - centre) @ rotation
-    order = torch.argsort(points[:, 2].detach(), stable=True)
-    order = order[points[order, 2].detach() >= near]
-    points = points[order]
-    x, y, z = points.unbind(1)
+    x, y, z = ((parameters.means - centre) @ rotation).unbind(1)
     limit_x = SLOPE_LIMIT * 0.5 * camera.width / k.fx
     limit_y = SLOPE_LIMIT * 0.5 * camera.height / k.fy
     zero = torch.zeros_like(z)
     slope_x = (x / z).clamp(-limit_x, limit_x)
     slope_y = (y / z).clamp(-limit_y, limit_y)
     jacobian = torch.stack([k.fx / z, zero, -k.fx * slope_x / z, zero, k.fy / z, -k.fy * slope_y / z], 1).view(-1, 2, 3)
-    spread = _rotations(parameters.quats[order]) * torch.exp(parameters.log_scales[order])[:, None, :]
-    projected = jacobian @ to_camera @ spread
-    covariance = projected @ projected.transpose(1, 2) + DILATION_PX2 * torch.eye(2, dtype=torch.float64)
-    conic = torch.linalg.inv(covariance)
+    spread = _rotations(parameters.quats) * torch.exp(parameters.log_scales)[:, None, :]
+    return _Projection(torch.stack([k.fx * x / z + k.cx, k.fy * y / z + k.cy], 1), jacobian @ rotation.T @ spread, z)
 
+
+def _render_one(
+    parameters: Parameters, camera: Camera, pose: tuple[Tensor, Tensor], background: float, near: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    seen = _project(parameters, camera, pose)
+    order = torch.argsort(seen.z.detach(), stable=True)
+    order = order[seen.z[order].detach() >= near]
+    half = seen.halves[order]
+    covariance = half @ half.transpose(1, 2) + DILATION_PX2 * torch.eye(2, dtype=torch.float64)
+    splats = _OnScreen(seen.centres[order], covariance, seen.z[order])
+    opacity = torch.sigmoid(parameters.opacity_logits[order])
+    return _composite(camera, splats, opacity, parameters.colours[order], background, None)
+
+
+def _composite(
+    camera: Camera, splats: _OnScreen, opacity: Tensor, colours: Tensor, background: float, time: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Values [H, W, C], alpha and depth sum [H, W] of splats in order of depth; time [H, W] where they move."""
+    conic = torch.linalg.inv(splats.covariances)
     rows = torch.arange(camera.height, dtype=torch.float64) + 0.5
     columns = torch.arange(camera.width, dtype=torch.float64) + 0.5
-    dx = columns[None, None, :] - (k.fx * x / z + k.cx)[:, None, None]
-    dy = rows[None, :, None] - (k.fy * y / z + k.cy)[:, None, None]
+    dx = columns[None, None, :] - splats.centres[:, 0, None, None]
+    dy = rows[None, :, None] - splats.centres[:, 1, None, None]
+    if splats.motion is not None and time is not None:
+        dx = dx - splats.motion[:, 0, None, None] * time
+        dy = dy - splats.motion[:, 1, None, None] * time
     a, b, c = (conic[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
     power = -0.5 * (a * dx**2 + c * dy**2) - b * dx * dy
-    alpha = torch.sigmoid(parameters.opacity_logits[order])[:, None, None] * torch.exp(power)
+    alpha = opacity[:, None, None] * torch.exp(power)
     alpha = torch.where(alpha >= ALPHA_CUT, alpha.clamp(max=ALPHA_CAP), 0.0)
 
     through = torch.cumprod(1 - alpha, 0)
     before = torch.cat([torch.ones_like(through[:1]), through[:-1]])
     share = alpha * before
     left = through[-1] if len(through) else torch.ones(camera.height, camera.width, dtype=torch.float64)
-    values = torch.einsum("nhw,nc->hwc", share, parameters.colours[order]) + background * left[:, :, None]
-    return values, 1 - left, torch.einsum("nhw,n->hw", share, z)
+    values = torch.einsum("nhw,nc->hwc", share, colours) + background * left[:, :, None]
+    return values, 1 - left, torch.einsum("nhw,n->hw", share, splats.z)
 
 
 def _cross(v: Tensor) -> Tensor:

@@ -53,6 +53,16 @@ struct Record {
 };
 static_assert(sizeof(Record) == 64, "a record is a cache line");
 
+// What a splat that crosses the image during a sub-frame adds to its record, whose ellipse then holds all of its path.
+// p, q, r and the opacity are those of the splat blurred by its motion; at time t in [-1/2, 1/2] from the middle of the
+// sub-frame, u and w are smaller by u_rate t and w_rate t.
+struct Motion {
+    float p, q, r;
+    float log2_opacity;
+    float u_rate, w_rate;
+    float unused[2];
+};
+
 // A splat seen by a tile. Slots are numbered by splat, so that a splat's sums lie together.
 struct Entry {
     uint32_t slot, rank, blocks;
@@ -72,12 +82,14 @@ struct Pairs {
 };
 
 // Sums over a tile's pixels for one pair; v = alpha dL/dalpha, and alpha T is the pixel's share of the splat.
-enum Sum { kV, kVu, kVw, kVuu, kVuw, kVww, kShare, kColour0, kColour1, kColour2, kSums };
-static constexpr int slot_floats(int colours) { return colours == 1 ? 8 : 16; }
+// t is the pixel's time in the sub-frame.
+enum Sum { kV, kVu, kVw, kVuu, kVuw, kVww, kShare, kColour0, kColour1, kColour2, kVut, kVwt, kSums };
+static constexpr int slot_floats(int colours, bool moving) { return colours == 1 && !moving ? 8 : 16; }
 
 struct Tile {
     const Lens* lens;
     const Record* records;
+    const Motion* motions;  // by rank, or null when the camera stands still
     const Entry* entries;
     int count;
     int tile_x, tile_y;
@@ -96,6 +108,17 @@ struct Planes {
     const float* weight;  // [height][width], or null for `uniform_weight`
     float uniform_weight;
     const uint8_t* channels;  // [height][width], or null when a pixel sees every colour
+    // While the camera moves, [height][width], the times when a pixel's window begins and ends: its weight is the share
+    // of its window that lies in the sub-frame [sub_frame, sub_frame + 1].
+    const float *start, *stop;
+    float sub_frame;
+};
+
+// The two poses between which the camera moves during a sub-frame.
+struct Passage {
+    View begin, end;
+    float blur;        // how much of the square of its motion is added to a splat's covariance
+    float time_reach;  // times of pixels are within this of the middle
 };
 
 // Sums over sub-poses; written back to images when the tile is done.
@@ -154,10 +177,20 @@ struct Kernels {
     void (*store)(const Tile&, const TileImage*, int colours, const Planes&, float* values, float* alpha, float* depth);
     // d_values [height][width] or [height][width][3]; slots are slot_floats(colours) floats each.
     void (*backward)(const Tile&, int colours, const float* d_values, const Planes&, const TileState&, float* slots);
+    // As project, for a camera on its way.
+    void (*project_moving)(const Prepared&, const Lens&, const Passage&, int count, int first, int last,
+                           Record* records, Motion* motions, uint32_t* keys);
     // Adds one view's gradients of the group [first, first + kGroup); sums [kSums][kGroup] are zero where not visible.
     // pose: 3 of rotation, then 3 of the mean, added up.
     void (*unproject)(const Prepared&, const Lens&, const View&, int first, const float* sums, const uint8_t* visible,
                       int colours, const SplatGradients&, double pose[6]);
+    // As unproject, for a camera on its way, by the poses of both ends.
+    void (*unproject_moving)(const Prepared&, const Lens&, const Passage&, int first, const float* sums,
+                             const uint8_t* visible, int colours, const SplatGradients&, double pose_begin[6],
+                             double pose_end[6]);
+    // Sums over `count` pixels' windows of their weights in a sub-frame, and of those times the square of the share of
+    // the sub-frame that they cover; and the farthest time from its middle.
+    void (*cover)(const Planes&, int64_t count, double* weight, double* square, float* time_reach);
     // From the gradients of spread, log opacity and so on to those of the parameters, for splats [first, last); zeros
     // where out.radius_px is 0. share_scale multiplies the contributions.
     void (*finish)(const SplatArrays&, const Prepared&, const SplatGradients&, int first, int last, float share_scale,

@@ -9,11 +9,13 @@ namespace {
 #include "vector.inl"
 #include "project.inl"
 #include "emit.inl"
+#include "moving.inl"
 #include "raster.inl"
 #include "losses.inl"
 // clang-format on
 }  // namespace
 
-const Kernels kAvx2 = {"avx2",    prepare, project, emit,   forward, store_tile,   backward,
-                       unproject, finish,  adam,    robust, ssim,    multiply_add, kLanes};
+const Kernels kAvx2 = {"avx2",    prepare,          project, emit,   forward, store_tile, backward, project_moving,
+                       unproject, unproject_moving, cover,   finish, adam,    robust,     ssim,     multiply_add,
+                       kLanes};
 }  // namespace raster

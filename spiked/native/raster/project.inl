@@ -105,10 +105,25 @@ static inline Projection project_lanes(const Prepared& s, const Lens& lens, cons
     return o;
 }
 
-static void project(const Prepared& splats, const Lens& lens, const View& view, int count, int first, int last,
-                    Record* records, uint32_t* keys) {
+// Writes kLanes records of splats that are seen, and their keys.
+static inline void write_records(const Vec fields[11], Int visible, int base, int count, Record* records,
+                                 uint32_t* keys) {
     alignas(64) float out[11][kLanes];
     alignas(64) int32_t seen[kLanes];
+    for (int k = 0; k < 11; ++k) store(out[k], fields[k]);
+    __builtin_memcpy(seen, &visible, sizeof seen);
+    for (int i = 0; i < kLanes && base + i < count; ++i) {
+        keys[base + i] = kCulled;
+        if (!seen[i]) continue;
+        __builtin_memcpy(&keys[base + i], &out[6][i], 4);
+        // The fields are the record's first eleven floats, in order.
+        float* record = &records[base + i].x;
+        for (int k = 0; k < 11; ++k) record[k] = out[k][i];
+    }
+}
+
+static void project(const Prepared& splats, const Lens& lens, const View& view, int count, int first, int last,
+                    Record* records, uint32_t* keys) {
     for (int base = first; base < last; base += kLanes) {
         Projection o = project_lanes(splats, lens, view, base);
         Vec u = o.raw_x * lens.fx + lens.cx, v = o.raw_y * lens.fy + lens.cy;
@@ -125,20 +140,60 @@ static void project(const Prepared& splats, const Lens& lens, const View& view, 
         Int visible = inside & sound & (o.z >= lens.near) & (reach >= 0.0f);
         const Vec fields[11] = {u,         v, o.p, o.q, o.r, log2_opacity, o.z, radius, half_y, o.xy / o.xx * half_x,
                                 1.0f / o.p};
-        for (int k = 0; k < 11; ++k) store(out[k], fields[k]);
-        __builtin_memcpy(seen, &visible, sizeof seen);
-        for (int i = 0; i < kLanes && base + i < count; ++i) {
-            keys[base + i] = kCulled;
-            if (!seen[i]) continue;
-            __builtin_memcpy(&keys[base + i], &out[6][i], 4);
-            // The fields are the record's first eleven floats, in order.
-            float* record = &records[base + i].x;
-            for (int k = 0; k < 11; ++k) record[k] = out[k][i];
-        }
+        write_records(fields, visible, base, count, records, keys);
     }
 }
 
 static inline void add(float* p, Vec v) { store(p, load(p) + v); }
+
+// Adds the gradients of one projection by the splat and the pose: g_u, g_v by the mean on screen, d_m0, d_m1 by M's
+// rows.
+static inline void unproject_lanes(const Prepared& splats, const Lens& lens, const View& view, const Projection& o,
+                                   Int seen, int base, int into, Vec g_u, Vec g_v, const Vec d_m0[3], const Vec d_m1[3],
+                                   const SplatGradients& out, double pose[6]) {
+    Vec jx = lens.fx * o.over_z, jy = lens.fy * o.over_z;
+    Vec d_spread[9], d_jx{}, d_jy{}, d_jxz{}, d_jyz{};
+    for (int k = 0; k < 3; ++k) {
+        const Vec d0 = d_m0[k], d1 = d_m1[k];
+        d_jx += d0 * o.b[k];
+        d_jy += d1 * o.b[3 + k];
+        d_jxz += d0 * o.b[6 + k];
+        d_jyz += d1 * o.b[6 + k];
+        Vec b0 = jx * d0, b1 = jy * d1, b2 = -(jx * o.slope_x * d0 + jy * o.slope_y * d1);
+        for (int row = 0; row < 3; ++row) {
+            const float* w = view.rotation + row;
+            d_spread[3 * row + k] = choose(seen, w[0] * b0 + w[3] * b1 + w[6] * b2, Vec{});
+        }
+    }
+    Vec over_z2 = o.over_z * o.over_z;
+    // Where the slope is clamped, jxz = -fx slope / z depends on z only.
+    Vec free_x = choose(o.slope_x == o.raw_x, splat(1.0f), Vec{});
+    Vec free_y = choose(o.slope_y == o.raw_y, splat(1.0f), Vec{});
+    Vec gx = jx * g_u - free_x * lens.fx * over_z2 * d_jxz;
+    Vec gy = jy * g_v - free_y * lens.fy * over_z2 * d_jyz;
+    Vec gz = lens.fx * over_z2 * (o.slope_x * d_jxz + free_x * o.raw_x * d_jxz - d_jx - o.x * g_u) +
+             lens.fy * over_z2 * (o.slope_y * d_jyz + free_y * o.raw_y * d_jyz - d_jy - o.y * g_v);
+    Vec d_mean[3];
+    for (int k = 0; k < 3; ++k) {
+        const float* w = view.rotation + k;
+        d_mean[k] = choose(seen, w[0] * gx + w[3] * gy + w[6] * gz, Vec{});
+        add(out.mean[k] + into, d_mean[k]);
+    }
+    for (int k = 0; k < 9; ++k) add(out.spread[k] + into, d_spread[k]);
+
+    for (int k = 0; k < 3; ++k) {
+        int a = (k + 1) % 3, b = (k + 2) % 3;
+        Vec turn = d_mean[a] * o.offset[b] - d_mean[b] * o.offset[a];
+        for (int j = 0; j < 3; ++j)
+            turn -= d_spread[3 * b + j] * load(splats.spread[3 * a + j] + base) -
+                    d_spread[3 * a + j] * load(splats.spread[3 * b + j] + base);
+        turn = choose(seen, turn, Vec{});
+        for (int i = 0; i < kLanes; ++i) {
+            pose[k] += turn[i];
+            pose[3 + k] += d_mean[k][i];
+        }
+    }
+}
 
 static void unproject(const Prepared& splats, const Lens& lens, const View& view, int first, const float* sums,
                       const uint8_t* visible, int colours, const SplatGradients& out, double pose[6]) {
@@ -160,48 +215,12 @@ static void unproject(const Prepared& splats, const Lens& lens, const View& view
         Vec c_xy = scale * scale * o.p * (o.q * suu + o.r * suw);
         Vec c_yy = scale * scale * (o.q * (o.q * suu + 2 * o.r * suw) + o.r * o.r * sww);
 
-        Vec jx = lens.fx * o.over_z, jy = lens.fy * o.over_z;
-        Vec d_spread[9], d_jx{}, d_jy{}, d_jxz{}, d_jyz{};
+        Vec d_m0[3], d_m1[3];
         for (int k = 0; k < 3; ++k) {
-            Vec d0 = c_xx * o.m0[k] + c_xy * o.m1[k], d1 = c_xy * o.m0[k] + c_yy * o.m1[k];
-            d_jx += d0 * o.b[k];
-            d_jy += d1 * o.b[3 + k];
-            d_jxz += d0 * o.b[6 + k];
-            d_jyz += d1 * o.b[6 + k];
-            Vec b0 = jx * d0, b1 = jy * d1, b2 = -(jx * o.slope_x * d0 + jy * o.slope_y * d1);
-            for (int row = 0; row < 3; ++row) {
-                const float* w = view.rotation + row;
-                d_spread[3 * row + k] = choose(seen, w[0] * b0 + w[3] * b1 + w[6] * b2, Vec{});
-            }
+            d_m0[k] = c_xx * o.m0[k] + c_xy * o.m1[k];
+            d_m1[k] = c_xy * o.m0[k] + c_yy * o.m1[k];
         }
-        Vec over_z2 = o.over_z * o.over_z;
-        // Where the slope is clamped, jxz = -fx slope / z depends on z only.
-        Vec free_x = choose(o.slope_x == o.raw_x, splat(1.0f), Vec{});
-        Vec free_y = choose(o.slope_y == o.raw_y, splat(1.0f), Vec{});
-        Vec gx = jx * g_u - free_x * lens.fx * over_z2 * d_jxz;
-        Vec gy = jy * g_v - free_y * lens.fy * over_z2 * d_jyz;
-        Vec gz = lens.fx * over_z2 * (o.slope_x * d_jxz + free_x * o.raw_x * d_jxz - d_jx - o.x * g_u) +
-                 lens.fy * over_z2 * (o.slope_y * d_jyz + free_y * o.raw_y * d_jyz - d_jy - o.y * g_v);
-        Vec d_mean[3];
-        for (int k = 0; k < 3; ++k) {
-            const float* w = view.rotation + k;
-            d_mean[k] = choose(seen, w[0] * gx + w[3] * gy + w[6] * gz, Vec{});
-            add(out.mean[k] + into, d_mean[k]);
-        }
-        for (int k = 0; k < 9; ++k) add(out.spread[k] + into, d_spread[k]);
-
-        for (int k = 0; k < 3; ++k) {
-            int a = (k + 1) % 3, b = (k + 2) % 3;
-            Vec turn = d_mean[a] * o.offset[b] - d_mean[b] * o.offset[a];
-            for (int j = 0; j < 3; ++j)
-                turn -= d_spread[3 * b + j] * load(splats.spread[3 * a + j] + base) -
-                        d_spread[3 * a + j] * load(splats.spread[3 * b + j] + base);
-            turn = choose(seen, turn, Vec{});
-            for (int i = 0; i < kLanes; ++i) {
-                pose[k] += turn[i];
-                pose[3 + k] += d_mean[k][i];
-            }
-        }
+        unproject_lanes(splats, lens, view, o, seen, base, into, g_u, g_v, d_m0, d_m1, out, pose);
     }
 }
 

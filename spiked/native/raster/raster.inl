@@ -19,23 +19,34 @@ struct Centres {
 static constexpr Centres kCentres;
 
 // What the inner loops read of an entry. u = p x + q y + s and w = r y + t for a pixel centre (x, y) in the tile.
-enum Local { kP, kQ, kS, kR, kT, kLog2Opacity, kZ, kC };
-constexpr int local_floats(int colours) { return colours == 1 ? 8 : 16; }
+// While the camera moves, u is smaller by u_rate times the pixel's time, and w by w_rate times it.
+enum Local { kP, kQ, kS, kR, kT, kLog2Opacity, kZ, kC, kURate = kC + 3, kWRate };
+constexpr int local_floats(int colours, bool moving) { return colours == 1 && !moving ? 8 : 16; }
 
 constexpr int kAhead = 12;  // entries; covers the latency of main memory
 
-template <int C>
+template <int C, bool Moving>
 static void localise(const Tile& tile) {
     float* out = tile.local;
     const float left = (float)(tile.tile_x * kTile), top = (float)(tile.tile_y * kTile);
-    for (int i = 0; i < tile.count; ++i, out += local_floats(C)) {
+    for (int i = 0; i < tile.count; ++i, out += local_floats(C, Moving)) {
         const Record& in = tile.records[tile.entries[i].rank];
         // Records lie in order of depth, so those of a tile are far apart.
-        if (i + kAhead < tile.count) __builtin_prefetch(&tile.records[tile.entries[i + kAhead].rank]);
-        out[kP] = in.p, out[kQ] = in.q, out[kR] = in.r;
-        out[kS] = -(in.p * (in.x - left) + in.q * (in.y - top));
-        out[kT] = -in.r * (in.y - top);
-        out[kLog2Opacity] = in.log2_opacity;
+        if (i + kAhead < tile.count) {
+            __builtin_prefetch(&tile.records[tile.entries[i + kAhead].rank]);
+            if (Moving) __builtin_prefetch(&tile.motions[tile.entries[i + kAhead].rank]);
+        }
+        if (Moving) {
+            const Motion& motion = tile.motions[tile.entries[i].rank];
+            out[kP] = motion.p, out[kQ] = motion.q, out[kR] = motion.r;
+            out[kLog2Opacity] = motion.log2_opacity;
+            out[kURate] = motion.u_rate, out[kWRate] = motion.w_rate;
+        } else {
+            out[kP] = in.p, out[kQ] = in.q, out[kR] = in.r;
+            out[kLog2Opacity] = in.log2_opacity;
+        }
+        out[kS] = -(out[kP] * (in.x - left) + out[kQ] * (in.y - top));
+        out[kT] = -out[kR] * (in.y - top);
         out[kZ] = in.z;
         for (int k = 0; k < C; ++k) out[kC + k] = in.colour[k];
         tile.blocks[i] = (uint16_t)tile.entries[i].blocks;
@@ -81,32 +92,61 @@ static inline void each_run(const Tile& tile, Visit visit) {
     }
 }
 
-static inline float weight_at(const Planes& planes, const Lens& lens, int x, int y) {
-    return planes.weight ? planes.weight[(int64_t)y * lens.width + x] : planes.uniform_weight;
-}
-
-template <int C>
-static void forward_tile(const Tile& tile, const float background[3], const Planes& planes, const TileState& state,
-                         TileImage* image) {
-    localise<C>(tile);
-    alignas(64) float transmittance[kTilePixels] = {}, depth[kTilePixels] = {}, weight[kTilePixels] = {};
+// Weights of a tile's pixels, 0 outside of the image, and while the camera moves their times in the sub-frame.
+template <bool Moving>
+static inline void read_planes(const Tile& tile, const Planes& planes, float* weight, float* time) {
     each_run(tile, [&](int i, int x, int y, int pixels) {
+        const int64_t at = (int64_t)y * tile.lens->width + x;
         for (int j = 0; j < pixels; ++j) {
-            transmittance[i + j] = 1.0f;
-            weight[i + j] = weight_at(planes, *tile.lens, x + j, y);
+            if (Moving) {
+                const Covered covered = covered_by(planes, at + j);
+                weight[i + j] = covered.weight;
+                time[i + j] = covered.time;
+            } else {
+                weight[i + j] = planes.weight ? planes.weight[at + j] : planes.uniform_weight;
+            }
         }
     });
+}
+
+// A bit for each block with a weight that is not 0.
+static inline uint32_t weighted_blocks(const float* weight) {
+    uint32_t blocks = 0;
+    for (int block = 0; block < kBlocks; ++block) {
+        float most = 0;
+        for (int i = 0; i < 16; ++i) most = weight[16 * block + i] > most ? weight[16 * block + i] : most;
+        blocks |= (uint32_t)(most > 0) << block;
+    }
+    return blocks;
+}
+
+template <int C, bool Moving>
+static void forward_tile(const Tile& tile, const float background[3], const Planes& planes, const TileState& state,
+                         TileImage* image) {
+    localise<C, Moving>(tile);
+    alignas(64) float transmittance[kTilePixels] = {}, depth[kTilePixels] = {}, weight[kTilePixels] = {};
+    alignas(64) float time[Moving ? kTilePixels : 1] = {};
+    read_planes<Moving>(tile, planes, weight, time);
+    each_run(tile, [&](int i, int, int, int pixels) {
+        for (int j = 0; j < pixels; ++j) transmittance[i + j] = 1.0f;
+    });
+    const uint32_t weighted = Moving ? weighted_blocks(weight) : 0xffff;
     const Vec cut = splat(-kLog2Cut), cap = splat(0.99f), stop = splat(kStopTransmittance);
     for (int block = 0; block < kBlocks; ++block) {
-        const int listed = list_block(tile, block);
+        const int listed = weighted >> block & 1 ? list_block(tile, block) : 0;
         for (int part = 0; part < kParts; ++part) {
             const int at = block * 16 + part * kLanes;
             const Vec x = load(kCentres.x + at), y = load(kCentres.y + at);
+            const Vec when = Moving ? load(time + at) : Vec{};
             Vec t = load(transmittance + at), d{}, c[C] = {};
-            int32_t end = tile.count;
+            int32_t end = listed ? tile.count : 0;
             for (int i = 0; i < listed; ++i) {
-                const float* s = tile.local + tile.listed[i] * local_floats(C);
+                const float* s = tile.local + tile.listed[i] * local_floats(C, Moving);
                 Vec u = s[kP] * x + (s[kQ] * y + s[kS]), w = s[kR] * y + s[kT];
+                if (Moving) {
+                    u -= s[kURate] * when;
+                    w -= s[kWRate] * when;
+                }
                 Vec log2_alpha = (s[kLog2Opacity] - u * u) - w * w;
                 Vec alpha = min(where_reaches(log2_alpha, cut, exp2_fast(log2_alpha)), cap);
                 Vec share = alpha * t;
@@ -179,17 +219,18 @@ static inline void totals(const Vec* v, float* out) {
 
 // The state that a tile's pixels carry from splat to splat: transmittance, and what is still to come of the sum over
 // colours of d_value times value.
-template <int C>
+template <int C, bool Moving>
 struct Pixels {
     alignas(64) float t[kTilePixels], rest[kTilePixels], d[C][kTilePixels];
+    alignas(64) float time[Moving ? kTilePixels : 1];
 };
 
 // Sums of one entry over its blocks. Capped: the splat is opaque enough to reach the cap, where alpha has no gradient.
-template <int C, bool Capped>
-static inline void backward_entry(const float* s, uint32_t blocks, int index, const int32_t* ends, Pixels<C>& pixels,
-                                  float* slot) {
+template <int C, bool Moving, bool Capped>
+static inline void backward_entry(const float* s, uint32_t blocks, int index, const int32_t* ends,
+                                  Pixels<C, Moving>& pixels, float* slot) {
     const Vec cut = splat(-kLog2Cut), cap = splat(0.99f);
-    Vec sum[kColour0 + C] = {};
+    Vec sum[kColour0 + C] = {}, vut{}, vwt{};
     for (; blocks; blocks &= blocks - 1) {
         const int block = __builtin_ctz(blocks);
         for (int part = 0; part < kParts; ++part) {
@@ -197,6 +238,10 @@ static inline void backward_entry(const float* s, uint32_t blocks, int index, co
             const int at = block * 16 + part * kLanes;
             const Vec x = load(kCentres.x + at), y = load(kCentres.y + at);
             Vec u = s[kP] * x + (s[kQ] * y + s[kS]), w = s[kR] * y + s[kT];
+            if (Moving) {
+                u -= s[kURate] * load(pixels.time + at);
+                w -= s[kWRate] * load(pixels.time + at);
+            }
             Vec log2_alpha = (s[kLog2Opacity] - u * u) - w * w;
             Vec alpha = where_reaches(log2_alpha, cut, exp2_fast(log2_alpha));
             if (Capped) alpha = min(alpha, cap);
@@ -216,26 +261,33 @@ static inline void backward_entry(const float* s, uint32_t blocks, int index, co
             sum[kVuu] += vu * u;
             sum[kVuw] += vu * w;
             sum[kVww] += vw * w;
+            if (Moving) {
+                vut += vu * load(pixels.time + at);
+                vwt += vw * load(pixels.time + at);
+            }
             sum[kShare] += share;
             for (int k = 0; k < C; ++k) sum[kColour0 + k] += share * load(pixels.d[k] + at);
         }
     }
     totals<8>(sum, slot);
-    if (C == 3) {
-        Vec more[4] = {sum[kColour0 + 1], sum[kColour0 + C - 1], Vec{}, Vec{}};
+    if (C == 3 || Moving) {
+        // Colours 1 and 2 of three; without them these places are not read.
+        Vec more[4] = {sum[kColour0 + C / 2], sum[kColour0 + C - 1], vut, vwt};
         totals<4>(more, slot + 8);
     }
 }
 
-template <int C>
+template <int C, bool Moving>
 static void backward_tile(const Tile& tile, const float* d_values, const Planes& planes, const TileState& state,
                           float* slots) {
-    localise<C>(tile);
-    Pixels<C> pixels = {};
+    localise<C, Moving>(tile);
+    Pixels<C, Moving> pixels = {};
+    alignas(64) float weights[kTilePixels] = {};
+    read_planes<Moving>(tile, planes, weights, pixels.time);
     each_run(tile, [&](int i, int x, int y, int run) {
         for (int j = 0; j < run; ++j) {
             const int64_t at = (int64_t)y * tile.lens->width + x + j;
-            const float weight = weight_at(planes, *tile.lens, x + j, y);
+            const float weight = weights[i + j];
             pixels.t[i + j] = 1.0f;
             for (int k = 0; k < C; ++k) {
                 float d = C == 1 || planes.channels ? d_values[at] : d_values[3 * at + k];
@@ -249,28 +301,30 @@ static void backward_tile(const Tile& tile, const float* d_values, const Planes&
     const __m512i ends = _mm512_loadu_si512(state.ends);
 #endif
     const float* s = tile.local;
-    for (int i = 0; i < tile.count; ++i, s += local_floats(C)) {
+    for (int i = 0; i < tile.count; ++i, s += local_floats(C, Moving)) {
         uint32_t blocks = tile.entries[i].blocks;
 #if defined(__AVX512F__)
         blocks &= _mm512_cmpgt_epi32_mask(ends, _mm512_set1_epi32(i));
 #endif
-        float* slot = slots + (int64_t)tile.entries[i].slot * slot_floats(C);
+        float* slot = slots + (int64_t)tile.entries[i].slot * slot_floats(C, Moving);
         if (s[kLog2Opacity] > kLog2Cap) {
-            backward_entry<C, true>(s, blocks, i, state.ends, pixels, slot);
+            backward_entry<C, Moving, true>(s, blocks, i, state.ends, pixels, slot);
         } else {
-            backward_entry<C, false>(s, blocks, i, state.ends, pixels, slot);
+            backward_entry<C, Moving, false>(s, blocks, i, state.ends, pixels, slot);
         }
     }
 }
 
 static void forward(const Tile& tile, int colours, const float background[3], const Planes& planes,
                     const TileState& state, TileImage* image) {
-    if (colours == 1) return forward_tile<1>(tile, background, planes, state, image);
-    forward_tile<3>(tile, background, planes, state, image);
+    auto* run = tile.motions ? (colours == 1 ? forward_tile<1, true> : forward_tile<3, true>)
+                             : (colours == 1 ? forward_tile<1, false> : forward_tile<3, false>);
+    run(tile, background, planes, state, image);
 }
 
 static void backward(const Tile& tile, int colours, const float* d_values, const Planes& planes, const TileState& state,
                      float* slots) {
-    if (colours == 1) return backward_tile<1>(tile, d_values, planes, state, slots);
-    backward_tile<3>(tile, d_values, planes, state, slots);
+    auto* run = tile.motions ? (colours == 1 ? backward_tile<1, true> : backward_tile<3, true>)
+                             : (colours == 1 ? backward_tile<1, false> : backward_tile<3, false>);
+    run(tile, d_values, planes, state, slots);
 }

@@ -30,19 +30,18 @@ View view_of(const double* rotation, const double* centre) {
 Renderer::Renderer(const Lens& lens, int threads)
     : kernels_(choose_kernels()), lens_(lens), pool_(threads), emissions_(threads), scratch_(threads) {}
 
-void Renderer::forward(const SplatArrays& splats, const double* rotations, const double* centres, int count,
-                       const float* weights, const uint8_t* channels, const float background[3], float* values,
+void Renderer::forward(const SplatArrays& splats, const Views& views, const float background[3], float* values,
                        float* alpha, float* depth) {
     splats_ = splats;
-    sub_poses_ = count;
-    weights_ = weights;
-    channels_ = channels;
-    if (static_cast<int>(views_.size()) < count) views_.resize(count);
+    planes_ = views;
+    sub_poses_ = moving() ? views.count - 1 : views.count;
+    if (static_cast<int>(views_.size()) < views.count) views_.resize(views.count);
+    for (int i = 0; i < views.count; ++i) views_[i].view = view_of(views.rotations + 9 * i, views.centres + 3 * i);
+    if (moving()) set_passages();
     prepare();
     std::fill_n(radius_.grow(splats.count), splats.count, 0.0f);
-    for (int i = 0; i < count; ++i) {
+    for (int i = 0; i < sub_poses_; ++i) {
         SubPose& sub = views_[i];
-        sub.view = view_of(rotations + 9 * i, centres + 3 * i);
         project(sub);
         sort(sub);
         bin(sub);
@@ -53,10 +52,23 @@ void Renderer::forward(const SplatArrays& splats, const double* rotations, const
     pool_.run(lens_.tiles_x * lens_.tiles_y, [&](int tile, int thread) {
         TileImage* image = scratch_[thread].image.grow(1);
         std::memset(static_cast<void*>(image), 0, sizeof *image);
-        for (int i = 0; i < count; ++i)
+        for (int i = 0; i < sub_poses_; ++i)
             kernels_.forward(tile_of(views_[i], tile, thread), splats.colours, background, planes_of(i),
                              state_of(views_[i], tile), image);
         kernels_.store(tile_of(views_[0], tile, thread), image, splats.colours, planes_of(0), values, alpha, depth);
+    });
+}
+
+void Renderer::set_passages() {
+    pool_.run(sub_poses_, [&](int i, int) {
+        double weight, square;
+        Passage& passage = views_[i].passage;
+        kernels_.cover(planes_of(i), static_cast<int64_t>(lens_.width) * lens_.height, &weight, &square,
+                       &passage.time_reach);
+        passage.begin = views_[i].view;
+        passage.end = views_[i + 1].view;
+        // The variance of an even motion is a twelfth of its square.
+        passage.blur = weight > 0 ? static_cast<float>(square / weight / 12) : 0.0f;
     });
 }
 
@@ -74,10 +86,16 @@ void Renderer::prepare() {
 
 void Renderer::project(SubPose& sub) {
     raw_.grow(stride_);
+    if (moving()) raw_motions_.grow(stride_);
     keys_.grow(stride_);
     pool_.run(chunks_of(stride_), [&](int chunk, int) {
         const int first = chunk * kChunk, last = std::min(stride_, first + kChunk);
-        kernels_.project(prepared_, lens_, sub.view, splats_.count, first, last, raw_.data(), keys_.data());
+        if (moving()) {
+            kernels_.project_moving(prepared_, lens_, sub.passage, splats_.count, first, last, raw_.data(),
+                                    raw_motions_.data(), keys_.data());
+        } else {
+            kernels_.project(prepared_, lens_, sub.view, splats_.count, first, last, raw_.data(), keys_.data());
+        }
         for (int n = first; n < std::min(last, splats_.count); ++n)
             if (keys_[n] != kCulled) radius_[n] = std::max(radius_[n], raw_[n].radius);
     });
@@ -104,6 +122,7 @@ void Renderer::sort(SubPose& sub) {
     }
     sub.visible = visible;
     sub.records.grow(visible);
+    if (moving()) sub.motions.grow(visible);
     pool_.run(chunks_of(visible), [&](int chunk, int) {
         const int last = std::min(visible, (chunk + 1) * kChunk);
         for (int rank = chunk * kChunk; rank < last; ++rank) {
@@ -112,6 +131,7 @@ void Renderer::sort(SubPose& sub) {
             Record& record = sub.records[rank] = raw_[splat];
             for (int k = 0; k < splats_.colours; ++k) record.colour[k] = splats_.colour[splats_.colours * splat + k];
             record.splat = splat;
+            if (moving()) sub.motions[rank] = raw_motions_[splat];
         }
     });
 }
@@ -171,6 +191,7 @@ Tile Renderer::tile_of(const SubPose& sub, int tile, int thread) {
     const int count = static_cast<int>(sub.tile_start[tile + 1] - start);
     return {&lens_,
             sub.records.data(),
+            moving() ? sub.motions.data() : nullptr,
             sub.entries.data() + start,
             count,
             tile % lens_.tiles_x,
@@ -187,12 +208,16 @@ TileState Renderer::state_of(const SubPose& sub, int tile) const {
 
 Planes Renderer::planes_of(int sub_pose) const {
     const size_t plane = static_cast<size_t>(lens_.width) * lens_.height;
-    return {weights_ ? weights_ + sub_pose * plane : nullptr, 1.0f / static_cast<float>(sub_poses_), channels_};
+    return {planes_.weights ? planes_.weights + sub_pose * plane : nullptr,
+            1.0f / static_cast<float>(sub_poses_),
+            planes_.channels,
+            planes_.start,
+            planes_.stop,
+            static_cast<float>(sub_pose)};
 }
 
 void Renderer::backward(const float* d_values, const GradientArrays& out) {
-    for (int i = 0; i < sub_poses_; ++i)
-        views_[i].slots.grow(static_cast<size_t>(views_[i].pairs) * slot_floats(splats_.colours));
+    for (int i = 0; i < sub_poses_; ++i) views_[i].slots.grow(static_cast<size_t>(views_[i].pairs) * slot_floats());
     pool_.run(lens_.tiles_x * lens_.tiles_y, [&](int tile, int thread) {
         for (int i = 0; i < sub_poses_; ++i)
             kernels_.backward(tile_of(views_[i], tile, thread), splats_.colours, d_values, planes_of(i),
@@ -200,7 +225,7 @@ void Renderer::backward(const float* d_values, const GradientArrays& out) {
     });
 
     const int chunks = chunks_of(stride_);
-    const size_t pose_doubles = static_cast<size_t>(sub_poses_) * 6;
+    const size_t pose_doubles = static_cast<size_t>(poses()) * 6;
     std::fill_n(poses_.grow(chunks * pose_doubles), chunks * pose_doubles, 0.0);
     pool_.run(chunks, [&](int chunk, int thread) {
         const int first = chunk * kChunk, last = std::min(stride_, first + kChunk);
@@ -219,9 +244,14 @@ void Renderer::backward(const float* d_values, const GradientArrays& out) {
             double* pose = poses_.data() + chunk * pose_doubles + 6 * i;
             for (int at = first; at < last; at += kGroup) {
                 gather(views_[i], at, group, visible);
-                if (std::any_of(visible, visible + kGroup, [](uint8_t v) { return v != 0; }))
+                if (std::none_of(visible, visible + kGroup, [](uint8_t v) { return v != 0; })) continue;
+                if (moving()) {
+                    kernels_.unproject_moving(prepared_, lens_, views_[i].passage, at, group, visible, splats_.colours,
+                                              sums, pose, pose + 6);
+                } else {
                     kernels_.unproject(prepared_, lens_, views_[i].view, at, group, visible, splats_.colours, sums,
                                        pose);
+                }
             }
         }
         const int end = std::min(last, splats_.count);
@@ -229,7 +259,7 @@ void Renderer::backward(const float* d_values, const GradientArrays& out) {
         kernels_.finish(splats_, prepared_, sums, first, end, 1.0f / static_cast<float>(sub_poses_), out);
     });
 
-    for (int i = 0; i < sub_poses_; ++i) {
+    for (int i = 0; i < poses(); ++i) {
         double sum[6] = {};
         for (int chunk = 0; chunk < chunks; ++chunk)
             for (int k = 0; k < 6; ++k) sum[k] += poses_[chunk * pose_doubles + 6 * i + k];
@@ -242,7 +272,7 @@ void Renderer::backward(const float* d_values, const GradientArrays& out) {
 
 // The sums of a group's splats over their tiles.
 void Renderer::gather(const SubPose& sub, int first, float* sums, uint8_t* visible) const {
-    const int stride = slot_floats(splats_.colours), used = kColour0 + splats_.colours;
+    const int stride = slot_floats(), used = moving() ? kSums : kColour0 + splats_.colours;
     for (int lane = 0; lane < kGroup; ++lane) {
         const int splat = std::min(first + lane, splats_.count);
         const uint32_t from = sub.first_slot[splat];

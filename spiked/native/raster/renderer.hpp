@@ -1,4 +1,5 @@
-// Renders splats from a few sub-poses into one weighted image, and the gradients of that image.
+// Renders splats from a few sub-poses, or from a camera on its way past a few poses, into one weighted image, and the
+// gradients of that image.
 #pragma once
 #include <vector>
 
@@ -8,12 +9,14 @@
 
 namespace raster {
 
-// Everything of one sub-pose that the backward pass needs again.
+// Everything of one sub-pose, or of one sub-frame on a camera's way, that the backward pass needs again.
 struct SubPose {
     View view;
+    Passage passage;
     int visible = 0;
     uint32_t pairs = 0;
     Buffer<Record> records;       // [visible], by depth
+    Buffer<Motion> motions;       // [visible], by depth; while the camera moves
     Buffer<uint32_t> first_slot;  // [splats + 1]
     Buffer<uint32_t> tile_start;  // [tiles + 1]
     Buffer<Entry> entries;        // [pairs], by tile, then depth
@@ -22,27 +25,38 @@ struct SubPose {
     Buffer<float> slots;          // [pairs][slot_floats]
 };
 
+// What to see the splats from, and when.
+struct Views {
+    const double *rotations, *centres;  // [count][9] camera to world, [count][3]
+    int count;
+    const float* weights;  // [count][height][width] or null
+    // Not null when the camera moves from pose to pose, each the end of a sub-frame and the beginning of the next one:
+    // [height][width], when each pixel's window begins and ends, in sub-frames from the first pose.
+    const float *start, *stop;
+    const uint8_t* channels;  // [height][width] or null
+};
+
 class Renderer {
   public:
     Renderer(const Lens& lens, int threads);
 
-    // rotations [count][9] camera to world, centres [count][3], weights [count][height][width] or null, channels
-    // [height][width] or null. The splats must stay as they are until backward() is done.
-    void forward(const SplatArrays&, const double* rotations, const double* centres, int count, const float* weights,
-                 const uint8_t* channels, const float background[3], float* values, float* alpha, float* depth);
+    // The splats and the planes of the views must stay as they are until backward() is done.
+    void forward(const SplatArrays&, const Views&, const float background[3], float* values, float* alpha,
+                 float* depth);
     void backward(const float* d_values, const GradientArrays&);
 
     const char* instructions() const { return kernels_.name; }
     int threads() const { return pool_.threads(); }
     const Lens& lens() const { return lens_; }
     const SplatArrays& splats() const { return splats_; }
-    int sub_poses() const { return sub_poses_; }
-    bool mosaic() const { return channels_ != nullptr; }
+    int poses() const { return planes_.count; }
+    bool mosaic() const { return planes_.channels != nullptr; }
     // Blocks of 16 pixels times splats that the last forward() had to look at, at most.
     int64_t block_evaluations() const;
 
   private:
     void prepare();
+    void set_passages();
     void project(SubPose&);
     void sort(SubPose&);
     void bin(SubPose&);
@@ -50,20 +64,22 @@ class Renderer {
     TileState state_of(const SubPose&, int tile) const;
     Planes planes_of(int sub_pose) const;
     void gather(const SubPose&, int first, float* sums, uint8_t* visible) const;
+    bool moving() const { return planes_.start != nullptr; }
+    int slot_floats() const { return raster::slot_floats(splats_.colours, moving()); }
 
     const Kernels& kernels_;
     Lens lens_;
     Pool pool_;
     SplatArrays splats_{};
-    int sub_poses_ = 0;
-    const float* weights_ = nullptr;
-    const uint8_t* channels_ = nullptr;
+    Views planes_{};     // of which only the planes outlive forward()
+    int sub_poses_ = 0;  // or sub-frames
     std::vector<SubPose> views_;
 
     int stride_ = 0;
     Buffer<float> prepared_store_;
     Prepared prepared_{};
     Buffer<Record> raw_;
+    Buffer<Motion> raw_motions_;
     Buffer<float> radius_;  // [splats], largest over the sub-poses
     Buffer<uint32_t> keys_;
     struct Item {
@@ -85,7 +101,7 @@ class Renderer {
         Buffer<float> gradients;
     };
     std::vector<Scratch> scratch_;
-    Buffer<double> poses_;  // [chunks][sub-poses][6]
+    Buffer<double> poses_;  // [chunks][poses][6]
 };
 
 }  // namespace raster

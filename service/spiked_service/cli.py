@@ -6,6 +6,7 @@ import typer
 
 from spiked.errors import SpikedError
 from spiked_service.commands.bench import bench
+from spiked_service.commands.config import config
 from spiked_service.commands.convert import convert
 from spiked_service.commands.devices import devices
 from spiked_service.commands.evaluate import evaluate
@@ -33,6 +34,7 @@ for _group, _commands in {
 }.items():
     for _command in _commands:
         app.command(rich_help_panel=_group)(_command)
+app.add_typer(config, name="config", rich_help_panel="Live")
 
 
 def main() -> None:

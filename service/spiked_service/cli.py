@@ -15,6 +15,7 @@ from spiked_service.commands.reconstruct import reconstruct
 from spiked_service.commands.render import render
 from spiked_service.commands.serve import serve
 from spiked_service.commands.simulate import simulate
+from spiked_service.commands.token import token
 from spiked_service.commands.verify import verify
 from spiked_service.commands.version import version
 from spiked_service.console import report_error
@@ -35,6 +36,7 @@ for _group, _commands in {
     for _command in _commands:
         app.command(rich_help_panel=_group)(_command)
 app.add_typer(config, name="config", rich_help_panel="Live")
+app.add_typer(token, name="token", rich_help_panel="Live")
 
 
 def main() -> None:

@@ -14,6 +14,7 @@ import zmq
 
 from spiked.errors import ConfigurationError
 from spiked_service.events import PUBLISHED, Bus, Message, Topic, pack
+from spiked_service.health import Verdict
 
 _LOOPBACK = "127.0.0.1"
 _ROOM = 10_000
@@ -68,6 +69,13 @@ class ZmqServer:
         for thread in self._threads:
             thread.join()
         self._context.destroy(linger=0)
+
+    def check(self) -> tuple[Verdict, str]:
+        """Whether both threads do their work."""
+        dead = [thread.name for thread in self._threads if not thread.is_alive()]
+        if dead and not self._over.is_set():
+            return Verdict.FAILED, f"{' and '.join(dead)} stopped working; the log says why: restart the service"
+        return Verdict.OK, f"events at {self.endpoints.events}"
 
     def _bound(self, kind: int, room: int, port: int) -> "zmq.Socket[bytes]":
         socket = self._context.socket(kind)

@@ -1,0 +1,182 @@
+"""What somebody who runs the service asks: health, version, settings, tokens."""
+
+import os
+import resource
+import time
+from datetime import UTC, datetime
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import APIRouter, Response
+from pydantic import BaseModel, Field
+
+from spiked_service.api.problems import Problem
+from spiked_service.api.services import Services
+from spiked_service.commands.version import installed_version
+from spiked_service.config import Origin, field, reloadable
+from spiked_service.health import Finding, Verdict, failed
+from spiked_service.store.folder import default_folder
+
+_PROBLEM: dict[str, Any] = {"model": Problem, "content": {"application/problem+json": {}}}
+
+
+class FindingOut(BaseModel):
+    """What one check found."""
+
+    name: str = Field(examples=["disk"])
+    verdict: Verdict
+    finding: str = Field(examples=["53 GiB free"])
+
+
+class HealthOut(BaseModel):
+    """How the service is."""
+
+    status: Verdict = Field(description="The worst of the checks.")
+    checks: list[FindingOut]
+
+
+class DiskOut(BaseModel):
+    """The disk below the data folder."""
+
+    free_bytes: int
+    total_bytes: int
+
+
+class SystemOut(BaseModel):
+    """The running service."""
+
+    version: str = Field(examples=["0.1.0"])
+    started_at: datetime
+    uptime_s: float
+    data_folder: str
+    disk: DiskOut
+    memory_bytes: int = Field(description="Resident memory of the service itself, without its workers.")
+    pid: int
+    events_seq: int = Field(description="Number of the newest event.")
+
+
+class SettingOut(BaseModel):
+    """One setting; secrets are masked."""
+
+    key: str = Field(examples=["limit_renders"])
+    value: Any = Field(examples=[8])
+    origin: Origin
+    reloadable: bool = Field(description="Whether `configuration:reload` brings a new value into effect.")
+    doc: str
+
+
+class SettingsOut(BaseModel):
+    """All settings in effect."""
+
+    items: list[SettingOut]
+
+
+class ReloadedOut(BaseModel):
+    """What has come of a reload."""
+
+    changed: list[str] = Field(description="In effect now.")
+    needs_restart: list[str] = Field(description="Different in file or environment, but in effect after a restart.")
+
+
+class TokenOut(BaseModel):
+    """A token, without what would open anything."""
+
+    name: str
+    created_at: datetime
+    expires_at: datetime | None
+
+
+class TokensOut(BaseModel):
+    """All tokens, oldest first."""
+
+    items: list[TokenOut]
+
+
+def health_routes(services: Services) -> APIRouter:
+    """`/healthz` and `/readyz`, which need no token."""
+    router = APIRouter(tags=["operations"])
+    unwell: dict[int | str, dict[str, Any]] = {503: {"model": HealthOut, "description": "A check has failed."}}
+
+    @router.get("/healthz", responses=unwell)
+    def get_health(response: Response) -> HealthOut:
+        """Whether the service lives; if not, only a restart helps."""
+        return _health(services.health.life(), response)
+
+    @router.get("/readyz", responses=unwell)
+    def get_readiness(response: Response) -> HealthOut:
+        """Whether captures can be started."""
+        return _health(services.health.readiness(), response)
+
+    return router
+
+
+def operations_routes(services: Services) -> APIRouter:
+    """`system`, `configuration` and `tokens`."""
+    router = APIRouter(tags=["operations"])
+    started_at, started_s = datetime.now(UTC), time.monotonic()
+
+    @router.get("/system")
+    def get_system() -> SystemOut:
+        """Version, uptime, disk and memory."""
+        folder = (services.settings.now.data or default_folder()).absolute()
+        there = next(path for path in (folder, *folder.parents) if path.exists())
+        stat = os.statvfs(there)
+        return SystemOut(
+            version=installed_version(),
+            started_at=started_at,
+            uptime_s=time.monotonic() - started_s,
+            data_folder=str(folder),
+            disk=DiskOut(free_bytes=stat.f_bavail * stat.f_frsize, total_bytes=stat.f_blocks * stat.f_frsize),
+            memory_bytes=resident_bytes(),
+            pid=os.getpid(),
+            events_seq=services.bus.seq,
+        )
+
+    @router.get("/configuration")
+    def get_configuration() -> SettingsOut:
+        """Every setting in effect, and where its value comes from."""
+        configuration = services.settings.configuration
+        items = [
+            SettingOut(
+                key=name,
+                value=value,
+                origin=configuration.origins[name],
+                reloadable=reloadable(name),
+                doc=field(name).description or "",
+            )
+            for name, value in configuration.shown().items()
+        ]
+        return SettingsOut(items=items)
+
+    @router.post("/configuration:reload", responses={422: {**_PROBLEM, "description": "The sources hold an error."}})
+    def reload_configuration() -> ReloadedOut:
+        """Read file and environment again, as SIGHUP does. After an error nothing has changed."""
+        done = services.settings.reload()
+        return ReloadedOut(changed=done.changed, needs_restart=done.waiting)
+
+    @router.get("/tokens")
+    def list_tokens() -> TokensOut:
+        """Names and dates of the tokens; `spiked token` makes and revokes them."""
+        items = [
+            TokenOut(name=token.name, created_at=token.created_at, expires_at=token.expires_at)
+            for token in services.tokens.all()
+        ]
+        return TokensOut(items=items)
+
+    return router
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process, from /proc."""
+    with open("/proc/self/statm") as file:  # noqa: PTH123 - read at every scrape
+        return int(file.read().split()[1]) * resource.getpagesize()
+
+
+def _health(findings: list[Finding], response: Response) -> HealthOut:
+    if failed(findings):
+        response.status_code = HTTPStatus.SERVICE_UNAVAILABLE
+    verdicts = [finding.verdict for finding in findings]
+    worst = next((one for one in (Verdict.FAILED, Verdict.WARNING) if one in verdicts), Verdict.OK)
+    response.headers["Cache-Control"] = "no-store"
+    checks = [FindingOut(name=one.name, verdict=one.verdict, finding=one.finding) for one in findings]
+    return HealthOut(status=worst, checks=checks)

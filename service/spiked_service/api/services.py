@@ -1,0 +1,29 @@
+"""What the routes work with: the parts of one running service."""
+
+from dataclasses import dataclass, field
+
+from spiked_service.captures import Captures
+from spiked_service.events import Bus
+from spiked_service.health import Health
+from spiked_service.limits import Gate
+from spiked_service.live import LiveSettings
+from spiked_service.tokens import Tokens
+
+
+@dataclass(frozen=True)
+class Services:
+    """Made once, by whoever runs the service."""
+
+    settings: LiveSettings
+    tokens: Tokens
+    captures: Captures
+    bus: Bus
+    health: Health = field(default_factory=Health)
+    renders: Gate = field(default_factory=lambda: Gate("renders", 1))
+    """Every rendering of a view goes through it."""
+    event_clients: Gate = field(default_factory=lambda: Gate("event clients", 1))
+
+    def __post_init__(self) -> None:
+        """The limits follow the settings."""
+        self.settings.on_change(lambda now: setattr(self.renders, "limit", now.limit_renders))
+        self.settings.on_change(lambda now: setattr(self.event_clients, "limit", now.limit_event_clients))

@@ -1,0 +1,68 @@
+"""The settings of a running service, some of which can change."""
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from spiked.errors import ConfigurationError
+from spiked_service.config import Configuration, Settings, load_settings, reloadable
+
+
+@dataclass(frozen=True)
+class Reloaded:
+    """What a look at the sources again has brought."""
+
+    changed: list[str]
+    """In effect now."""
+    waiting: list[str]
+    """Different, but in effect only after a restart."""
+
+
+class LiveSettings:
+    """The settings in effect. Any thread may read them or load them again."""
+
+    def __init__(self, flags: Mapping[str, object] | None = None, file: Path | None = None) -> None:
+        """Raises ConfigurationError."""
+        self._flags = dict(flags or {})
+        self._file = file
+        self._lock = threading.Lock()
+        self._configuration = load_settings(self._flags, file)
+        self._listeners: list[Callable[[Settings], None]] = []
+
+    @property
+    def now(self) -> Settings:
+        """The settings in effect."""
+        return self._configuration.settings
+
+    @property
+    def configuration(self) -> Configuration:
+        """The settings in effect with their origins."""
+        return self._configuration
+
+    def on_change(self, listener: Callable[[Settings], None]) -> None:
+        """Call it with the settings now, and whenever they have changed."""
+        listener(self.now)
+        self._listeners.append(listener)
+
+    def reload(self) -> Reloaded:
+        """Read file and environment again and put into effect what can be. On ConfigurationError nothing changes."""
+        with self._lock:
+            before = self._configuration
+            after = load_settings(self._flags, self._file)
+            old, new = before.settings, after.settings
+            names = [name for name in Settings.model_fields if getattr(old, name) != getattr(new, name)]
+            changed = [name for name in names if reloadable(name)]
+            values = {name: getattr(new, name) for name in changed}
+            origins = {**before.origins, **{name: after.origins[name] for name in changed}}
+            try:
+                self._take(Configuration(old.model_copy(update=values), origins, after.file))
+            except ConfigurationError:
+                self._take(before)
+                raise
+            return Reloaded(changed, [name for name in names if name not in changed])
+
+    def _take(self, configuration: Configuration) -> None:
+        self._configuration = configuration
+        for listener in self._listeners:
+            listener(self.now)

@@ -25,9 +25,10 @@ class Daemon:
     """`spiked serve` as a process of its own, and a client to talk to it."""
 
     def __init__(
-        self, *arguments: str, runtime: Path, token: str | None = None, seen: VirtualCameras | None = None
+        self, *arguments: str, folder: Path, token: str | None = None, seen: VirtualCameras | None = None
     ) -> None:
-        command = [sys.executable, "-m", "spiked_service", "serve", "--port", "0", "--runtime", str(runtime)]
+        command = [sys.executable, "-m", "spiked_service", "serve", "--port", "0"]
+        command += ["--runtime", str(folder / "runtime"), "--data", str(folder / "data")]
         self.process = subprocess.Popen(
             [*command, *arguments], stdout=subprocess.PIPE, text=True, env=seen and seen.environment
         )
@@ -65,7 +66,7 @@ def daemon(tmp_path: Path) -> Iterator[Callable[..., Daemon]]:
     started: list[Daemon] = []
 
     def start(*arguments: str, token: str | None = None, seen: VirtualCameras | None = None) -> Daemon:
-        started.append(Daemon(*arguments, runtime=tmp_path / "runtime", token=token, seen=seen))
+        started.append(Daemon(*arguments, folder=tmp_path, token=token, seen=seen))
         return started[-1]
 
     yield start

@@ -180,7 +180,7 @@ class _Asked:
         self.secure = scope["scheme"] in ("https", "wss")
         self.host = self.headers.get("host", "")
         self.address: str = scope["client"][0] if scope.get("client") else "unknown"
-        self.query = parse_qs(scope.get("query_string", b"").decode("latin-1"))
+        self.query: dict[str, list[str]] = parse_qs(scope.get("query_string", b"").decode("latin-1"))
 
     def token(self) -> str:
         """From the header, the cookie, or, where a browser can do no other, the address."""

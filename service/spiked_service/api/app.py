@@ -10,6 +10,7 @@ from spiked_service.api.captures import capture_routes
 from spiked_service.api.events import event_routes
 from spiked_service.api.old_schemas import DeviceOut
 from spiked_service.api.operations import health_routes, operations_routes
+from spiked_service.api.page import mount_page
 from spiked_service.api.problems import install
 from spiked_service.api.services import Services
 from spiked_service.commands.version import installed_version

@@ -35,7 +35,7 @@ class Daemon:
         assert self.process.stdout is not None
         self.output = self.process.stdout
         line = self.output.readline()
-        found = re.search(r"http://\S+", line)
+        found = re.search(r"https?://\S+", line)
         assert found, f"no address in {line!r}"
         self.address = found[0]
         headers = {"Authorization": f"Bearer {token}"} if token else {}

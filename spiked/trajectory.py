@@ -87,6 +87,18 @@ class Trajectory:
         )
         return head + "".join(lines)
 
+    def colmap_model(self, sensor: Sensor) -> dict[str, bytes | str]:
+        """The files of a COLMAP text model without points, by name. Raises SceneError without intrinsics."""
+        if sensor.intrinsics is None:
+            raise SceneError("a COLMAP model needs intrinsics; give --intrinsics or --fov")
+        k = sensor.intrinsics
+        camera = f"1 PINHOLE {sensor.width} {sensor.height} {k.fx!r} {k.fy!r} {k.cx!r} {k.cy!r}\n"
+        return {
+            "cameras.txt": "# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY\n" + camera,
+            "images.txt": self.colmap(),
+            "points3D.txt": "# no points: the poses are from splats\n",
+        }
+
     def nerfstudio(self, sensor: Sensor) -> str:
         """The text of nerfstudio's `transforms.json`: camera-to-world with OpenGL axes (y up, z back)."""
         if sensor.intrinsics is None:

@@ -135,7 +135,8 @@ def shown(image: Image, output: Output, background: tuple[float, float, float]) 
             behind = np.array(background, np.float32)
             through = 1 - image.alpha
             if image.values.ndim == 2 and (behind == behind[0]).all():
-                return image.values + through * behind[0]
+                grey: Floats = image.values + through * behind[0]
+                return grey
             values = image.values if image.values.ndim == 3 else image.values[..., None]
             coloured: Floats = values + through[..., None] * behind
             return coloured

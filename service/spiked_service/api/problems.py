@@ -1,58 +1,199 @@
-"""Errors as RFC 9457 problem details."""
+"""Errors as RFC 9457 problem details that say what is wrong and what to do."""
 
 from http import HTTPStatus
+from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
 
 from spiked.errors import SpikedError
 from spiked_service.captures import BusyError, UnknownCaptureError
 from spiked_service.limits import OverloadedError
+from spiked_service.store.catalogue import StoreError, UnknownIdError
+
+MEDIA_TYPE = "application/problem+json"
+_RETRY_S = 1
 
 
 class Problem(BaseModel):
     """RFC 9457 problem details."""
 
-    type: str = Field("about:blank", examples=["about:blank"])
-    title: str = Field(examples=["Conflict"])
-    status: int = Field(examples=[409])
-    detail: str = Field(examples=["capture 0192… is still running: stop it, or wait for its end"])
+    model_config = ConfigDict(
+        json_schema_serialization_defaults_required=True,
+        json_schema_extra={
+            "examples": [
+                {
+                    "type": "urn:spiked:problem:not-found",
+                    "title": "Not Found",
+                    "status": 404,
+                    "detail": "there is no capture 01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10; GET captures lists them",
+                    "instance": "/api/v1/captures/01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10",
+                    "what_to_do": "look for the id with the GET of the list",
+                }
+            ]
+        },
+    )
+
+    type: str = Field(description="urn:spiked:problem: and the kind of problem.")
+    title: str
+    status: int
+    detail: str = Field(description="What is wrong, in one sentence or a few.")
+    instance: str | None = Field(None, description="Path of the request.")
+    what_to_do: str | None = Field(None, description="What will help, where something will.")
 
 
 class NotReadyError(SpikedError):
     """What was asked for will exist later."""
 
 
+class GoneError(SpikedError):
+    """What was asked for is not kept."""
+
+
+class ConflictError(SpikedError):
+    """The request does not fit the state that things are in."""
+
+
+class KeyReusedError(SpikedError):
+    """An idempotency key came with another request than before."""
+
+
 _STATUS: dict[type[SpikedError], HTTPStatus] = {
     UnknownCaptureError: HTTPStatus.NOT_FOUND,
-    BusyError: HTTPStatus.CONFLICT,
+    UnknownIdError: HTTPStatus.NOT_FOUND,
     NotReadyError: HTTPStatus.NOT_FOUND,
+    GoneError: HTTPStatus.NOT_FOUND,
+    BusyError: HTTPStatus.CONFLICT,
+    ConflictError: HTTPStatus.CONFLICT,
     OverloadedError: HTTPStatus.SERVICE_UNAVAILABLE,
+    StoreError: HTTPStatus.INSUFFICIENT_STORAGE,
+}
+
+_KINDS: dict[type[SpikedError], str] = {
+    NotReadyError: "not-ready",
+    GoneError: "gone",
+    BusyError: "busy",
+    KeyReusedError: "idempotency-key-reused",
+}
+
+_WHAT_TO_DO: dict[int, str] = {
+    400: "send a request as /openapi.json describes it",
+    401: "send Authorization: Bearer TOKEN; `spiked token add NAME` makes one",
+    404: "look for the id with the GET of the list",
+    405: "use a method that the Allow header names",
+    408: "send the request again, without long pauses in its body",
+    409: "look at the state of the thing with GET, and ask again when it fits",
+    411: "send Content-Length",
+    413: "send less at a time; recordings go through uploads, in chunks",
+    415: "send the body with the Content-Type that /openapi.json names",
+    416: "ask for a range that begins inside the file",
+    422: "mend what the detail names; /openapi.json and /docs show what is expected",
+    429: "wait as long as Retry-After says",
+    503: "ask again in a moment, as Retry-After says",
+    507: "make room in the data folder, or remove captures",
+}
+
+_MORE: dict[str, str] = {
+    "not-ready": "ask again in a moment, or wait for the event that tells of it",
+    "gone": "ask for a newer version; GET versions lists those that are kept",
+    "idempotency-key-reused": "use a new key for a new request",
 }
 
 
-def problem(status: HTTPStatus | int, detail: str, headers: dict[str, str] | None = None) -> JSONResponse:
+def problem(
+    status: HTTPStatus | int,
+    detail: str,
+    headers: dict[str, str] | None = None,
+    *,
+    kind: str | None = None,
+    instance: str | None = None,
+    what_to_do: str | None = None,
+) -> JSONResponse:
     """A response that says what is wrong."""
     code = HTTPStatus(status)
-    body = Problem(type="about:blank", title=code.phrase, status=code.value, detail=detail)
-    return JSONResponse(body.model_dump(), code.value, headers, "application/problem+json")
+    kind = kind or code.phrase.lower().replace(" ", "-").replace("'", "")
+    body = Problem(
+        type=f"urn:spiked:problem:{kind}",
+        title=code.phrase,
+        status=code.value,
+        detail=detail,
+        instance=instance,
+        what_to_do=what_to_do or _MORE.get(kind) or _WHAT_TO_DO.get(code.value),
+    )
+    return JSONResponse(body.model_dump(), code.value, headers, MEDIA_TYPE)
+
+
+def problem_of(error: SpikedError, request: Request) -> JSONResponse:
+    """The response to one of our own errors."""
+    status = next((_STATUS[kind] for kind in type(error).__mro__ if kind in _STATUS), HTTPStatus.UNPROCESSABLE_ENTITY)
+    headers = {"Retry-After": str(_RETRY_S)} if status is HTTPStatus.SERVICE_UNAVAILABLE else None
+    return problem(status, str(error), headers, kind=_KINDS.get(type(error)), instance=request.url.path)
 
 
 def install(app: FastAPI) -> None:
     """Answer every error of the application with problem details."""
 
     @app.exception_handler(SpikedError)
-    def _spiked(request: Request, error: SpikedError) -> JSONResponse:
-        return problem(_STATUS.get(type(error), HTTPStatus.UNPROCESSABLE_ENTITY), str(error))
+    async def _spiked(request: Request, error: SpikedError) -> JSONResponse:
+        return problem_of(error, request)
 
     @app.exception_handler(RequestValidationError)
-    def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:
-        told = "; ".join(f"{'.'.join(str(part) for part in e['loc'])}: {e['msg']}" for e in error.errors())
-        return problem(HTTPStatus.UNPROCESSABLE_ENTITY, told)
+    async def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:
+        told = "; ".join(_told(one) for one in error.errors()[:10])
+        return problem(HTTPStatus.UNPROCESSABLE_ENTITY, told, instance=request.url.path)
 
     @app.exception_handler(HTTPException)
-    def _http(request: Request, error: HTTPException) -> JSONResponse:
-        return problem(error.status_code, str(error.detail), dict(error.headers or {}))
+    async def _http(request: Request, error: HTTPException) -> JSONResponse:
+        code = HTTPStatus(error.status_code)
+        detail, advice = str(error.detail), None
+        if detail == code.phrase and code is HTTPStatus.NOT_FOUND:
+            detail, advice = f"there is nothing at {request.url.path}", "/docs lists what there is"
+        elif detail == code.phrase and code is HTTPStatus.METHOD_NOT_ALLOWED:
+            detail = f"{request.url.path} does not take {request.method}"
+        return problem(code, detail, dict(error.headers or {}), instance=request.url.path, what_to_do=advice)
+
+    @app.exception_handler(Exception)
+    async def _unexpected(request: Request, error: Exception) -> JSONResponse:
+        return problem(
+            HTTPStatus.INTERNAL_SERVER_ERROR,
+            "the service failed over this request; its log says more",
+            instance=request.url.path,
+            what_to_do="report it with the log lines of this moment",
+        )
+
+
+def _told(error: Any) -> str:
+    """One finding of Pydantic: where, what, and what came, if that is short."""
+    where = ".".join(str(part) for part in error["loc"] if part != "body") or "body"
+    given = error.get("input")
+    shown = f", not {given!r}" if isinstance(given, str | int | float) and len(repr(given)) < 60 else ""
+    return f"{where}: {str(error['msg']).removeprefix('Value error, ')}{shown}"
+
+
+_SCHEMA = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+_DESCRIPTIONS = {
+    400: "The request cannot be read.",
+    401: "A token is needed.",
+    404: "There is no such thing, or not yet.",
+    405: "It does not take this method.",
+    409: "It does not fit the state that things are in.",
+    413: "The body is larger than allowed.",
+    415: "The body is of another type.",
+    416: "The range lies outside the file.",
+    422: "Something in the request cannot be.",
+    429: "Too many requests.",
+    503: "Too busy, or about to end.",
+    507: "The disk is full, or the catalogue cannot be written.",
+}
+_ALWAYS = (401, 422, 429, 503)
+_Responses = dict[int | str, dict[str, Any]]
+
+
+def problems(*codes: int) -> _Responses:
+    """The responses of a route with these problems, and those that every route may have."""
+    return {
+        code: {"description": _DESCRIPTIONS[code], "content": _SCHEMA} for code in sorted({*codes, *_ALWAYS, 400, 413})
+    }

@@ -3,6 +3,7 @@
 from datetime import UTC, datetime
 from typing import Annotated, Any, Generic, TypeVar
 
+from fastapi import Query
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from spiked.sensor import Intrinsics
@@ -54,6 +55,13 @@ Id = Annotated[str, Field(description="UUID version 7: ids sort by time.", examp
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
 Quaternion = tuple[Finite, Finite, Finite, Finite]
+
+
+Limit = Annotated[int, Query(ge=1, le=200, description="Most items of an answer.")]
+Cursor = Annotated[
+    str | None,
+    Query(min_length=1, max_length=64, description="`next_cursor` of the page before."),
+]
 
 
 class PageOut(Out, Generic[T]):

@@ -66,3 +66,9 @@ class UploadOut(Out):
     offset_bytes: int = Field(description="What has come; the next chunk begins here.")
     created_at: datetime
     capture_id: str | None = Field(description="What it became.")
+
+
+class UploadsOut(Out):
+    """Uploads that have not become captures, newest first."""
+
+    items: list[UploadOut]

@@ -10,14 +10,12 @@ from typing import Any
 from fastapi import APIRouter, Response
 from pydantic import BaseModel, Field
 
-from spiked_service.api.problems import Problem
+from spiked_service.api.problems import problems
 from spiked_service.api.services import Services
 from spiked_service.commands.version import installed_version
 from spiked_service.config import Origin, field, reloadable
 from spiked_service.health import Finding, Verdict, failed
 from spiked_service.store.folder import default_folder
-
-_PROBLEM: dict[str, Any] = {"model": Problem, "content": {"application/problem+json": {}}}
 
 
 class FindingOut(BaseModel):
@@ -115,7 +113,7 @@ def operations_routes(services: Services) -> APIRouter:
     router = APIRouter(tags=["operations"])
     started_at, started_s = datetime.now(UTC), time.monotonic()
 
-    @router.get("/system")
+    @router.get("/system", responses=problems())
     def get_system() -> SystemOut:
         """Version, uptime, disk and memory."""
         folder = (services.settings.now.data or default_folder()).absolute()
@@ -132,7 +130,7 @@ def operations_routes(services: Services) -> APIRouter:
             events_seq=services.bus.seq,
         )
 
-    @router.get("/configuration")
+    @router.get("/configuration", responses=problems())
     def get_configuration() -> SettingsOut:
         """Every setting in effect, and where its value comes from."""
         configuration = services.settings.configuration
@@ -148,13 +146,13 @@ def operations_routes(services: Services) -> APIRouter:
         ]
         return SettingsOut(items=items)
 
-    @router.post("/configuration:reload", responses={422: {**_PROBLEM, "description": "The sources hold an error."}})
+    @router.post("/configuration:reload", responses=problems())
     def reload_configuration() -> ReloadedOut:
         """Read file and environment again, as SIGHUP does. After an error nothing has changed."""
         done = services.settings.reload()
         return ReloadedOut(changed=done.changed, needs_restart=done.waiting)
 
-    @router.get("/tokens")
+    @router.get("/tokens", responses=problems())
     def list_tokens() -> TokensOut:
         """Names and dates of the tokens; `spiked token` makes and revokes them."""
         items = [

@@ -44,6 +44,8 @@ class Shot:
     recording: Recording
     row: int
     """Of the frame in the middle, in the file."""
+    first_frame: int
+    """Absolute index of the file's first frame."""
 
     @property
     def sensor(self) -> Sensor:
@@ -53,7 +55,7 @@ class Shot:
     @property
     def frame(self) -> int:
         """Absolute index of the frame in the middle."""
-        return self.recording.capture_index(self.row)
+        return self.first_frame + self.recording.capture_index(self.row)
 
     def window(self, length: int) -> Window:
         """So many frames around it, or as many as there are."""
@@ -86,21 +88,26 @@ class Statistics:
     mean_rate: float
 
 
-def shot_at(recording: Recording, frame: int | None) -> Shot:
-    """The frames around the one with this absolute index; those in the middle if None. Raises RecordingError."""
+def shot_at(recording: Recording, frame: int | None, first_frame: int = 0) -> Shot:
+    """The frames around the one with this absolute index, or those in the middle if None.
+
+    `first_frame` is the absolute index of the recording's first one. Raises RecordingError for a frame not recorded.
+    """
     if frame is None:
-        return Shot(recording, recording.frames // 2)
-    row = frame
+        return Shot(recording, recording.frames // 2, first_frame)
+    index = row = frame - first_frame
     for gap in sorted(recording.gaps, key=lambda gap: gap.first):
-        if frame < gap.first:
+        if index < gap.first:
             break
-        if frame < gap.first + gap.count:
-            raise RecordingError(f"frame {frame} was lost: {gap.count} frames are missing from {gap.first} on")
+        if index < gap.first + gap.count:
+            raise RecordingError(
+                f"frame {frame} was lost: {gap.count} frames are missing from {first_frame + gap.first} on"
+            )
         row -= gap.count
     if not 0 <= row < recording.frames:
-        last = recording.capture_index(recording.frames - 1)
-        raise RecordingError(f"frame {frame} is not in the recording, which ends with frame {last}")
-    return Shot(recording, row)
+        last = first_frame + recording.capture_index(recording.frames - 1)
+        raise RecordingError(f"frame {frame} is not in the recording, which holds frames {first_frame} to {last}")
+    return Shot(recording, row, first_frame)
 
 
 def picture(shot: Shot, kind: PictureKind, white: float | None) -> Picture:

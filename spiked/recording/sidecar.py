@@ -35,7 +35,9 @@ class ClockPair(_Strict):
     unix_ns: int
 
 
-class _Pinhole(_Strict):
+class Pinhole(_Strict):
+    """Intrinsics as sidecars say them, in pixels."""
+
     fx: float = Field(gt=0)
     fy: float = Field(gt=0)
     cx: float
@@ -59,7 +61,7 @@ class Sidecar(BaseModel):
     """Rows are stored bottom-up."""
     cfa: Mosaic | None = None
     """Colour pattern of the upright image."""
-    intrinsics: _Pinhole | None = None
+    intrinsics: Pinhole | None = None
     pixel_centre: float = Field(0.5, ge=0, le=0.5)
     """Where the intrinsics put the centre of the first pixel."""
     note: str = ""
@@ -85,7 +87,7 @@ class Sidecar(BaseModel):
             bit_order=sensor.bit_order,
             flipped=sensor.flipped,
             cfa=sensor.mosaic,
-            intrinsics=None if k is None else _Pinhole(fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy),
+            intrinsics=None if k is None else Pinhole(fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy),
             **more,
         )
 

@@ -7,8 +7,10 @@ from fastapi import APIRouter, FastAPI
 from fastapi.concurrency import run_in_threadpool
 
 from spiked_service.api.captures import capture_routes
+from spiked_service.api.docs import mount_docs
 from spiked_service.api.events import event_routes
 from spiked_service.api.old_schemas import DeviceOut
+from spiked_service.api.openapi import describe
 from spiked_service.api.operations import health_routes, operations_routes
 from spiked_service.api.page import mount_page
 from spiked_service.api.problems import install
@@ -17,18 +19,6 @@ from spiked_service.commands.version import installed_version
 from spiked_service.devices import known_devices
 from spiked_service.security import Security
 from spiked_service.views import ViewRenderer
-
-_DESCRIPTION = """Captures from spike cameras, reconstructed while they run.
-
-Poses are camera-to-world with OpenCV axes (x right, y down, z forward). Errors are RFC 9457 problem details.
-
-```
-curl -X POST localhost:8650/api/v1/captures -H 'content-type: application/json' -d '{"source": "sim:", "frames": 1280}'
-curl localhost:8650/api/v1/captures/ID/trajectory?format=tum -o trajectory.tum
-curl -X POST localhost:8650/api/v1/captures/ID/views -H 'content-type: application/json' \\
-     -d '{"position": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}' -o view.png
-```
-"""
 
 
 def create_app(services: Services) -> FastAPI:
@@ -39,7 +29,8 @@ def create_app(services: Services) -> FastAPI:
         yield
         await run_in_threadpool(services.captures.close)
 
-    app = FastAPI(title="spiked", version=installed_version(), description=_DESCRIPTION, lifespan=lifespan)
+    app = FastAPI(title="spiked", version=installed_version(), docs_url=None, redoc_url=None, lifespan=lifespan)
+    describe(app)
     install(app)
     api = APIRouter(prefix="/api/v1")
     api.include_router(capture_routes(services.captures, ViewRenderer(services.renders)))
@@ -54,5 +45,6 @@ def create_app(services: Services) -> FastAPI:
     app.include_router(api)
     app.include_router(health_routes(services))
     app.add_middleware(Security, settings=services.settings, tokens=services.tokens)
+    mount_docs(app)
     mount_page(app)
     return app

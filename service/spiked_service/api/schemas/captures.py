@@ -16,6 +16,7 @@ from spiked_service.api.schemas.base import (
     Name,
     Notes,
     Out,
+    PageOut,
     example,
     examples,
 )
@@ -287,11 +288,20 @@ class CaptureOut(Out):
         )
 
 
+class CapturePage(PageOut[CaptureOut]):
+    """Captures, newest first."""
+
+
 class RateHistogram(Out):
     """How many pixels fire how often."""
 
     edges: list[float] = Field(description="Spikes a frame; one more than counts.")
     counts: list[int]
+
+    @classmethod
+    def of(cls, counts: list[int]) -> "RateHistogram":
+        """Equal bins from 0 to 1."""
+        return cls(edges=[k / len(counts) for k in range(len(counts) + 1)], counts=counts)
 
 
 class StatsOut(Out):

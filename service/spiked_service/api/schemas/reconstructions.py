@@ -5,7 +5,7 @@ from datetime import datetime
 from pydantic import Field
 
 from spiked.recon import State
-from spiked_service.api.schemas.base import ID_EXAMPLE, Id, In, Out, example
+from spiked_service.api.schemas.base import ID_EXAMPLE, Id, In, Out, PageOut, example
 from spiked_service.messages import Stage
 from spiked_service.reconstruction_options import ReconstructionOptions
 from spiked_service.store.rows import JobState, ReconstructionRow, VersionRow
@@ -58,6 +58,10 @@ class ReconstructionOut(Out):
     def of(cls, row: ReconstructionRow) -> "ReconstructionOut":
         """A row as it is shown."""
         return cls.model_validate({name: getattr(row, name) for name in cls.model_fields})
+
+
+class ReconstructionPage(PageOut[ReconstructionOut]):
+    """Reconstructions, newest first."""
 
 
 class VersionOut(Out):

@@ -62,10 +62,7 @@ class Reads(Protocol):
         ...
 
     def ran_dry(self) -> int | None:
-        """If the camera found nothing queued to write into: the bytes that had come by then and were not had by `next`.
-
-        Asking forgets it; None if all went well since last asked.
-        """
+        """If the camera had nothing to write into at the last `release`: bytes that waited for `next`; else None."""
         ...
 
     def start(self) -> None:
@@ -139,7 +136,8 @@ class AsynchronousReads:
         self._put_off: list[_Read] = []
         self._current: _Read | None = None
         self._in_flight = 0
-        self._dry = False
+        self._endings = 0
+        self._dry: int | None = None
         self._running = False
         self._request_trouble: Trouble | None = None
 
@@ -150,10 +148,7 @@ class AsynchronousReads:
 
     def ran_dry(self) -> int | None:
         """See `Reads`."""
-        if not self._dry:
-            return None
-        self._dry = False
-        return sum(read.transfer.actual_length for read in self._queue if not read.pending)
+        return self._dry
 
     def start(self) -> None:
         """See `Reads`; where the kernel takes at least a few transfers, those are what is used."""
@@ -170,7 +165,6 @@ class AsynchronousReads:
                     self._forget(surplus)
                 del self._reads[number:]
                 break
-        self._dry = False
 
     def next(self, timeout_s: float) -> Arrival | None:
         """See `Reads`."""
@@ -187,8 +181,12 @@ class AsynchronousReads:
     def release(self) -> None:
         """See `Reads`. Raises usb.core.USBError, or OutOfUsbMemoryError if nothing can be queued any more."""
         read, self._current = self._current, None
+        self._dry = None
         if read is None or not self._running:
             return
+        self._reap()
+        if not self._in_flight:
+            self._dry = sum(ended.transfer.actual_length for ended in self._queue)
         self._put_off.append(read)
         try:
             while self._put_off:
@@ -267,7 +265,6 @@ class AsynchronousReads:
 
     def _wait(self, timeout_s: float) -> None:
         """Until the oldest read has ended."""
-        self._context.handle_events(0)
         deadline = time.monotonic() + timeout_s
         while self._queue[0].pending and self._request_trouble is None:
             remaining_s = deadline - time.monotonic()
@@ -275,17 +272,24 @@ class AsynchronousReads:
                 return
             self._context.handle_events(remaining_s)
 
+    def _reap(self) -> None:
+        """Hear of all that has ended; libusb looks at no more than a few at a time."""
+        seen = -1
+        while seen != self._endings:
+            seen = self._endings
+            self._context.handle_events(0)
+
     def _ended(self, address: int) -> None:
         """Called by libusb: nothing here may raise, or take long."""
         one = self._by_address[address]
         one.pending = False
+        self._endings += 1
         if isinstance(one, _Request):
             self._free_requests.append(one)
             if one.transfer.status != Status.COMPLETED and self._running:
                 self._request_trouble = _TROUBLES.get(Status(one.transfer.status), Trouble.FAILED)
         else:
             self._in_flight -= 1
-            self._dry |= self._in_flight == 0
 
 
 class SynchronousReads:

@@ -170,8 +170,10 @@ class UsbSource:
         self._framing.keep()
         try:
             reads.release()
+            if (waiting := reads.ran_dry()) is not None:
+                ended_at = self._framing.next_index + waiting // USB_FRAME_BYTES
+                self._dry = (self._dry[0] if self._dry else ended_at, ended_at)
             arrival = reads.next(READ_WAIT_S)
-            dry = reads.ran_dry()
         except usb.core.USBError as error:
             self._break_off(trouble_of(error))
             return False
@@ -180,9 +182,6 @@ class UsbSource:
             if now_s - max(self._heard_s, self._waiting_since_s) > self.options.silence_s:
                 self._break_off(None)
             return False
-        if dry is not None:
-            ended_at = self._framing.next_index + (dry + arrival.data.size) // USB_FRAME_BYTES
-            self._dry = (self._dry[0] if self._dry else ended_at, ended_at)
         self._take(arrival, now_s)
         if arrival.trouble:
             self._break_off(arrival.trouble)

@@ -94,8 +94,8 @@ def find_cameras() -> list[UsbCamera]:
     """Every camera that is plugged in, by bus and port."""
     try:
         folders = list(SYSFS.iterdir())
-    except FileNotFoundError:
-        return []  # no USB on this machine, or in this container
+    except OSError:
+        return []  # no USB on this machine, or none that this container may see
     found = [camera for folder in folders if _PORT.fullmatch(folder.name) and (camera := _read(folder))]
     return sorted(found, key=lambda camera: [int(number) for number in re.findall(r"\d+", camera.port)])
 

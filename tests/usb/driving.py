@@ -1,0 +1,154 @@
+"""The driver in a process of its own, and what it has told so far."""
+
+import json
+import os
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from virtual_camera.rig import Report, VirtualCameras
+
+_HERE = Path(__file__).resolve().parent
+PATIENCE_S = 40.0
+
+
+@dataclass
+class Told:
+    """What the driver said, in order."""
+
+    states: list[tuple[str, str]] = field(default_factory=list)
+    """State and reason."""
+    gaps: list[tuple[int, int, str]] = field(default_factory=list)
+    """First, count, cause."""
+    runs: dict[tuple[int, int], int] = field(default_factory=dict)
+    """Frames that followed one another: capture index and camera number of the first, and how many."""
+    opened: bool = False
+    error: str | None = None
+    closed_s: float | None = None
+    times: dict[str, list[float]] = field(default_factory=dict)
+    """When each state began, in seconds since the driver's start."""
+
+    @property
+    def received(self) -> int:
+        """Frames."""
+        return sum(self.runs.values())
+
+    @property
+    def lost(self) -> int:
+        """Frames."""
+        return sum(count for _, count, _ in self.gaps)
+
+    @property
+    def end(self) -> int:
+        """Received and lost, if they are the whole capture from 0 on without an overlap; raises AssertionError."""
+        pieces = [(first, count) for (first, _), count in self.runs.items() if count]
+        pieces += [(first, count) for first, count, _ in self.gaps]
+        expected = 0
+        for first, count in sorted(pieces):
+            assert first == expected
+            expected += count
+        return expected
+
+    @property
+    def offsets(self) -> list[int]:
+        """Camera number minus index of each run, in order; one and the same while the camera's count runs on."""
+        offsets = [number - index for (index, number), count in sorted(self.runs.items()) if count]
+        return [offset for at, offset in enumerate(offsets) if not at or offset != offsets[at - 1]]
+
+
+class Driver:
+    """`driver_client` as a process that sees the virtual cameras."""
+
+    def __init__(self, rig: VirtualCameras, spec: str, *, user: int | None = None) -> None:
+        path = os.pathsep.join([str(_HERE), os.environ.get("PYTHONPATH", "")])
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "driver_client", spec, *([] if user is None else [str(user)])],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**rig.environment, "PYTHONPATH": path},
+        )
+        self.told = Told()
+        self._lines: queue.Queue[str] = queue.Queue()
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def wait_for(self, condition: Callable[[Told], Any], seconds: float = PATIENCE_S) -> Told:
+        """Until the condition is fulfilled. Raises TimeoutError with what was told."""
+        deadline_s = time.monotonic() + seconds
+        while not condition(self.told):
+            try:
+                self._hear(self._lines.get(timeout=max(0.0, deadline_s - time.monotonic())))
+            except queue.Empty as error:
+                raise TimeoutError(f"not so within {seconds:g} s: {self.told}") from error
+        return self.told
+
+    def wait_for_state(self, *states: str, after: int = 0) -> Told:
+        """Until one of the states came, the first `after` states left out."""
+        return self.wait_for(lambda told: any(state in states for state, _ in told.states[after:]))
+
+    def doze(self) -> None:
+        """Do nothing for a second, as on a busy host."""
+        self._command("doze\n")
+
+    def wait_for_frames(self, count: int) -> Told:
+        """Until so many more frames came than by now."""
+        now = self.told.received
+        return self.wait_for(lambda told: told.received >= now + count)
+
+    def stop(self) -> Told:
+        """Stop it and wait for its end; frames and gaps are accounted for without a hole."""
+        self._command("stop\n")
+        self.wait_for(lambda told: told.closed_s is not None or told.error)
+        self.told.end  # noqa: B018
+        return self.told
+
+    def close(self) -> None:
+        """End the process."""
+        if self._process.poll() is None:
+            self._process.kill()
+        self._process.communicate()
+
+    def _command(self, text: str) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(text)
+        self._process.stdin.flush()
+
+    def _listen(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._lines.put(line)
+        self._lines.put("")
+
+    def _hear(self, line: str) -> None:
+        if not line:
+            raise RuntimeError(f"the driver's process ended with {self._process.wait()}: {self.told}")
+        match json.loads(line):
+            case {"run": [index, number, count]}:
+                self.told.runs[index, number] = count
+            case {"gap": [first, count, cause]}:
+                self.told.gaps.append((first, count, cause))
+            case {"state": state, "reason": reason, "at": at}:
+                self.told.states.append((state, reason))
+                self.told.times.setdefault(state, []).append(at)
+            case {"opened": True}:
+                self.told.opened = True
+            case {"closed_s": seconds}:
+                self.told.closed_s = seconds
+            case {"error": message}:
+                self.told.error = message
+
+
+def check_sent(told: Told, report: Report) -> None:
+    """Every frame that was received is one that the camera sent."""
+    for (_, number), count in told.runs.items():
+        assert (
+            not count
+            or any(run.first <= number and number + count <= run.first + run.count for run in report.sent)
+            or all(report.runs(one) for one in range(number, number + count))
+        )

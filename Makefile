@@ -6,8 +6,9 @@ PYTHON ?= python3.11
 TORCH ?= torch==2.13.0
 BUILD_REQUIRES := "scikit-build-core>=0.10" "nanobind>=2.4" "cmake>=3.25" ninja
 
-# Debian packages for tests of the USB camera.
+# Debian packages for tests of the USB camera: a mocked kernel, and, for the slow ones, a guest with a real one.
 MOCKS := umockdev libusb-1.0-0
+GUEST := qemu-system-x86 busybox-static udev
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -29,7 +30,7 @@ test: lint $(PAGE) $(VENV)/.chromium $(VENV)/.mocks
 	cd web && npm run --silent test
 	$(BIN)/pytest -m "not slow"
 
-test-slow: $(VENV)/.native $(PAGE) $(VENV)/.chromium $(VENV)/.mocks
+test-slow: $(VENV)/.native $(PAGE) $(VENV)/.chromium $(VENV)/.mocks $(VENV)/.guest
 	$(BIN)/pytest -m slow
 
 lint: $(VENV)/.native $(NPM_CI)
@@ -69,13 +70,15 @@ $(VENV)/.python:
 	touch $@
 
 # What stands in for the hardware in tests. Root gets it installed; for others those tests are skipped and say so.
-$(VENV)/.mocks: $(VENV)/.python
+$(VENV)/.mocks: PACKAGES := $(MOCKS)
+$(VENV)/.guest: PACKAGES := $(GUEST)
+$(VENV)/.mocks $(VENV)/.guest: $(VENV)/.python
 	@missing=""; \
-	for package in $(MOCKS); do dpkg -s $$package >/dev/null 2>&1 || missing="$$missing $$package"; done; \
+	for package in $(PACKAGES); do dpkg -s $$package >/dev/null 2>&1 || missing="$$missing $$package"; done; \
 	if [ -n "$$missing" ] && [ "$$(id -u)" = 0 ]; then \
 	  apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -q -y --no-install-recommends $$missing; \
 	elif [ -n "$$missing" ]; then \
-	  echo "tests with mocked hardware are skipped; they need: apt-get install$$missing" >&2; exit 0; \
+	  echo "some tests of the USB camera are skipped; they need: apt-get install$$missing" >&2; exit 0; \
 	fi && touch $@
 
 $(VENV)/.packages: $(VENV)/.python pyproject.toml

@@ -4,28 +4,16 @@ import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 from virtual_camera.faults import Fault, Kind
 from virtual_camera.host import CameraSettings
 from virtual_camera.rig import VirtualCameras
 from virtual_camera.stream import FRAME_BYTES, ROWS
+from wire_facts import assert_sent, frames_of, lines_of
 
 HIGH, SUPER = 3, 4
 READ_BYTES = 1 << 16
-
-
-def frames_of(path: Path) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """The whole frames of a wire file that begins with one, uint8 [n, 13016]."""
-    data = np.fromfile(path, np.uint8)
-    return data[: len(data) // FRAME_BYTES * FRAME_BYTES].reshape(-1, FRAME_BYTES)
-
-
-def lines_of(frames: np.ndarray[Any, np.dtype[np.uint8]]) -> list[int]:
-    """The line counters of frames, in frames."""
-    return [int(value) // ROWS for value in np.ascontiguousarray(frames[:, 12:16]).view("<u4")[:, 0]]
 
 
 def test_libusb_lists_it_as_the_bridge_it_is(cameras: Callable[..., VirtualCameras], pictures: Path) -> None:
@@ -55,18 +43,9 @@ def test_what_it_sends_is_what_the_wire_says(
     rig = cameras(CameraSettings(str(pictures), lines=start, nbytes=50 * start & 0xFFFFFFFF), direct_memory=direct)
     answer = rig.call("read", str(tmp_path / "wire"), 5)
     assert answer == {"lengths": [READ_BYTES] * 5, "errno": None}
-    frames, sent = frames_of(tmp_path / "wire"), np.fromfile(pictures, np.uint8).reshape(-1, ROWS, 50)
+    frames = frames_of(tmp_path / "wire")
     assert len(frames) == 5 * READ_BYTES // FRAME_BYTES
-    for index, frame in enumerate(frames):
-        magic, word1, nbytes, lines = np.frombuffer(frame[:16].tobytes(), "<u4").tolist()
-        assert (magic, word1) == (0x63606300, 0x00100021)
-        assert lines == (start + ROWS * index) & 0xFFFFFFFF
-        assert nbytes == 50 * (start + ROWS * index) & 0xFFFFFFFF
-        rows = frame[16:].reshape(ROWS, 52).copy()
-        assert rows[:, 50:].tobytes() == np.arange(ROWS, dtype="<u2").tobytes()
-        assert rows[0, :8].tobytes() == index.to_bytes(8, "little")
-        rows[0, :8] = sent[index, 0, :8]
-        np.testing.assert_array_equal(rows[:, :50], sent[index])
+    assert_sent(frames, pictures, start)
     report = rig.report()
     assert report.requests == tuple((index, READ_BYTES) for index in range(5))
     assert report.sent_frames == report.next_frame == -(-5 * READ_BYTES // FRAME_BYTES)

@@ -1,4 +1,4 @@
-"""Faults on purpose, for any source: losses, stalls and unplugging at exactly repeatable frames."""
+"""Faults on purpose, for any source: losses, stalls, damage and unplugging at exactly repeatable frames."""
 
 import time
 from collections import deque
@@ -43,6 +43,9 @@ class Faults:
     """Fraction of the frames lost at random (cause usb)."""
     drop_run: int = 1
     """Frames lost each time."""
+    corrupt: float = 0.0
+    """Fraction of the frames in which a stretch of pixels is noise, delivered as if nothing were wrong: the wire has no
+    checksum over pixels."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -50,6 +53,8 @@ class Faults:
             raise ConfigurationError(
                 f"dropping a fraction of {self.drop:g}, {self.drop_run} frames each, is not possible"
             )
+        if not 0 <= self.corrupt <= 1:
+            raise ConfigurationError(f"corrupting a fraction of {self.corrupt:g} of the frames is not possible")
         if any(loss.first < 0 or loss.count < 1 for loss in self.losses):
             raise ConfigurationError("a loss begins at frame 0 or later and takes at least one frame")
         if any(stall.frame < 0 or stall.seconds < 0 for stall in self.stalls):
@@ -70,6 +75,8 @@ class FaultySource:
         self._told: deque[Gap | End] = deque()
         self._loss: Loss | None = None  # the one going on
         self._stalled_since_s: float | None = None
+        self.corrupted = 0
+        """Frames that were damaged since `open`."""
         self._restart()
 
     @property
@@ -116,6 +123,8 @@ class FaultySource:
         if self._loss is not None:
             return self._lose(self._loss, view)
         item = self.inner.read_into(view[: self._undisturbed(len(view))])
+        if isinstance(item, Chunk):
+            self._corrupt(view[: item.frames])
         self._advance(item)
         return item
 
@@ -126,6 +135,9 @@ class FaultySource:
         self._stalls = deque(sorted(self.faults.stalls, key=lambda stall: stall.frame))
         self._random = np.random.default_rng(self.faults.seed)
         self._next_drop = self._draw_drop()
+        self._noise = np.random.default_rng([self.faults.seed, 1])
+        self._next_corrupt = self._draw_corrupt(0)
+        self.corrupted = 0
         self._loss = None
         self._told.clear()
         self._stalled_since_s = None
@@ -136,6 +148,20 @@ class FaultySource:
             return None
         chance = self.faults.drop / (self.faults.drop_run * (1 - self.faults.drop) + self.faults.drop)
         return self._next + int(self._random.geometric(chance)) - 1
+
+    def _draw_corrupt(self, start: int) -> int | None:
+        """The first frame from `start` on that is damaged."""
+        return start + int(self._noise.geometric(self.faults.corrupt)) - 1 if self.faults.corrupt else None
+
+    def _corrupt(self, frames: NDArray[np.uint8]) -> None:
+        """Put noise into those of the frames, uint8 [n, frame_bytes], whose turn it is; the first has index _next."""
+        while self._next_corrupt is not None and self._next_corrupt < self._next + len(frames):
+            noise = self._noise.integers(0, 256, frames.shape[1] // 16 + 1, np.uint8)
+            at = int(self._noise.integers(0, frames.shape[1] - len(noise) + 1))
+            if self._next_corrupt >= self._next:  # else it was lost
+                frames[self._next_corrupt - self._next, at : at + len(noise)] ^= noise
+                self.corrupted += 1
+            self._next_corrupt = self._draw_corrupt(self._next_corrupt + 1)
 
     def _loss_at(self, frame: int) -> Loss | None:
         while self._losses and self._losses[0].first + self._losses[0].count <= frame:

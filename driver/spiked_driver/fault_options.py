@@ -80,7 +80,7 @@ class FaultOptions(BaseModel):
         losses = [Loss(first, length.at(rate_hz), cause) for first, length, cause in self.gap]
         losses += [Loss(first, length.at(rate_hz), Cause.DEVICE, unplugged=True) for first, length in self.unplug_at]
         stalls = tuple(Stall(*stall) for stall in self.stall)
-        return Faults(tuple(losses), stalls, self.drop, self.drop_run, self.corrupt, self.fault_seed)
+        return Faults(tuple(losses), stalls, self.drop, self.drop_run, self.fault_seed, self.corrupt)
 
 
 def many(values: Any) -> list[str]:

@@ -43,10 +43,10 @@ class Faults:
     """Fraction of the frames lost at random (cause usb)."""
     drop_run: int = 1
     """Frames lost each time."""
+    seed: int = 0
     corrupt: float = 0.0
     """Fraction of the frames in which a stretch of pixels is noise, delivered as if nothing were wrong: the wire has no
     checksum over pixels."""
-    seed: int = 0
 
     def __post_init__(self) -> None:
         if not 0 <= self.drop < 1 or self.drop_run < 1:

@@ -8,10 +8,10 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from spiked.errors import SourceError
 from spiked.recording import open_recording
-from spiked.ring import Cause
 from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import MotionKind
-from spiked_driver.faults import Faults, FaultySource, Loss, Stall
+from spiked_driver.fault_options import FaultOptions
+from spiked_driver.faults import Faults, FaultySource
 from spiked_driver.framing import USB_HEIGHT, USB_WIDTH
 from spiked_driver.pcie import PCIE_SIZE, PcieSource
 from spiked_driver.replay import ReplaySource
@@ -28,39 +28,11 @@ class _Options(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class SourceOptions(_Options):
-    """Options of every source: its pace, and what shall go wrong."""
+class SourceOptions(FaultOptions):
+    """Options of every source that is not a real camera: its pace, and what shall go wrong."""
 
     pace: Pace = 1.0
     """Factor of the sensor's frame rate; 0 or `max`: as fast as lossless consumers take frames."""
-    drop: float = Field(0.0, ge=0, lt=1)
-    """Fraction of the frames lost at random."""
-    drop_run: int = Field(1, ge=1)
-    """Frames lost each time."""
-    fault_seed: int = 0
-    gap: tuple[tuple[int, int, Cause], ...] = ()
-    """`first:count` or `first:count:cause`, any number of times: frames to lose."""
-    unplug: tuple[tuple[int, int], ...] = ()
-    """`first:count`: the device is gone for so many frames."""
-    stall: tuple[tuple[int, float], ...] = ()
-    """`frame:seconds`: nothing comes for a while."""
-
-    @field_validator("gap", mode="before")
-    @classmethod
-    def _with_cause(cls, values: Any) -> Any:
-        return [[*text.split(":"), Cause.USB][:3] for text in _many(values)]
-
-    @field_validator("unplug", "stall", mode="before")
-    @classmethod
-    def _pairs(cls, values: Any) -> Any:
-        return [text.split(":") for text in _many(values)]
-
-    def faults(self) -> Faults:
-        """The faults among the options."""
-        losses = tuple(Loss(*gap) for gap in self.gap)
-        unplugged = tuple(Loss(first, count, Cause.DEVICE, unplugged=True) for first, count in self.unplug)
-        stalls = tuple(Stall(*stall) for stall in self.stall)
-        return Faults(losses + unplugged, stalls, self.drop, self.drop_run, self.fault_seed)
 
 
 class ReplayOptions(SourceOptions):
@@ -123,7 +95,7 @@ class UsbCameraOptions(CameraOptions):
     """When nothing came for so long, the camera is lost."""
 
 
-_Kind = TypeVar("_Kind", bound=_Options)
+_Kind = TypeVar("_Kind", bound=BaseModel)
 _USB = re.compile(r"usb\d*(:|\?|$)")
 
 
@@ -150,12 +122,14 @@ def open_source(spec: str) -> Source:
             return PcieSource(target, frame_rate_hz=card.rate, intrinsics=optics)
         case "replay":
             replay = _parse(ReplayOptions, query, spec)
-            source, faults = _replay(target, replay), replay.faults()
+            source = _replay(target, replay)
+            faults = replay.faults(source.sensor.frame_rate_hz)
         case "sim":
             if target:
                 raise SourceError(f"source {spec!r}: sim: takes options only, as in sim:?seed=1")
             simulation = _parse(SimulationOptions, query, spec)
-            source, faults = _simulated(simulation), simulation.faults()
+            source = _simulated(simulation)
+            faults = simulation.faults(simulation.rate)
         case _:
             raise SourceError(f"source {spec!r}: there is no kind {kind!r}, only usb0, pcie:PATH, replay:FILE and sim:")
     return source if faults == Faults(seed=faults.seed) else FaultySource(source, faults)
@@ -197,13 +171,10 @@ def _simulated(options: SimulationOptions) -> Source:
     )
 
 
-def _many(values: Any) -> list[str]:
-    return [values] if isinstance(values, str) else list(values)
-
-
 def _parse(kind: type[_Kind], query: str, spec: str) -> _Kind:
     values = {
-        name: texts if len(texts) > 1 else texts[0] for name, texts in parse_qs(query, keep_blank_values=True).items()
+        name.replace("-", "_"): texts if len(texts) > 1 else texts[0]
+        for name, texts in parse_qs(query, keep_blank_values=True).items()
     }
     try:
         return kind.model_validate(values)

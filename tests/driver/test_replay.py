@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from spiked_driver import Chunk, Faults, FaultySource, Loss, Source, Stall, acquire
 from spiked_driver.replay import ReplaySource
 from spiked_driver.simulated import SimulatedSource
@@ -144,14 +145,43 @@ def test_a_paced_replay_does_not_wait_for_readers(recording: Path) -> None:
 
 
 def test_faults_are_options_of_every_source(recording: Path) -> None:
-    line = "pace=0&drop=0.1&drop_run=2&fault_seed=4&gap=5:3&gap=10:2:disk&unplug=20:5&stall=30:0.5"
+    line = "pace=0&drop=0.1&drop_run=2&fault_seed=4&gap=5:3&gap=10:2:disk&unplug-at=20:5&stall=30:0.5&corrupt=0.2"
     losses = (Loss(5, 3), Loss(10, 2, Cause.DISK), Loss(20, 5, Cause.DEVICE, unplugged=True))
-    expected = Faults(losses, (Stall(30, 0.5),), drop=0.1, drop_run=2, seed=4)
+    expected = Faults(losses, (Stall(30, 0.5),), drop=0.1, drop_run=2, seed=4, corrupt=0.2)
     for spec, kind in ((f"replay:{recording}?{line}", ReplaySource), (f"sim:?{line}", SimulatedSource)):
         source = open_source(spec)
         assert isinstance(source, FaultySource)
         assert isinstance(source.inner, kind)
         assert source.faults == expected
+
+
+def test_lengths_of_faults_may_be_times() -> None:
+    source = open_source("sim:?rate=20000&gap=5:1.5ms:ring&unplug-at=100:2s&stall=30:40ms&stall=40:1s")
+    assert isinstance(source, FaultySource)
+    losses = (Loss(5, 30, Cause.RING), Loss(100, 40_000, Cause.DEVICE, unplugged=True))
+    assert source.faults == Faults(losses, (Stall(30, 0.04), Stall(40, 1.0)))
+
+
+def test_corrupted_frames_are_the_same_however_they_are_read(recording: Path) -> None:
+    options = "pace=0&corrupt=0.3&fault_seed=2&gap=7:9"
+    spoilt = [read_all(open_source(f"replay:{recording}?{options}"), block) for block in (1, 7, 50)]
+    np.testing.assert_array_equal(spoilt[0], spoilt[1])
+    np.testing.assert_array_equal(spoilt[0], spoilt[2])
+    kept = np.delete(bits(), slice(7, 16), axis=0)
+    wrong = (spoilt[0] != kept).any(axis=1)
+    assert 3 < wrong.sum() < 25
+    assert (spoilt[0] == kept)[~wrong].all()
+
+
+def read_all(source: Source, block: int) -> NDArray[np.uint8]:
+    """All frames, uint8 [n, frame_bytes], read in blocks."""
+    source.open()
+    view = np.zeros((block, source.sensor.frame_bytes), np.uint8)
+    frames = []
+    while not isinstance(item := source.read_into(view), End):
+        if isinstance(item, Chunk):
+            frames.append(view[: item.frames].copy())
+    return np.concatenate(frames)
 
 
 def test_a_simulation_is_described_by_its_options() -> None:
@@ -196,6 +226,9 @@ def test_cameras_are_told_from_files_and_simulations(spec: str, camera: bool) ->
         ("sim:?seed=1&seed=2", "seed"),
         ("sim:?drop=1", "drop=1"),
         ("sim:?gap=5", "gap=5"),
+        ("sim:?gap=5:1.5", "neither a number of frames nor a time"),
+        ("sim:?unplug-at=5:2:disk", "unplug_at"),
+        ("sim:?corrupt=2", "corrupt=2"),
         ("sim:?gap=5:3&gap=6:1", "overlap"),
         ("sim:?gap=5:0", "at least one frame"),
         ("sim:?pace=-1", "pace=-1"),

@@ -11,6 +11,7 @@ import typer
 from spiked.recon import State
 from spiked_service.capture import CaptureState, Plan, Snapshot
 from spiked_service.captures import Captures, unhurried
+from spiked_service.commands.fault_flags import Corrupt, Drop, Gap, Stall, UnplugAt, with_faults
 from spiked_service.config import LogFormat, LogLevel, setting
 from spiked_service.console import output
 from spiked_service.daemon import Daemon
@@ -40,6 +41,11 @@ def serve(
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="NAME=VALUE for any other setting; see `spiked config show`.")
     ] = None,
+    drop: Drop = None,
+    gap: Gap = None,
+    corrupt: Corrupt = None,
+    unplug_at: UnplugAt = None,
+    stall: Stall = None,
 ) -> None:
     """Run the daemon: acquisition, reconstruction in a worker process, HTTP and a page to watch it.
 
@@ -52,11 +58,14 @@ def serve(
 
     - `spiked serve --device 'replay:rec.dat?pace=1' --port 9000`
 
+    - `spiked serve --device 'sim:?pace=1' --drop 0.01 --unplug-at 20000:2s`
+
     - `spiked token create laptop; spiked serve --device sim: --host 0.0.0.0`
     """
     flags: dict[str, object] = {
         **dict(setting(text) for text in set_ or []),
-        "devices": device or None,
+        "devices": with_faults(device or [], drop=drop, gap=gap, corrupt=corrupt, unplug_at=unplug_at, stall=stall)
+        or None,
         "host": host,
         "port": port,
         "token": token,

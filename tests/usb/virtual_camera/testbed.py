@@ -93,6 +93,7 @@ class Testbed:
             "devnum": str(number),
             "speed": str(speed.value),
             "version": f"{descriptors[3]:2x}.{descriptors[2]:02x}",
+            "bcdDevice": descriptors[13:11:-1].hex(),
             "maxchild": "0",
             **identity,
             **texts,

@@ -15,11 +15,12 @@ from spiked.errors import ConfigurationError, SpikedError
 from spiked_service.api.app import create_app
 from spiked_service.api.services import Services
 from spiked_service.captures import Captures
+from spiked_service.commands.version import installed_version
 from spiked_service.config import Settings
-from spiked_service.console import report_error
 from spiked_service.events import Bus
 from spiked_service.health import Health, failed
 from spiked_service.live import LiveSettings
+from spiked_service.logs import configure_logs, logger, set_level
 from spiked_service.runtime import RuntimeFolder
 from spiked_service.security import is_loopback
 from spiked_service.store.folder import default_folder
@@ -27,6 +28,7 @@ from spiked_service.systemd import Notifier
 from spiked_service.tokens import Tokens
 from spiked_service.zmq import ZmqServer
 
+_log = logger("spiked.daemon")
 _CONNECTIONS = 1000
 """More at a time are answered with 503 at once."""
 _GONE_MS = 60_000
@@ -49,6 +51,8 @@ class Daemon:
             self._folder = RuntimeFolder(now.runtime)
             ends.callback(self._folder.remove)
             bus = Bus()
+            configure_logs(now.log_level, now.log_format, bus)
+            settings.on_change(lambda changed: set_level(changed.log_level))
             health = Health()
             captures = Captures(self._folder.path)
             ends.callback(captures.close)
@@ -82,9 +86,10 @@ class Daemon:
         """Take what has changed in file and environment; an error is told, and all stays as it was."""
         self._notifier.reloading()
         try:
-            self.services.settings.reload()
+            done = self.services.settings.reload()
+            _log.info("settings reloaded", changed=done.changed, waiting=done.waiting)
         except SpikedError as error:
-            report_error(error)
+            _log.error("settings not reloaded", reason=str(error))
         self._notifier.ready(f"serving at {self.address}")
 
     def lives(self) -> bool:
@@ -100,7 +105,8 @@ class Daemon:
     def _server_config(self, now: Settings) -> uvicorn.Config:
         config = uvicorn.Config(
             create_app(self.services),
-            log_level="warning",
+            log_config=None,
+            access_log=False,
             lifespan="on",
             timeout_graceful_shutdown=1,
             limit_concurrency=_CONNECTIONS,
@@ -130,11 +136,13 @@ class _Server(uvicorn.Server):
         await super().startup(sockets)
         if self.started:
             self._notifier.ready(f"serving at {self._daemon.address}")
+            _log.info("serving", address=self._daemon.address, version=installed_version())
             self._notifier.watch(self._daemon.lives)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """The workers learn of the end at once, not when the last response is sent."""
         self._notifier.stopping()
+        _log.info("stopping", signal=signal.Signals(sig).name)
         threading.Thread(target=self._daemon.services.captures.dismiss, name="dismissal").start()
         super().handle_exit(sig, frame)
 

@@ -221,6 +221,7 @@ class Bus:
         self._history: deque[Message] = deque(maxlen=history)
         self._states: dict[Topic, OrderedDict[str | None, Message]] = {topic: OrderedDict() for topic in _WITH_STATE}
         self._subscriptions: tuple[Subscription, ...] = ()
+        self._observers: tuple[Callable[[Message], None], ...] = ()
         self._dropped: Counter[Topic] = Counter()
 
     @property
@@ -248,7 +249,9 @@ class Bus:
                 self._remember(message)
             for subscription in self._subscriptions:
                 subscription._put(message)
-            return message.seq
+        for observer in self._observers:
+            observer(message)
+        return message.seq
 
     def subscribe(
         self,
@@ -269,6 +272,11 @@ class Bus:
                 subscription._begin(start, missed, kept)
             self._subscriptions += (subscription,)
         return subscription
+
+    def observe(self, observer: Callable[[Message], None]) -> None:
+        """Call it with every message, in the publisher's thread: it must be quick and must not publish."""
+        with self._lock:
+            self._observers += (observer,)
 
     def state(self) -> dict[Topic, list[Message]]:
         """The newest message of each device, capture, job, trajectory and scene."""

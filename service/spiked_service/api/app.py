@@ -9,9 +9,10 @@ from fastapi.concurrency import run_in_threadpool
 from spiked_service.api.captures import capture_routes
 from spiked_service.api.docs import mount_docs
 from spiked_service.api.events import event_routes
+from spiked_service.api.observe import Observe
 from spiked_service.api.old_schemas import DeviceOut
 from spiked_service.api.openapi import describe
-from spiked_service.api.operations import health_routes, operations_routes
+from spiked_service.api.operations import health_routes, metrics_routes, operations_routes
 from spiked_service.api.page import mount_page
 from spiked_service.api.problems import install
 from spiked_service.api.services import Services
@@ -44,7 +45,9 @@ def create_app(services: Services) -> FastAPI:
 
     app.include_router(api)
     app.include_router(health_routes(services))
+    app.include_router(metrics_routes(services))
     app.add_middleware(Security, settings=services.settings, tokens=services.tokens)
     mount_docs(app)
+    app.add_middleware(Observe, metrics=services.metrics)  # the last one added is the outermost
     mount_page(app)
     return app

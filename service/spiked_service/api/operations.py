@@ -8,6 +8,8 @@ from http import HTTPStatus
 from typing import Any
 
 from fastapi import APIRouter, Response
+from fastapi.responses import PlainTextResponse
+from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import BaseModel, Field
 
 from spiked_service.api.problems import problems
@@ -15,6 +17,7 @@ from spiked_service.api.services import Services
 from spiked_service.commands.version import installed_version
 from spiked_service.config import Origin, field, reloadable
 from spiked_service.health import Finding, Verdict, failed
+from spiked_service.readings import existing
 from spiked_service.store.folder import default_folder
 
 
@@ -108,6 +111,18 @@ def health_routes(services: Services) -> APIRouter:
     return router
 
 
+def metrics_routes(services: Services) -> APIRouter:
+    """`/metrics`."""
+    router = APIRouter(tags=["operations"])
+
+    @router.get("/metrics", response_class=PlainTextResponse, responses={200: {"content": {"text/plain": {}}}})
+    def get_metrics() -> Response:
+        """Figures for Prometheus; docs/operations.md explains each."""
+        return Response(services.metrics.exposition(), media_type=CONTENT_TYPE_LATEST)
+
+    return router
+
+
 def operations_routes(services: Services) -> APIRouter:
     """`system`, `configuration` and `tokens`."""
     router = APIRouter(tags=["operations"])
@@ -117,8 +132,7 @@ def operations_routes(services: Services) -> APIRouter:
     def get_system() -> SystemOut:
         """Version, uptime, disk and memory."""
         folder = (services.settings.now.data or default_folder()).absolute()
-        there = next(path for path in (folder, *folder.parents) if path.exists())
-        stat = os.statvfs(there)
+        stat = os.statvfs(existing(folder))
         return SystemOut(
             version=installed_version(),
             started_at=started_at,

@@ -7,6 +7,8 @@ from spiked_service.events import Bus
 from spiked_service.health import Health
 from spiked_service.limits import Gate
 from spiked_service.live import LiveSettings
+from spiked_service.metrics import Metrics
+from spiked_service.readings import readings_of
 from spiked_service.tokens import Tokens
 
 
@@ -22,8 +24,12 @@ class Services:
     renders: Gate = field(default_factory=lambda: Gate("renders", 1))
     """Every rendering of a view goes through it."""
     event_clients: Gate = field(default_factory=lambda: Gate("event clients", 1))
+    metrics: Metrics = field(init=False)
 
     def __post_init__(self) -> None:
         """The limits follow the settings."""
+        readings = readings_of(self.captures, self.settings)
+        metrics = Metrics(readings, self.bus, self.health, self.renders, self.event_clients)
+        object.__setattr__(self, "metrics", metrics)
         self.settings.on_change(lambda now: setattr(self.renders, "limit", now.limit_renders))
         self.settings.on_change(lambda now: setattr(self.event_clients, "limit", now.limit_event_clients))

@@ -1,0 +1,111 @@
+"""Metrics: totals over captures, and what a running daemon exposes."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+from prometheus_client.parser import text_string_to_metric_families
+from spiked_service.events import Bus, Topic
+from spiked_service.health import Health, Verdict
+from spiked_service.limits import Gate
+from spiked_service.metrics import Metrics, Reading, Readings
+from spiked_service.payloads import PosePayload
+from spiked_service.store.rows import ConsumerCounters, Counters
+
+from spiked.ring import DeviceState, Policy
+
+
+def counters(received: int, lost: int = 0) -> Counters:
+    recorder = ConsumerCounters("recorder", Policy.PRIORITY, received, lost, 16, 0.25, False)
+    return Counters(DeviceState.STREAMING, "", received, {"usb": lost}, received + lost, (recorder,))
+
+
+class Scraped:
+    """A service's figures by name and labels."""
+
+    def __init__(self, text: str) -> None:
+        self.families = {family.name: family for family in text_string_to_metric_families(text)}
+        self.samples = {
+            (sample.name, tuple(sorted(sample.labels.items()))): sample.value
+            for family in self.families.values()
+            for sample in family.samples
+        }
+
+    def __call__(self, name: str, **labels: str) -> float:
+        return self.samples[name, tuple(sorted(labels.items()))]
+
+
+def scraped(metrics: Metrics) -> Scraped:
+    return Scraped(metrics.exposition().decode())
+
+
+def made(readings: list[Reading], bus: Bus | None = None, health: Health | None = None) -> Metrics:
+    return Metrics(
+        Readings(lambda: list(readings), lambda: {"streaming": 1}, lambda: {"queued": 2}, dict, lambda: Path("/")),
+        bus or Bus(),
+        health or Health(),
+        Gate("renders", 3),
+        Gate("event clients", 5),
+    )
+
+
+def test_frames_add_up_over_captures_of_a_device() -> None:
+    readings = [Reading("a", "usb0", counters(100, 5), over=False)]
+    metrics = made(readings)
+    assert scraped(metrics)("spiked_frames_received_total", device="usb0") == 100
+    readings[:] = [Reading("a", "usb0", counters(150, 5), over=True)]
+    assert scraped(metrics)("spiked_frames_received_total", device="usb0") == 150
+    readings[:] = [Reading("b", "usb0", counters(10), over=False)]
+    now = scraped(metrics)
+    assert now("spiked_frames_received_total", device="usb0") == 160
+    assert now("spiked_frames_lost_total", device="usb0", cause="usb") == 5
+    assert now("spiked_frames_lost_total", device="usb0", cause="disk") == 0
+    assert now("spiked_consumer_frames_total", device="usb0", consumer="recorder") == 160
+    assert now("spiked_ring_fill_ratio", device="usb0", consumer="recorder") == 0.25
+    assert now("spiked_device_state", device="usb0", state="streaming") == 1
+    assert now("spiked_device_state", device="usb0", state="lost") == 0
+
+
+def test_latency_of_poses_and_what_listeners_lost() -> None:
+    bus = Bus()
+    metrics = made([], bus)
+    slow = bus.subscribe(capacity=1)
+    for latency_s in (0.004, 0.04, None):
+        pose = PosePayload(
+            frame=1, time_s=0, position=(0, 0, 0), quaternion_wxyz=(1, 0, 0, 0), state="track", latency_s=latency_s
+        )
+        bus.publish(Topic.POSE, pose)
+    now = scraped(metrics)
+    assert now("spiked_pose_latency_seconds_count") == 2
+    assert now("spiked_pose_latency_seconds_bucket", le="0.005") == 1
+    assert now("spiked_events_published_total", topic="pose") == 3
+    assert now("spiked_events_dropped_total", topic="pose") == 2
+    slow.close()
+    assert scraped(metrics)("spiked_events_dropped_total", topic="pose") == 2
+
+
+def test_states_limits_and_checks() -> None:
+    health = Health()
+    health.add("disk", lambda: (Verdict.FAILED, "full"))
+    now = scraped(made([], health=health))
+    assert now("spiked_reconstructions", state="queued") == 2
+    assert now("spiked_inside_limit", what="renders") == 3
+    assert now("spiked_check_failed", check="disk") == 1
+    assert now("spiked_disk_free_bytes") > 0
+    build = next(labels for name, labels in now.samples if name == "spiked_build_info")
+    assert {name for name, _ in build} == {"version", "python", "machine", "instruction_set"}
+
+
+def test_a_daemon_exposes_what_it_does(daemon: Callable[..., Any]) -> None:
+    one = daemon()
+    one.http.get("devices")
+    one.http.get("captures/no-such")
+    httpx.get(f"{one.address}nowhere")
+    now = Scraped(httpx.get(f"{one.address}metrics").text)
+    requests = "spiked_http_request_seconds_count"
+    assert now(requests, method="GET", route="/api/v1/devices", status="200") == 1
+    assert now(requests, method="GET", route="/api/v1/captures/{capture_id}", status="404") == 1
+    assert now(requests, method="GET", route="other", status="404") == 1
+    assert now("process_resident_memory_bytes") > 10e6
+    assert now("spiked_check_failed", check="zmq") == 0

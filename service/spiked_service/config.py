@@ -24,7 +24,7 @@ from pydantic_settings import (
 from spiked.errors import ConfigurationError
 
 _PREFIX = "SPIKED_"
-_NOT_SETTINGS = frozenset({"SPIKED_CONFIG", "SPIKED_SIMD", "SPIKED_SPLAT_TRANSFORM"})
+_NOT_SETTINGS = frozenset({"SPIKED_CONFIG", "SPIKED_SIMD", "SPIKED_SPLAT_TRANSFORM", "SPIKED_CLIENT_TOKEN"})
 """Environment variables with our prefix that say something else."""
 MIB = 1 << 20
 

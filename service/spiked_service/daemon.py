@@ -1,5 +1,6 @@
 """The running service: its parts put together, its sockets, its signals, and its end."""
 
+import asyncio
 import os
 import signal
 import socket
@@ -18,7 +19,7 @@ from spiked_service.captures import Captures
 from spiked_service.commands.version import installed_version
 from spiked_service.config import Settings
 from spiked_service.events import Bus
-from spiked_service.health import Health, failed
+from spiked_service.health import Health, Pulse, failed
 from spiked_service.live import LiveSettings
 from spiked_service.logs import configure_logs, logger, set_level
 from spiked_service.runtime import RuntimeFolder
@@ -54,16 +55,19 @@ class Daemon:
             configure_logs(now.log_level, now.log_format, bus)
             settings.on_change(lambda changed: set_level(changed.log_level))
             health = Health()
+            self.pulse = Pulse()
+            health.add("event loop", self.pulse.check, life=True)
             captures = Captures(self._folder.path)
             ends.callback(captures.close)
-            self.services = Services(settings, tokens, captures, bus, health)
-            self._config = self._server_config(now)
-            self.zmq: ZmqServer | None = None
+            endpoints = None
             if now.zmq:
                 port = self.port + 1 if now.zmq_port is None and now.port else now.zmq_port or 0
-                self.zmq = ZmqServer(bus, port)
-                ends.callback(self.zmq.close)
-                health.add("zmq", self.zmq.check, life=True)
+                zmq = ZmqServer(bus, port)
+                ends.callback(zmq.close)
+                health.add("zmq", zmq.check, life=True)
+                endpoints = zmq.endpoints
+            self.services = Services(settings, tokens, captures, bus, health, zmq=endpoints)
+            self._config = self._server_config(now)
             self._ends = ends.pop_all()
 
     @property
@@ -135,6 +139,7 @@ class _Server(uvicorn.Server):
         """Tell systemd when requests are answered."""
         await super().startup(sockets)
         if self.started:
+            self._beating = asyncio.create_task(self._daemon.pulse.beat())
             self._notifier.ready(f"serving at {self._daemon.address}")
             _log.info("serving", address=self._daemon.address, version=installed_version())
             self._notifier.watch(self._daemon.lives)

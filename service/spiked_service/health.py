@@ -1,5 +1,7 @@
 """Whether the service lives, and whether it can be used: findings, not a constant."""
 
+import asyncio
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -45,6 +47,28 @@ class Health:
     def readiness(self) -> list[Finding]:
         """Whether it can be used; a service that does not live is not ready."""
         return self.life() + [_asked(name, check) for name, check in self._readiness.items()]
+
+
+class Pulse:
+    """Beats in an event loop; a check of life from other threads sees when it stops."""
+
+    def __init__(self, period_s: float = 1.0, limit_s: float = 10.0) -> None:
+        self._period_s = period_s
+        self._limit_s = limit_s
+        self._last_s: float | None = None
+
+    async def beat(self) -> None:
+        """For ever."""
+        while True:
+            self._last_s = time.monotonic()
+            await asyncio.sleep(self._period_s)
+
+    def check(self) -> tuple[Verdict, str]:
+        """Whether the loop came round in time."""
+        late_s = 0.0 if self._last_s is None else time.monotonic() - self._last_s
+        if late_s > self._limit_s:
+            return Verdict.FAILED, f"the event loop has not come round for {late_s:.0f} s: restart the service"
+        return Verdict.OK, ""
 
 
 def failed(findings: list[Finding]) -> bool:

@@ -1,5 +1,6 @@
 """The running daemon under systemd's eyes: notify, watchdog, reload, health, TLS."""
 
+import asyncio
 import os
 import signal
 import socket
@@ -14,7 +15,7 @@ from typing import Any
 
 import httpx
 import pytest
-from spiked_service.health import Finding, Health, Verdict, failed
+from spiked_service.health import Finding, Health, Pulse, Verdict, failed
 from spiked_service.live import LiveSettings
 from spiked_service.systemd import Notifier
 
@@ -161,6 +162,22 @@ def test_a_failing_or_broken_check_makes_the_service_unready() -> None:
     assert not failed(health.life())
     assert failed(health.readiness())
     assert health.readiness()[-1] == Finding("broken", Verdict.FAILED, "the check itself failed: OSError('gone')")
+
+
+def test_an_event_loop_that_hangs_is_seen() -> None:
+    pulse = Pulse(period_s=0.01, limit_s=0.1)
+    seen = [pulse.check()[0]]
+
+    async def loop() -> None:
+        beating = asyncio.create_task(pulse.beat())
+        await asyncio.sleep(0.05)
+        seen.append(pulse.check()[0])
+        time.sleep(0.2)  # what a loop must never do
+        seen.append(pulse.check()[0])
+        beating.cancel()
+
+    asyncio.run(loop())
+    assert seen == [Verdict.OK, Verdict.OK, Verdict.FAILED]
 
 
 def certificate(folder: Path, name: str) -> tuple[Path, Path]:

@@ -43,6 +43,14 @@ class DiskOut(BaseModel):
     total_bytes: int
 
 
+class ZmqOut(BaseModel):
+    """Addresses of the ZeroMQ sockets, on this machine."""
+
+    events: str = Field(description="PUB: all but pictures.", examples=["tcp://127.0.0.1:8651"])
+    state: str = Field(description="REP: the newest message of each kind, or those after a number.")
+    previews: str = Field(description="PUB: pictures.")
+
+
 class SystemOut(BaseModel):
     """The running service."""
 
@@ -54,6 +62,7 @@ class SystemOut(BaseModel):
     memory_bytes: int = Field(description="Resident memory of the service itself, without its workers.")
     pid: int
     events_seq: int = Field(description="Number of the newest event.")
+    zmq: ZmqOut | None = Field(description="null where ZeroMQ is turned off.")
 
 
 class SettingOut(BaseModel):
@@ -142,6 +151,7 @@ def operations_routes(services: Services) -> APIRouter:
             memory_bytes=resident_bytes(),
             pid=os.getpid(),
             events_seq=services.bus.seq,
+            zmq=None if services.zmq is None else ZmqOut(**vars(services.zmq)),
         )
 
     @router.get("/configuration", responses=problems())

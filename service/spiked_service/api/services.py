@@ -10,6 +10,7 @@ from spiked_service.live import LiveSettings
 from spiked_service.metrics import Metrics
 from spiked_service.readings import readings_of
 from spiked_service.tokens import Tokens
+from spiked_service.zmq import Endpoints
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,7 @@ class Services:
     renders: Gate = field(default_factory=lambda: Gate("renders", 1))
     """Every rendering of a view goes through it."""
     event_clients: Gate = field(default_factory=lambda: Gate("event clients", 1))
+    zmq: Endpoints | None = None
     metrics: Metrics = field(init=False)
 
     def __post_init__(self) -> None:

@@ -1,0 +1,94 @@
+"""The examples of docs/events.md, run against a daemon as they stand."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from queue import Empty, Queue
+from typing import Any
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+DEADLINE_S = 60.0
+
+
+@contextmanager
+def running(*command: str, cwd: Path | None = None) -> Iterator["Queue[str]"]:
+    """A program, and the lines that it prints."""
+    environment = {**os.environ, "MPLBACKEND": "Agg"}
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, cwd=cwd, start_new_session=True, env=environment
+    )
+    lines: Queue[str] = Queue()
+
+    def read() -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            lines.put(line)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    try:
+        yield lines
+    finally:
+        os.killpg(process.pid, signal.SIGTERM)
+        process.wait(DEADLINE_S)
+        reader.join()
+
+
+def reload_until(daemon: Any, lines: "Queue[str]") -> str:
+    """Do something that is an event, until the program has printed it."""
+    for _ in range(int(DEADLINE_S / 0.2)):
+        daemon.http.post("/configuration:reload")
+        try:
+            return lines.get(timeout=0.2)
+        except Empty:
+            continue
+    raise AssertionError("the example printed nothing")
+
+
+def websocket(daemon: Any) -> str:
+    return str(daemon.address).replace("http", "ws").rstrip("/")
+
+
+def test_python_prints_events(daemon: Callable[..., Any]) -> None:
+    one = daemon()
+    with running(sys.executable, str(EXAMPLES / "events.py"), websocket(one), "log") as lines:
+        seq, topic, data = reload_until(one, lines).split(maxsplit=2)
+    assert int(seq) > 0 and topic == "log" and data.startswith("{")
+
+
+def test_curl_prints_events(daemon: Callable[..., Any]) -> None:
+    if shutil.which("curl") is None:
+        pytest.skip("needs curl")
+    one = daemon()
+    with running(str(EXAMPLES / "events.sh"), one.address.rstrip("/"), "log") as lines:
+        assert json.loads(reload_until(one, lines))["topic"] == "log"
+
+
+def test_javascript_prints_events(daemon: Callable[..., Any]) -> None:
+    if shutil.which("node") is None:
+        pytest.skip("needs node")
+    one = daemon()
+    command = ["node", "--experimental-websocket", str(EXAMPLES / "events.mjs"), websocket(one), "log"]
+    with running(*command) as lines:
+        assert reload_until(one, lines).split()[1] == "log"
+
+
+def test_zmq_prints_poses(daemon: Callable[..., Any]) -> None:
+    one = daemon()
+    zmq = one.http.get("system").json()["zmq"]
+    assert all(zmq[name].startswith("tcp://127.0.0.1:") for name in ("events", "state", "previews"))
+
+
+def test_the_trajectory_example_has_twenty_lines() -> None:
+    text = (EXAMPLES / "live_trajectory.py").read_text()
+    code = [line for line in text.split('"""')[2].splitlines() if line.strip()]
+    assert len(code) <= 20

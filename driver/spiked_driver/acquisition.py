@@ -140,7 +140,8 @@ def _pump(source: Source, filler: _Filler, stop: StopEvent) -> EndReason:
             case End():
                 return item.reason
             case None:
-                pass
+                if source.condition.state is not DeviceState.STREAMING:
+                    filler.flush()  # what came before the trouble may be long in being followed
     return EndReason.FINISHED
 
 

@@ -1,7 +1,10 @@
 """The acquisition worker: a source into a ring, and nothing else."""
 
+import logging
+
 from spiked_driver.acquisition import acquire
-from spiked_driver.spec import open_source
+from spiked_driver.realtime import take_priority
+from spiked_driver.spec import is_camera, open_source
 
 from spiked.ring import RingWriter
 from spiked_service.messages import AcquisitionOrder, RingOpened
@@ -28,4 +31,7 @@ def run_acquisition(order: AcquisitionOrder, link: Link) -> None:
                 unhurried=source.waits,
             )
         )
+        if is_camera(order.source):
+            for note in take_priority():
+                logging.getLogger(__name__).warning("%s", note)
         acquire(source, writer, link.stop, limit_frames=limit, consumers=order.consumers)

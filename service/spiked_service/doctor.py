@@ -1,0 +1,216 @@
+"""Whether this machine is fit for a USB camera: each thing looked at by itself, with what was found and what to do."""
+
+import os
+import re
+import shutil
+import tempfile
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+from spiked_driver.framing import USB_COMPACT_BYTES, USB_FRAME_BYTES
+from spiked_driver.ft60x import PRODUCTS, VENDOR_ID
+from spiked_driver.realtime import PRIORITY, may_lock_memory, may_schedule
+from spiked_driver.usb import RATE_HZ
+from spiked_driver.usb_budget import LIMIT_FILE, how_to_raise, kernel_bytes, plan_transfers, usbfs_limit
+from spiked_driver.usb_cameras import UDEV_FILE, UsbCamera, find_cameras
+
+from spiked.errors import SourceError
+from spiked.ring.segment import FOLDER as RING_FOLDER
+from spiked.ring.writer import DEFAULT_BYTES
+
+UDEV_FOLDERS = tuple(Path(folder) for folder in ("/etc", "/run", "/usr/lib", "/lib", "/usr/local/lib"))
+CPU = Path("/sys/devices/system/cpu")
+_PIXELS_S = USB_COMPACT_BYTES * RATE_HZ
+_WIRE_S = USB_FRAME_BYTES * RATE_HZ
+_BUS_S = 400e6
+"""What is left of 5 Gbit/s after encoding and protocol, about."""
+_MINUTES = 5
+_PROBE_BYTES = 128 << 20
+_PIECE = bytes(range(256)) * (4 << 10)
+
+
+class Status(StrEnum):
+    """How bad it is."""
+
+    OK = "ok"
+    WARNING = "warning"
+    """It works, with losses or for a short time."""
+    PROBLEM = "problem"
+    """A camera cannot be used."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at."""
+
+    name: str
+    status: Status
+    finding: str
+    what_to_do: str | None = None
+
+
+def examine(data: Path) -> list[Finding]:
+    """All that matters; takes about a second for the disk below the data folder. Changes nothing."""
+    cameras = find_cameras()
+    return [
+        _cameras(cameras),
+        *(_camera(camera) for camera in cameras),
+        *_shared_buses(cameras),
+        _udev_rule(),
+        _usbfs(max(1, len(cameras))),
+        _governor(),
+        _priority(),
+        _memory(),
+        _shared_memory(),
+        *_disk(data),
+    ]
+
+
+def _cameras(cameras: list[UsbCamera]) -> Finding:
+    name = "cameras"
+    if cameras:
+        return Finding(name, Status.OK, f"{len(cameras)} plugged in: {', '.join(camera.port for camera in cameras)}")
+    ids = " or ".join(f"{VENDOR_ID:04x}:{product:04x}" for product in PRODUCTS)
+    todo = f"plug it in, power it, and look with `lsusb -d {VENDOR_ID:04x}:` whether the kernel sees {ids}"
+    return Finding(name, Status.WARNING, "no USB camera is plugged in", todo)
+
+
+def _camera(camera: UsbCamera) -> Finding:
+    """Port speed and permission of one."""
+    name = f"camera {camera.port}"
+    for problem in (camera.speed_problem(), camera.permission_problem()):
+        if problem:
+            found, _, todo = problem.partition(": ")
+            return Finding(name, Status.PROBLEM, found, todo)
+    return Finding(name, Status.OK, f"{camera.speed}, and may be opened")
+
+
+def _shared_buses(cameras: list[UsbCamera]) -> Iterator[Finding]:
+    for bus in sorted({camera.bus for camera in cameras}):
+        here = [camera for camera in cameras if camera.bus == bus]
+        slowest = min((camera.speed_mbps or 5000) / 5000 * _BUS_S for camera in here)
+        if len(here) * _WIRE_S > slowest:
+            ports = ", ".join(camera.port for camera in here)
+            found = (
+                f"{ports} share bus {bus}, which carries about {slowest / 1e6:.0f} MB/s; each needs {_WIRE_S / 1e6:.0f}"
+            )
+            yield Finding("bus", Status.WARNING, found, "give each camera a controller of its own (see `lsusb -t`)")
+
+
+def _udev_rule() -> Finding:
+    name = "udev rule"
+    for file in _udev_files():
+        try:
+            text = file.read_text(errors="replace").lower()
+        except OSError:
+            continue
+        if all(re.search(f'"{number:04x}"', text) for number in (VENDOR_ID, *PRODUCTS)):
+            return Finding(name, Status.OK, f"{file}")
+    if os.geteuid() == 0:
+        return Finding(name, Status.OK, "none, and none is needed by root")
+    todo = f"spiked devices --udev-rules | sudo tee {UDEV_FILE}; sudo udevadm control --reload; sudo udevadm trigger"
+    return Finding(name, Status.WARNING, "no rule lets ordinary users open the camera", todo)
+
+
+def _udev_files() -> Iterable[Path]:
+    for folder in UDEV_FOLDERS:
+        yield from sorted((folder / "udev/rules.d").glob("*.rules"))
+
+
+def _usbfs(cameras: int) -> Finding:
+    """The budget of all plugged cameras together."""
+    name = "usbfs memory"
+    limit = usbfs_limit()
+    wanted = plan_transfers(_WIRE_S, None)
+    needed = cameras * kernel_bytes(wanted.count, wanted.transfer_bytes)
+    if limit is None:
+        none = "no limit" if LIMIT_FILE.exists() else f"no limit is to be seen: there is no {LIMIT_FILE}"
+        return Finding(name, Status.OK, none)
+    found = f"{limit >> 20} MiB for all cameras, {needed / 2**20:.0f} MiB are wanted"
+    if needed <= limit:
+        return Finding(name, Status.OK, found)
+    try:
+        hides_ms = 1e3 * plan_transfers(_WIRE_S, limit // cameras).hides_s
+    except SourceError:
+        return Finding(name, Status.PROBLEM, found, how_to_raise(needed))
+    hidden = f"{found}: a busy host loses frames after {hides_ms:.0f} ms, not {1e3 * wanted.hides_s:.0f}"
+    return Finding(name, Status.WARNING, hidden, how_to_raise(needed))
+
+
+def _governor() -> Finding:
+    name = "CPU governor"
+    files = sorted(CPU.glob("cpu[0-9]*/cpufreq/scaling_governor"))
+    governors = sorted({file.read_text().strip() for file in files})
+    if not governors:
+        return Finding(name, Status.OK, "the kernel does not change the clock here")
+    found = ", ".join(governors)
+    if governors == ["performance"]:
+        return Finding(name, Status.OK, found)
+    todo = (
+        "sudo cpupower frequency-set -g performance (or: echo performance | sudo tee "
+        f"{CPU}/cpu*/cpufreq/scaling_governor)"
+    )
+    return Finding(name, Status.WARNING, f"{found}: a core that has slowed down may lose frames", todo)
+
+
+def _priority() -> Finding:
+    if may_schedule():
+        return Finding("real-time priority", Status.OK, "permitted")
+    todo = f"LimitRTPRIO={PRIORITY} in the systemd unit, or a line `USER - rtprio {PRIORITY}` in /etc/security/limits.d"
+    return Finding("real-time priority", Status.WARNING, "not permitted: other programs may delay acquisition", todo)
+
+
+def _memory() -> Finding:
+    if may_lock_memory():
+        return Finding("locked memory", Status.OK, "permitted")
+    todo = "LimitMEMLOCK=infinity in the systemd unit, or a line `USER - memlock unlimited` in /etc/security/limits.d"
+    return Finding("locked memory", Status.WARNING, "not permitted: acquisition's memory may be paged out", todo)
+
+
+def _shared_memory() -> Finding:
+    name = "shared memory"
+    free = shutil.disk_usage(RING_FOLDER).free
+    found = f"{free / 2**20:.0f} MiB free in {RING_FOLDER}, a capture takes {DEFAULT_BYTES / 2**20:.0f} MiB"
+    if free > 1.1 * DEFAULT_BYTES:
+        return Finding(name, Status.OK, found)
+    todo = f"sudo mount -o remount,size=1G {RING_FOLDER} (a container has an option for it, as --shm-size)"
+    return Finding(name, Status.PROBLEM, found, todo)
+
+
+def _disk(data: Path) -> Iterator[Finding]:
+    """Room and speed where recordings go."""
+    folder = next(each for each in (data.absolute(), *data.absolute().parents) if each.is_dir())
+    free = shutil.disk_usage(folder).free
+    seconds = free / _PIXELS_S
+    found = f"{free / 1e9:.0f} GB free in {folder}, {seconds / 60:.0f} minutes at 20 kHz"
+    if seconds >= 60 * _MINUTES:
+        yield Finding("disk space", Status.OK, found)
+    else:
+        yield Finding("disk space", Status.WARNING, found, "remove recordings, or give another folder with --data")
+    if free < 2 * _PROBE_BYTES:
+        yield Finding("disk speed", Status.WARNING, "not measured: there is no room to try", "make room on the disk")
+        return
+    try:
+        speed = _written_bytes_a_second(folder)
+    except OSError as error:
+        todo = "give a folder with --data that this user may write"
+        yield Finding("disk speed", Status.PROBLEM, f"{folder} cannot be written: {error.strerror}", todo)
+        return
+    found = f"{speed / 1e6:.0f} MB/s written and flushed; recording takes {_PIXELS_S / 1e6:.0f}"
+    if speed > 1.2 * _PIXELS_S:
+        yield Finding("disk speed", Status.OK, found)
+    else:
+        todo = "record to a faster disk (--data), or shorter than memory holds"
+        yield Finding("disk speed", Status.WARNING, found, todo)
+
+
+def _written_bytes_a_second(folder: Path) -> float:
+    with tempfile.TemporaryFile(dir=folder, buffering=0) as file:
+        start_s = time.monotonic()
+        for _ in range(_PROBE_BYTES // len(_PIECE)):
+            file.write(_PIECE)
+        os.fdatasync(file.fileno())
+        return _PROBE_BYTES / (time.monotonic() - start_s)

@@ -24,7 +24,8 @@ export interface Consumer {
 }
 
 export interface Counters {
-  device: string;
+  device: DeviceState;
+  device_reason: string;
   received: number;
   /** By cause: device, usb, ring, disk. */
   lost: Record<string, number>;
@@ -63,7 +64,6 @@ export interface Sensor {
   width: number;
   height: number;
   frame_rate_hz: number;
-  frames: number | null;
   intrinsics: Intrinsics | null;
 }
 
@@ -85,6 +85,7 @@ export interface Capture {
   verdict: Verdict | null;
   started_at: string;
   ended_at: string | null;
+  frames_planned: number | null;
   deleted_at: string | null;
   recording: { bytes: number; frames: number; sha256?: string | null } | null;
   reconstruction_ids: string[];
@@ -158,7 +159,7 @@ export interface Preview {
   height: number;
   /** WebP, base64. */
   image: string;
-  rate_histogram?: RateHistogram | null;
+  rate_histogram?: number[] | null;
 }
 
 export interface SceneNews {
@@ -168,10 +169,25 @@ export interface SceneNews {
   bytes?: number;
 }
 
-export type Timeline = { time_s: number[]; frame: number[]; state?: TrackingState[] } & Record<
-  string,
-  (number | null)[] | string[] | undefined
->;
+export interface Gap {
+  first: number;
+  count: number;
+  cause: string;
+}
+
+/** Arrays of the same length; null where a value is not known. */
+export interface Timeline {
+  time_s: number[];
+  frame: number[];
+  state: TrackingState[];
+  chi2: (number | null)[];
+  sigma_px: (number | null)[];
+  rate: (number | null)[];
+  loss: (number | null)[];
+  psnr_db: (number | null)[];
+  splats: (number | null)[];
+  gaps: Gap[];
+}
 
 export interface System {
   version: string;

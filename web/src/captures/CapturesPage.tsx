@@ -1,5 +1,12 @@
+/** All captures, or one of them. */
+
 import type { JSX } from "react";
 
+import { useRoute } from "../state/route";
+import { CaptureDetail } from "./CaptureDetail";
+import { CapturesTable } from "./CapturesTable";
+
 export function CapturesPage(): JSX.Element {
-  return <h1>Captures</h1>;
+  const { capture } = useRoute();
+  return capture === null ? <CapturesTable /> : <CaptureDetail key={capture} id={capture} />;
 }

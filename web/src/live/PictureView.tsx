@@ -5,7 +5,7 @@ import { type JSX, useEffect, useRef, useState } from "react";
 import { stats } from "../api/calls";
 import type { Capture, PreviewKind, Stats } from "../api/types";
 import { count } from "../state/format";
-import { isOver, useService } from "../state/store";
+import { isOver } from "../state/store";
 import { Icon } from "../ui/icons";
 import { Empty, Segmented } from "../ui/parts";
 import { Histogram } from "./Histogram";
@@ -52,8 +52,7 @@ export function PictureView({ capture }: { capture: Capture | null }): JSX.Eleme
   const gain = 2 ** stops;
   const picture = usePicture(capture, kind, gain);
   const measured = useStats(capture);
-  const pushed = useService((state) => (state.previewOf === capture?.id ? state.previews["interval"] : undefined));
-  const histogram = pushed?.rate_histogram ?? measured?.rate_histogram ?? null;
+  const histogram = measured?.rate_histogram ?? null;
   const image = useRef<HTMLImageElement>(null);
   useEffect(() => {
     if (image.current !== null)

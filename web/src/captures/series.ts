@@ -1,0 +1,71 @@
+/** What the timeline of a reconstruction is drawn as. */
+
+import type { Timeline } from "../api/types";
+
+export interface PlotSpec {
+  key: "sigma_px" | "chi2" | "loss" | "psnr_db" | "rate";
+  title: string;
+  unit: string;
+  log: boolean;
+  hint: string;
+}
+
+export const PLOTS: readonly PlotSpec[] = [
+  {
+    key: "sigma_px",
+    title: "Pose σ",
+    unit: "px",
+    log: false,
+    hint: "One standard deviation of the pose in the picture",
+  },
+  {
+    key: "chi2",
+    title: "χ²",
+    unit: "",
+    log: false,
+    hint: "Squared residual over what the noise explains; 1 is as expected",
+  },
+  {
+    key: "loss",
+    title: "Loss",
+    unit: "",
+    log: true,
+    hint: "Mean squared error of the views, in units of white squared",
+  },
+  { key: "psnr_db", title: "PSNR estimate", unit: "dB", log: false, hint: "From the views the scene was made of" },
+  { key: "rate", title: "Spike rate", unit: "/frame", log: false, hint: "Mean spikes a pixel and frame" },
+];
+
+export type Column = (number | null)[];
+
+/** Two timelines on one axis of time: the times of both, sorted, and each one's values, null where it has none. */
+export function joined(times: readonly (readonly number[])[], values: readonly Column[]): [number[], ...Column[]] {
+  const all = [...new Set(times.flat())].sort((a, b) => a - b);
+  const columns = values.map((column, i) => {
+    const at = new Map((times[i] ?? []).map((time, row) => [time, column[row] ?? null]));
+    return all.map((time) => at.get(time) ?? null);
+  });
+  return [all, ...columns];
+}
+
+/**
+ * Flicker: how much the spike rate swings around its own slow course, as a share of it. The slow course is the mean over
+ * 10 ms, a whole period of light on mains of 50 and about one of 60 Hz.
+ */
+export function flicker(timeline: Timeline): Column {
+  const period = 0.01;
+  const { time_s: times, rate } = timeline;
+  let first = 0;
+  let end = 0;
+  return times.map((time, i) => {
+    while ((times[first] ?? Infinity) < time - period / 2) first += 1;
+    while (end < times.length && (times[end] ?? Infinity) <= time + period / 2) end += 1;
+    const around = rate.slice(first, end).filter((x) => x !== null);
+    const own = rate[i] ?? null;
+    const mean = around.reduce((sum, x) => sum + x, 0) / around.length;
+    return own === null || around.length < 3 || mean <= 0 ? null : own / mean - 1;
+  });
+}
+
+export const isKnown = (column: Column | undefined): column is Column =>
+  column?.some((value) => value !== null) === true;

@@ -1,0 +1,158 @@
+/** The camera's own view: what it saw over what the scene looks like from there, with a slider between or their difference. */
+
+import { type JSX, useEffect, useRef, useState } from "react";
+
+import { address } from "../api/calls";
+import { request } from "../api/http";
+import type { Capture, Reconstruction, Sensor } from "../api/types";
+import { Segmented } from "../ui/parts";
+
+type Comparison = "wipe" | "difference" | "rendered" | "observed";
+const CHOICES = [
+  { value: "wipe", label: "Wipe" },
+  { value: "difference", label: "Difference" },
+  { value: "rendered", label: "Rendered" },
+  { value: "observed", label: "Observed" },
+] as const;
+const SETTLE_MS = 60;
+const NEWEST_MS = 400;
+/** Differences are small; so much are they brightened. */
+const DIFFERENCE_GAIN = 4;
+
+export function RideAlong({
+  capture,
+  job,
+  sensor,
+  frame,
+  live,
+}: {
+  capture: Capture;
+  job: Reconstruction;
+  sensor: Sensor;
+  frame: number | null;
+  live: boolean;
+}): JSX.Element {
+  const [comparison, setComparison] = useState<Comparison>("wipe");
+  const [share, setShare] = useState(0.5);
+  const image = useRef<HTMLImageElement>(null);
+  const observed = useObserved(capture, job.white ?? undefined, frame, live && job.state === "running");
+  const bar = useRef<HTMLDivElement>(null);
+  useFitted(bar, sensor.width / sensor.height);
+
+  useEffect(() => {
+    const style = image.current?.style;
+    if (style === undefined) return;
+    style.clipPath = comparison === "wipe" ? `inset(0 ${100 * (1 - share)}% 0 0)` : "";
+    style.mixBlendMode = comparison === "difference" ? "difference" : "normal";
+    style.visibility = comparison === "rendered" ? "hidden" : "visible";
+    const box = stageOf(bar.current);
+    if (box !== null) box.style.filter = comparison === "difference" ? `brightness(${DIFFERENCE_GAIN})` : "";
+    return () => {
+      if (box !== null) box.style.filter = "";
+    };
+  }, [comparison, share, observed.url]);
+
+  return (
+    <>
+      {observed.url !== null && (
+        <img ref={image} className="observed" src={observed.url} alt="What the camera saw" data-frame={frame ?? ""} />
+      )}
+      {comparison === "wipe" && <Wipe share={share} onShare={setShare} />}
+      <div className="compare" ref={bar}>
+        <Segmented label="Comparison" value={comparison} choices={CHOICES} onChange={setComparison} />
+        {comparison === "difference" && <span className="note">|observed − rendered| × {DIFFERENCE_GAIN}</span>}
+        {observed.missing && comparison !== "rendered" && (
+          <span className="note">No recorded picture of this frame</span>
+        )}
+        {sensor.intrinsics === null && <span className="note">The optics of this capture are not known</span>}
+      </div>
+    </>
+  );
+}
+
+function Wipe({ share, onShare }: { share: number; onShare: (share: number) => void }): JSX.Element {
+  const line = useRef<HTMLSpanElement>(null);
+  useEffect(() => {
+    if (line.current !== null) line.current.style.left = `${100 * share}%`;
+  }, [share]);
+  return (
+    <>
+      <span className="wipe-line" ref={line} aria-hidden="true" />
+      <span className="wipe-names" aria-hidden="true">
+        <b>observed</b>
+        <b>rendered</b>
+      </span>
+      <input
+        className="wipe"
+        type="range"
+        aria-label="Observed on the left, rendered on the right of"
+        min={0}
+        max={1}
+        step={0.01}
+        value={share}
+        onChange={(event) => onShare(event.target.valueAsNumber)}
+      />
+    </>
+  );
+}
+
+const stageOf = (inside: HTMLElement | null): HTMLElement | null => inside?.closest<HTMLElement>(".stage") ?? null;
+
+/** Keep the stage as large as its surroundings allow at the aspect of the sensor; undone at the end. */
+function useFitted(inside: { readonly current: HTMLElement | null }, aspect: number): void {
+  useEffect(() => {
+    const box = stageOf(inside.current);
+    const around = box?.parentElement;
+    if (box === null || around == null) return;
+    const fit = (): void => {
+      const width = Math.min(around.clientWidth, around.clientHeight * aspect);
+      box.style.width = `${Math.floor(width)}px`;
+      box.style.height = `${Math.floor(width / aspect)}px`;
+    };
+    const observer = new ResizeObserver(fit);
+    observer.observe(around);
+    fit();
+    return () => {
+      observer.disconnect();
+      box.style.width = box.style.height = "";
+    };
+  }, [inside, aspect]);
+}
+
+/** The picture of a frame as the camera saw it, at the brightness of the scene. */
+function useObserved(
+  capture: Capture,
+  white: number | undefined,
+  frame: number | null,
+  newest: boolean,
+): { url: string | null; missing: boolean } {
+  const [url, setUrl] = useState<string | null>(null);
+  const [missing, setMissing] = useState(false);
+  const id = capture.id;
+  // At the live edge the newest picture is asked for a few times a second, not one for each pose.
+  const asked = newest ? undefined : (frame ?? undefined);
+  useEffect(() => {
+    const ended = new AbortController();
+    let timer: ReturnType<typeof setTimeout> | undefined;
+    const ask = async (): Promise<void> => {
+      try {
+        const path = address.preview(id, "interval", { frame: asked, white }).replace("api/v1/", "");
+        const next = URL.createObjectURL(await (await request(path, { signal: ended.signal })).blob());
+        setUrl((before) => {
+          if (before !== null) URL.revokeObjectURL(before);
+          return next;
+        });
+        setMissing(false);
+      } catch {
+        if (!ended.signal.aborted) setMissing(true);
+      }
+      if (newest && !ended.signal.aborted) timer = setTimeout(() => void ask(), NEWEST_MS);
+    };
+    timer = setTimeout(() => void ask(), SETTLE_MS);
+    return () => {
+      ended.abort();
+      clearTimeout(timer);
+    };
+  }, [id, asked, white, newest]);
+  return { url, missing };
+}

@@ -1,0 +1,39 @@
+import { beforeEach, expect, it } from "vitest";
+
+import type { Capture, Message, Reconstruction } from "../api/types";
+import { newestCapture, newestReconstruction, takeMessage, useService } from "./store";
+
+const initial = useService.getInitialState();
+beforeEach(() => useService.setState(initial, true));
+
+const capture = (id: string, more: Partial<Capture> = {}): Capture =>
+  ({ id, state: "streaming", deleted_at: null, counters: null, ...more }) as Capture;
+const job = (id: string, captureId: string, version: number): Reconstruction =>
+  ({ id, capture_id: captureId, version }) as Reconstruction;
+const message = (topic: string, data: unknown, ids: Partial<Message> = {}): Message =>
+  ({ seq: 1, topic, at: "", capture_id: null, reconstruction_id: null, data, ...ids }) as Message;
+
+it("shows the newest capture that is not deleted", () => {
+  const captures = { a: capture("a"), b: capture("b"), c: capture("c", { deleted_at: "2026-11-21T00:00:00Z" }) };
+  expect(newestCapture(captures)?.id).toBe("b");
+});
+
+it("shows the newest reconstruction that has a scene, and one without only if there is no other", () => {
+  const jobs = { x: job("x", "a", 3), y: job("y", "a", 0), z: job("z", "b", 9) };
+  expect(newestReconstruction(jobs, "a")?.id).toBe("x");
+  expect(newestReconstruction({ y: jobs.y }, "a")?.id).toBe("y");
+  expect(newestReconstruction(jobs, "c")).toBeNull();
+});
+
+it("follows a device that comes and goes", () => {
+  takeMessage(message("device", { id: "usb0", state: "idle" }));
+  takeMessage(message("device", { id: "usb0", state: "lost" }));
+  expect(useService.getState().devices).toEqual([{ id: "usb0", state: "lost" }]);
+});
+
+it("forgets the pictures of the capture before", () => {
+  takeMessage(message("preview", { kind: "rate", image: "1" }, { capture_id: "a" }));
+  takeMessage(message("preview", { kind: "interval", image: "2" }, { capture_id: "b" }));
+  expect(Object.keys(useService.getState().previews)).toEqual(["interval"]);
+  expect(useService.getState().previewOf).toBe("b");
+});

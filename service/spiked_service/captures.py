@@ -75,10 +75,10 @@ class Captures:
 def _check(plan: Plan) -> None:
     """Refuse at once what would fail a moment later in a worker."""
     sensor = open_source(plan.source).sensor
-    if sensor.intrinsics is None and plan.intrinsics is None and plan.source.startswith("replay:"):
+    if sensor.intrinsics is None and plan.intrinsics is None:
         raise ConfigurationError(
             f"the focal length of {plan.source} is not known: give intrinsics (fx, fy, cx, cy) with the capture, "
-            "as `spiked serve --intrinsics`, or in the recording's sidecar"
+            "as `spiked serve --intrinsics`, in a recording's sidecar, or as a camera's field of view (usb0?fov=40)"
         )
 
 

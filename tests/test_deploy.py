@@ -1,0 +1,91 @@
+"""What is in deploy/ fits the program: settings that exist, metrics that exist, a unit that systemd reads."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from prometheus_client.parser import text_string_to_metric_families
+from spiked_service.config import Settings, load_settings
+from spiked_service.events import Bus
+from spiked_service.health import Health, Verdict
+from spiked_service.limits import Gate
+from spiked_service.metrics import Metrics, Reading, Readings
+from spiked_service.store.rows import ConsumerCounters, Counters
+
+from spiked.ring import DeviceState, Policy
+
+DEPLOY = Path(__file__).parents[1] / "deploy"
+
+
+def exposed() -> set[str]:
+    """Names of all series of a service with a capture."""
+    consumer = ConsumerCounters("recorder", Policy.PRIORITY, 8, 0, 0, 0.0, False)
+    counters = Counters(DeviceState.STREAMING, "", 8, {"usb": 0}, 8, (consumer,))
+    health = Health()
+    health.add("disk", lambda: (Verdict.OK, ""))
+    readings = Readings(
+        lambda: [Reading("a", "usb0", counters, over=False)],
+        lambda: {"streaming": 1},
+        lambda: {"queued": 1},
+        lambda: {"recorder": 1},
+        lambda: Path("/"),
+    )
+    metrics = Metrics(readings, Bus(), health, Gate("renders", 1), Gate("event clients", 1))
+    metrics.request_s.labels("GET", "/", "200").observe(0.01)
+    families = text_string_to_metric_families(metrics.exposition().decode())
+    return {sample.name for family in families for sample in family.samples}
+
+
+def queried(expressions: list[str]) -> set[str]:
+    return {name for text in expressions for name in re.findall(r"\b(?:spiked|process)_[a-z_]+", text)}
+
+
+def test_alerts_ask_for_metrics_that_exist_and_say_what_to_do() -> None:
+    rules = yaml.safe_load((DEPLOY / "prometheus/alerts.yml").read_text())["groups"][0]["rules"]
+    assert queried([rule["expr"] for rule in rules]) <= exposed()
+    assert all(rule["annotations"]["what_to_do"] for rule in rules)
+    scrape = yaml.safe_load((DEPLOY / "prometheus/prometheus.yml").read_text())
+    assert all((DEPLOY / "prometheus" / name).is_file() for name in scrape["rule_files"])
+
+
+def test_the_dashboard_asks_for_metrics_that_exist() -> None:
+    panels = json.loads((DEPLOY / "grafana/spiked.json").read_text())["panels"]
+    asked = queried([target["expr"] for panel in panels for target in panel["targets"]])
+    assert asked <= exposed()
+    assert {"spiked_frames_received_total", "spiked_frames_lost_total", "spiked_ring_fill_ratio"} <= asked
+    places = [(panel["gridPos"]["x"], panel["gridPos"]["y"]) for panel in panels]
+    assert len(set(places)) == len(places)
+
+
+def test_the_settings_file_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in os.environ if name.startswith("SPIKED_")]:
+        monkeypatch.delenv(name)
+    text = (DEPLOY / "spiked.toml").read_text()
+    assert load_settings(file=DEPLOY / "spiked.toml").settings.devices == ["usb0"]
+    commented = re.findall(r"^# ([a-z_]+) = ", text, re.MULTILINE)
+    assert set(commented) <= set(Settings.model_fields)
+
+
+@pytest.mark.parametrize("file", ["systemd/spiked.service", "container/Containerfile"])
+def test_the_environment_they_set_is_settings(file: str) -> None:
+    names = re.findall(r"\bSPIKED_[A-Z_]+(?==)", (DEPLOY / file).read_text())
+    assert names
+    assert {name.removeprefix("SPIKED_").lower() for name in names} <= set(Settings.model_fields)
+
+
+def test_systemd_reads_the_unit(tmp_path: Path) -> None:
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("needs systemd-analyze")
+    unit = tmp_path / "spiked.service"
+    unit.write_text((DEPLOY / "systemd/spiked.service").read_text().replace("/opt/spiked/bin/spiked", sys.executable))
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", "--generators=no", str(unit)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert "spiked.service" not in done.stderr, done.stderr

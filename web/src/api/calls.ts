@@ -1,66 +1,76 @@
 /** The calls of the service that the page makes. */
 
-import { API, getJson, query, request, sendJson } from "./http";
+import { answered, API, client, query, request } from "./http";
 import type {
   Capture,
+  CaptureChange,
+  CapturePage,
   CaptureRequest,
-  ConfigurationItem,
   Device,
-  DoctorItem,
+  Finding,
   OptionSchema,
   OptionValues,
-  Page,
   PreviewKind,
   Reconstruction,
+  Setting,
   Stats,
   System,
   Timeline,
-  TokenItem,
+  Token,
   Trajectory,
 } from "./types";
 
-const idempotent = (): Record<string, string> => ({ "Idempotency-Key": newKey() });
-
 /** `crypto.randomUUID` exists only in secure contexts; a phone on the local network has none. */
-function newKey(): string {
-  return Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");
-}
+const newKey = (): string =>
+  Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");
+const idempotent = (): { "idempotency-key": string } => ({ "idempotency-key": newKey() });
+const ofCapture = (capture_id: string) => ({ params: { path: { capture_id } } });
+const ofReconstruction = (reconstruction_id: string) => ({ params: { path: { reconstruction_id } } });
 
-export const devices = async (): Promise<Device[]> => (await getJson<Page<Device>>("devices")).items;
-export const doctor = async (): Promise<DoctorItem[]> => (await getJson<{ items: DoctorItem[] }>("doctor")).items;
-export const system = (): Promise<System> => getJson("system");
-export const configuration = async (): Promise<ConfigurationItem[]> =>
-  (await getJson<{ items: ConfigurationItem[] }>("configuration")).items;
-export const reloadConfiguration = (): Promise<unknown> => sendJson("POST", "configuration:reload", {});
-export const tokens = async (): Promise<TokenItem[]> => (await getJson<{ items: TokenItem[] }>("tokens")).items;
-export const optionSchema = (): Promise<OptionSchema> => getJson("options");
+export const devices = async (): Promise<Device[]> => (await answered(client.GET("/api/v1/devices"))).items;
+export const doctor = async (): Promise<Finding[]> =>
+  ((await (await request("doctor")).json()) as { items: Finding[] }).items;
+export const system = (): Promise<System> => answered(client.GET("/api/v1/system"));
+export const configuration = async (): Promise<Setting[]> =>
+  (await answered(client.GET("/api/v1/configuration"))).items;
+export const reloadConfiguration = (): Promise<unknown> => answered(client.POST("/api/v1/configuration:reload"));
+export const tokens = async (): Promise<Token[]> => (await answered(client.GET("/api/v1/tokens"))).items;
+export const optionSchema = async (): Promise<OptionSchema> => await answered(client.GET("/api/v1/options"));
 
-export const captures = (asked: {
-  limit?: number;
-  cursor?: string | null;
-  q?: string;
-  state?: string;
-}): Promise<Page<Capture>> => getJson(`captures${query(asked)}`);
-export const capture = (id: string): Promise<Capture> => getJson(`captures/${id}`);
+export const captures = (asked: { limit?: number; cursor?: string; q?: string }): Promise<CapturePage> =>
+  answered(client.GET("/api/v1/captures", { params: { query: asked } }));
+export const capture = (id: string): Promise<Capture> =>
+  answered(client.GET("/api/v1/captures/{capture_id}", ofCapture(id)));
 export const startCapture = (plan: CaptureRequest): Promise<Capture> =>
-  sendJson("POST", "captures", plan, idempotent());
-export const stopCapture = (id: string): Promise<Capture> => sendJson("POST", `captures/${id}:stop`, {});
-export const renameCapture = (
-  id: string,
-  change: { name?: string; notes?: string; keep?: boolean },
-): Promise<Capture> => sendJson("PATCH", `captures/${id}`, change);
-export const removeCapture = (id: string): Promise<Response> => request(`captures/${id}`, { method: "DELETE" });
-export const restoreCapture = (id: string): Promise<Capture> => sendJson("POST", `captures/${id}:restore`, {});
-export const stats = (id: string, frame?: number): Promise<Stats> => getJson(`captures/${id}/stats${query({ frame })}`);
+  answered(client.POST("/api/v1/captures", { body: plan, params: { header: idempotent() } }));
+export const stopCapture = (id: string): Promise<Capture> =>
+  answered(client.POST("/api/v1/captures/{capture_id}:stop", ofCapture(id)));
+export const changeCapture = (id: string, change: CaptureChange): Promise<Capture> =>
+  answered(client.PATCH("/api/v1/captures/{capture_id}", { ...ofCapture(id), body: change }));
+export const removeCapture = (id: string): Promise<unknown> =>
+  answered(client.DELETE("/api/v1/captures/{capture_id}", ofCapture(id)));
+export const restoreCapture = (id: string): Promise<Capture> =>
+  answered(client.POST("/api/v1/captures/{capture_id}:restore", ofCapture(id)));
+export const stats = (id: string): Promise<Stats> =>
+  answered(client.GET("/api/v1/captures/{capture_id}/stats", ofCapture(id)));
 
 export const reconstructions = async (captureId: string): Promise<Reconstruction[]> =>
-  (await getJson<Page<Reconstruction>>(`reconstructions${query({ capture_id: captureId, limit: 100 })}`)).items;
-export const reconstruction = (id: string): Promise<Reconstruction> => getJson(`reconstructions/${id}`);
+  (await answered(client.GET("/api/v1/reconstructions", { params: { query: { capture_id: captureId, limit: 100 } } })))
+    .items;
 export const submit = (captureId: string, options: OptionValues): Promise<Reconstruction> =>
-  sendJson("POST", "reconstructions", { capture_id: captureId, options }, idempotent());
-export const cancel = (id: string): Promise<Reconstruction> => sendJson("POST", `reconstructions/${id}:cancel`, {});
-export const timeline = (id: string): Promise<Timeline> => getJson(`reconstructions/${id}/timeline`);
-export const trajectory = (id: string): Promise<Trajectory> => getJson(`reconstructions/${id}/trajectory?format=json`);
+  answered(
+    client.POST("/api/v1/reconstructions", {
+      body: { capture_id: captureId, options },
+      params: { header: idempotent() },
+    }),
+  );
+export const cancel = (id: string): Promise<Reconstruction> =>
+  answered(client.POST("/api/v1/reconstructions/{reconstruction_id}:cancel", ofReconstruction(id)));
+export const timeline = (id: string): Promise<Timeline> =>
+  answered(client.GET("/api/v1/reconstructions/{reconstruction_id}/timeline", ofReconstruction(id)));
+/** Every `step`-th pose. */
+export const trajectory = async (id: string, step: number): Promise<Trajectory> =>
+  (await (await request(`reconstructions/${id}/trajectory${query({ format: "json", step })}`)).json()) as Trajectory;
 export const log = async (id: string): Promise<string> => (await request(`reconstructions/${id}/log`)).text();
 
 /** Addresses of what the browser fetches by itself. */
@@ -73,13 +83,11 @@ export const address = {
   ): string => `${API}/captures/${id}/preview${query({ kind, ...extra })}`,
   recording: (id: string): string => `${API}/captures/${id}/recording`,
   sidecar: (id: string): string => `${API}/captures/${id}/recording/sidecar`,
-  scene: (id: string, format: "ply" | "spz", extra: { version?: number; max_splats?: number } = {}): string =>
+  scene: (id: string, format: "ply" | "spz", extra: { max_splats?: number } = {}): string =>
     `${API}/reconstructions/${id}/scene${query({ format, ...extra })}`,
   trajectory: (id: string, format: string): string => `${API}/reconstructions/${id}/trajectory${query({ format })}`,
 };
 
-/** The bytes of a scene, with the version they are of. Aborted by `signal`. */
-export async function sceneBytes(url: string, signal: AbortSignal): Promise<Uint8Array> {
-  const response = await request(url.replace(`${API}/`, ""), { signal });
-  return new Uint8Array(await response.arrayBuffer());
-}
+/** The bytes of a picture or a scene, aborted by `signal`. */
+export const fetched = (url: string, signal: AbortSignal): Promise<Response> =>
+  request(url.slice(API.length + 1), { signal });

@@ -1,4 +1,8 @@
-/** Requests to the service, and its errors (RFC 9457). */
+/** Requests to the service, typed by its OpenAPI schema, and its errors (RFC 9457). */
+
+import createClient from "openapi-fetch";
+
+import type { paths } from "./schema";
 
 export const API = "api/v1";
 
@@ -22,47 +26,38 @@ export class UnreachableError extends Error {
   }
 }
 
-export async function request(path: string, init: RequestInit = {}): Promise<Response> {
-  let response: Response;
+async function reach(input: RequestInfo | URL, init?: RequestInit): Promise<Response> {
   try {
-    response = await fetch(`${API}/${path}`, init);
+    return await fetch(input, init);
   } catch (error) {
     if (error instanceof DOMException && error.name === "AbortError") throw error;
     throw new UnreachableError();
   }
-  if (response.ok || response.status === 304) return response;
-  throw await problemOf(response);
 }
 
-async function problemOf(response: Response): Promise<ApiError> {
-  try {
-    const problem = (await response.json()) as { detail?: string; title?: string; what_to_do?: string | null };
-    return new ApiError(
-      response.status,
-      problem.detail ?? problem.title ?? response.statusText,
-      problem.what_to_do ?? null,
-    );
-  } catch {
-    return new ApiError(response.status, `${response.status} ${response.statusText}`);
-  }
+/** The page may lie below a prefix: addresses are taken from where it was loaded. */
+const baseUrl = new URL(".", document.baseURI).href.replace(/\/$/, "");
+export const client = createClient<paths>({ baseUrl, fetch: reach });
+
+/** The answer of a call, or its problem thrown. */
+export async function answered<T>(call: Promise<{ data?: T; error?: unknown; response: Response }>): Promise<T> {
+  const { data, error, response } = await call;
+  if (response.ok) return data as T;
+  throw errorOf(response, error);
 }
 
-export async function getJson<T>(path: string, init?: RequestInit): Promise<T> {
-  return (await (await request(path, init)).json()) as T;
+/** A request for something that is not JSON. */
+export async function request(path: string, init: RequestInit = {}): Promise<Response> {
+  const response = await reach(`${API}/${path}`, init);
+  if (response.ok) return response;
+  throw errorOf(response, await response.json().catch(() => null));
 }
 
-export async function sendJson<T>(
-  method: string,
-  path: string,
-  body: unknown,
-  headers: Record<string, string> = {},
-): Promise<T> {
-  const response = await request(path, {
-    method,
-    headers: { "Content-Type": "application/json", ...headers },
-    body: JSON.stringify(body),
-  });
-  return (response.status === 204 ? undefined : await response.json()) as T;
+function errorOf(response: Response, body: unknown): ApiError {
+  const problem = typeof body === "object" && body !== null ? (body as Record<string, unknown>) : {};
+  const text = (key: string): string | null => (typeof problem[key] === "string" ? problem[key] : null);
+  const said = text("detail") ?? text("title") ?? `${response.status} ${response.statusText}`;
+  return new ApiError(response.status, said, text("what_to_do"));
 }
 
 export const query = (values: Record<string, string | number | boolean | null | undefined>): string => {

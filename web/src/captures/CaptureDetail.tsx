@@ -4,6 +4,7 @@ import { type JSX, useEffect, useState } from "react";
 
 import * as calls from "../api/calls";
 import type { Capture, OptionValues, Reconstruction } from "../api/types";
+import { lengthOf, nameOf } from "../state/capture";
 import { bytes, count, decibel, duration, rate, small, when } from "../state/format";
 import { adjust, go, useRoute } from "../state/route";
 import {
@@ -20,7 +21,6 @@ import { toast } from "../state/toasts";
 import { useAsked } from "../state/useAsked";
 import { Icon } from "../ui/icons";
 import { Badge, captureTone, Empty, gradeTone, jobTone, Loading, Panel, Stat, Trouble } from "../ui/parts";
-import { lengthOf, nameOf } from "./CapturesTable";
 import { OptionsForm, textOf } from "./OptionsForm";
 import { Plots } from "./Plots";
 import { removeWithUndo } from "./remove";
@@ -103,19 +103,19 @@ function Detail({ capture }: { capture: Capture }): JSX.Element {
 }
 
 function Head({ capture }: { capture: Capture }): JSX.Element {
-  const [name, setName] = useState(capture.name ?? "");
+  const [name, setName] = useState(capture.name);
   const rename = async (): Promise<void> => {
-    if (name === (capture.name ?? "")) return;
+    if (name === capture.name) return;
     try {
-      takeCapture(await calls.renameCapture(capture.id, { name }));
+      takeCapture(await calls.changeCapture(capture.id, { name }));
     } catch (error) {
       toast(wordsOf(error), { tone: "problem" });
-      setName(capture.name ?? "");
+      setName(capture.name);
     }
   };
   const keep = async (wanted: boolean): Promise<void> => {
     try {
-      takeCapture(await calls.renameCapture(capture.id, { keep: wanted }));
+      takeCapture(await calls.changeCapture(capture.id, { keep: wanted }));
     } catch (error) {
       toast(wordsOf(error), { tone: "problem" });
     }
@@ -136,7 +136,7 @@ function Head({ capture }: { capture: Capture }): JSX.Element {
         onBlur={() => void rename()}
         onKeyDown={(event) => {
           if (event.key === "Enter") event.currentTarget.blur();
-          if (event.key === "Escape") setName(capture.name ?? "");
+          if (event.key === "Escape") setName(capture.name);
         }}
       />
       {capture.verdict === null ? (

@@ -4,7 +4,8 @@ import { type JSX, useEffect, useState } from "react";
 
 import { address, captures as ask } from "../api/calls";
 import type { Capture } from "../api/types";
-import { bytes, count, duration, when } from "../state/format";
+import { lengthOf, nameOf } from "../state/capture";
+import { bytes, when } from "../state/format";
 import { adjust, go, useRoute } from "../state/route";
 import { newestReconstruction, useService, wordsOf } from "../state/store";
 import { Icon } from "../ui/icons";
@@ -129,15 +130,6 @@ export function CapturesTable(): JSX.Element {
         ))}
     </div>
   );
-}
-
-export const nameOf = (capture: Capture): string =>
-  capture.name === null || capture.name === "" ? capture.source : capture.name;
-
-export function lengthOf(capture: Capture): string {
-  const frames = capture.recording?.frames ?? capture.counters?.next_frame ?? capture.frames_planned;
-  if (frames == null) return "–";
-  return capture.sensor === null ? `${count(frames)} frames` : duration(frames / capture.sensor.frame_rate_hz);
 }
 
 function Row({

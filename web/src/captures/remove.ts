@@ -2,11 +2,11 @@
 
 import { removeCapture, restoreCapture } from "../api/calls";
 import type { Capture } from "../api/types";
+import { nameOf } from "../state/capture";
 import { forgetCapture, takeCapture, wordsOf } from "../state/store";
 import { toast } from "../state/toasts";
 
 export async function removeWithUndo(capture: Capture, onRemoved: () => void, onRestored: () => void): Promise<void> {
-  const name = capture.name === null || capture.name === "" ? capture.source : capture.name;
   try {
     await removeCapture(capture.id);
   } catch (error) {
@@ -23,5 +23,5 @@ export async function removeWithUndo(capture: Capture, onRemoved: () => void, on
       toast(wordsOf(error), { tone: "problem" });
     }
   };
-  toast(`Deleted ${name}`, { action: { label: "Undo", run: () => void undo() } });
+  toast(`Deleted ${nameOf(capture)}`, { action: { label: "Undo", run: () => void undo() } });
 }

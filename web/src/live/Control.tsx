@@ -172,7 +172,7 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
 
 function DeviceSign({ device }: { device: Device }): JSX.Element {
   return (
-    <span title={device.reason ?? undefined}>
+    <span title={device.reason}>
       <Badge tone={deviceTone[device.state]}>{device.state}</Badge>
     </span>
   );

@@ -20,7 +20,7 @@ export function Progress({ job }: { job: Reconstruction | null }): JSX.Element {
     <Panel
       title="Reconstruction"
       aside={
-        running && job.tracking_state !== null ? (
+        running ? (
           <Badge tone={trackingTone[job.tracking_state]}>{job.tracking_state}</Badge>
         ) : (
           <Badge tone={jobTone[job.state]}>{job.state}</Badge>

@@ -145,9 +145,7 @@ export function DevicePanel({ device }: { device: Device }): JSX.Element {
     <div className="device">
       <strong>{device.description || device.source}</strong>
       <span className="dim">{facts.join(" · ")}</span>
-      {device.reason !== null && device.reason !== "" && (
-        <p className={device.state === "lost" ? "problem" : "dim"}>{device.reason}</p>
-      )}
+      {device.reason !== "" && <p className={device.state === "lost" ? "problem" : "dim"}>{device.reason}</p>}
     </div>
   );
 }

@@ -55,8 +55,8 @@ export function Inspector(props: InspectorProps): JSX.Element {
   return (
     <aside className="inspector" aria-label="Scene settings">
       <header>
-        <strong>{capture.name === null || capture.name === "" ? capture.source : capture.name}</strong>
-        {running && job.tracking_state !== null ? (
+        <strong>{capture.name === "" ? capture.source : capture.name}</strong>
+        {running ? (
           <Badge tone={trackingTone[job.tracking_state]}>{job.tracking_state}</Badge>
         ) : (
           <Badge tone={jobTone[job.state]}>{job.state}</Badge>

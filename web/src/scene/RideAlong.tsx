@@ -2,8 +2,7 @@
 
 import { type JSX, useEffect, useRef, useState } from "react";
 
-import { address } from "../api/calls";
-import { request } from "../api/http";
+import { address, fetched } from "../api/calls";
 import type { Capture, Reconstruction, Sensor } from "../api/types";
 import { Segmented } from "../ui/parts";
 
@@ -136,8 +135,8 @@ function useObserved(
     let timer: ReturnType<typeof setTimeout> | undefined;
     const ask = async (): Promise<void> => {
       try {
-        const path = address.preview(id, "interval", { frame: asked, white }).replace("api/v1/", "");
-        const next = URL.createObjectURL(await (await request(path, { signal: ended.signal })).blob());
+        const picture = address.preview(id, "interval", { frame: asked, white });
+        const next = URL.createObjectURL(await (await fetched(picture, ended.signal)).blob());
         setUrl((before) => {
           if (before !== null) URL.revokeObjectURL(before);
           return next;

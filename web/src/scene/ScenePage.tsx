@@ -4,6 +4,7 @@ import { type JSX, useCallback, useEffect, useState } from "react";
 
 import { capture as askCapture } from "../api/calls";
 import type { Capture } from "../api/types";
+import { nameOf } from "../state/capture";
 import { count } from "../state/format";
 import { adjust, go, route, useRoute } from "../state/route";
 import {
@@ -82,7 +83,7 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   const [full, setFull] = useState(false);
   const dark = useDark();
   const sensor = capture.sensor;
-  const path = usePath(job, sensor);
+  const path = usePath(job);
   const { shown, loading, problem } = useScene(viewer, job, full);
 
   const mount = useCallback((canvas: HTMLCanvasElement | null) => {
@@ -151,7 +152,7 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
             ref={mount}
             tabIndex={0}
             role="application"
-            aria-label={`Scene of ${capture.name ?? capture.id}: ${count(shown?.splats ?? 0)} splats, version ${shown?.version ?? 0}`}
+            aria-label={`Scene of ${nameOf(capture)}: ${count(shown?.splats ?? 0)} splats, version ${shown?.version ?? 0}`}
             data-version={shown?.version ?? 0}
             data-splats={shown?.splats ?? 0}
           />
@@ -176,7 +177,7 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
               </Empty>
             ) : (
               <Empty icon="scene" title={loading ? "Loading the scene…" : "Waiting for the first version…"}>
-                {!loading && `The tracking is at ${job.tracking_state ?? "its start"}. ${job.reason}`}
+                {!loading && `The tracking is at ${job.tracking_state}. ${job.reason}`}
               </Empty>
             )}
           </div>

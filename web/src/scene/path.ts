@@ -28,19 +28,18 @@ export interface Path {
   states: (TrackingState | null)[];
 }
 
-export function pathOf(trajectory: Trajectory, frameRateHz: number, tail: readonly Pose[] = []): Path {
+export function pathOf(trajectory: Trajectory, tail: readonly Pose[] = []): Path {
   const fresh = tail.filter((pose) => pose.time_s > (trajectory.times_s.at(-1) ?? -1));
   const times = Float64Array.from([...trajectory.times_s, ...fresh.map((pose) => pose.time_s)]);
-  const frames = trajectory.frames ?? trajectory.times_s.map((time) => Math.round(time * frameRateHz - 0.5));
   return {
-    frames: Float64Array.from([...frames, ...fresh.map((pose) => pose.frame)]),
+    frames: Float64Array.from([...trajectory.frames, ...fresh.map((pose) => pose.frame)]),
     times,
     positions: Float32Array.from([...trajectory.positions.flat(), ...fresh.flatMap((pose) => pose.position)]),
     quaternions: Float32Array.from([
       ...trajectory.quaternions_wxyz.flat(),
       ...fresh.flatMap((pose) => pose.quaternion_wxyz),
     ]),
-    states: [...(trajectory.states ?? trajectory.times_s.map(() => null)), ...fresh.map((pose) => pose.state)],
+    states: [...trajectory.states, ...fresh.map((pose) => pose.state)],
   };
 }
 

@@ -3,36 +3,38 @@
 import { useEffect, useState } from "react";
 
 import { trajectory } from "../api/calls";
-import type { Reconstruction, Sensor, Trajectory } from "../api/types";
+import type { Reconstruction, Trajectory } from "../api/types";
 import { poses } from "../state/poses";
 import { useService } from "../state/store";
 import { type Path, pathOf } from "./path";
 
 const TAIL_MS = 250;
+/** A path of minutes has millions of poses; the page shows no more than so many. */
+const MOST_POSES = 20_000;
 
-export function usePath(job: Reconstruction | null, sensor: Sensor | null): Path | null {
+export function usePath(job: Reconstruction | null): Path | null {
   const announced = useService((state) => (job === null ? undefined : state.scenes[job.id]?.version));
   const version = Math.max(job?.version ?? 0, announced ?? 0);
   const [published, setPublished] = useState<{ id: string; trajectory: Trajectory } | null>(null);
   const [path, setPath] = useState<{ id: string; path: Path } | null>(null);
   const id = job?.id ?? null;
+  const step = Math.max(1, Math.ceil((job?.poses ?? 0) / MOST_POSES));
   useEffect(() => {
     if (id === null || version === 0) return;
     let current = true;
-    trajectory(id).then(
+    trajectory(id, step).then(
       (value) => current && setPublished({ id, trajectory: value }),
       () => undefined, // asked again with the next version
     );
     return () => {
       current = false;
     };
-  }, [id, version]);
+  }, [id, version, step]);
 
-  const rateHz = sensor?.frame_rate_hz ?? null;
   const live = job?.live === true && job.state === "running";
   const captureId = job?.capture_id ?? null;
   useEffect(() => {
-    if (id === null || rateHz === null) return;
+    if (id === null) return;
     const base: Trajectory =
       published?.id === id
         ? published.trajectory
@@ -41,13 +43,13 @@ export function usePath(job: Reconstruction | null, sensor: Sensor | null): Path
     const join = (): void => {
       if (poses.version === seen) return;
       seen = poses.version;
-      const end = base.frames?.at(-1) ?? Math.round((base.times_s.at(-1) ?? -1) * rateHz);
-      setPath({ id, path: pathOf(base, rateHz, live ? poses.after(captureId, end) : []) });
+      const end = base.frames.at(-1) ?? -1;
+      setPath({ id, path: pathOf(base, live ? poses.after(captureId, end) : []) });
     };
     join();
     if (!live) return;
     const timer = setInterval(join, TAIL_MS);
     return () => clearInterval(timer);
-  }, [published, id, rateHz, live, captureId]);
+  }, [published, id, live, captureId]);
   return path !== null && path.id === id ? path.path : null;
 }

@@ -2,7 +2,7 @@
 
 import { useEffect, useRef, useState } from "react";
 
-import { address, sceneBytes } from "../api/calls";
+import { address, fetched } from "../api/calls";
 import type { Reconstruction } from "../api/types";
 import { useService, wordsOf } from "../state/store";
 import type { Viewer } from "./Viewer";
@@ -51,7 +51,7 @@ export function useScene(
         // Of an older version only the newest files are kept, so the newest is asked for whatever its number is by now.
         const format = whole ? "ply" : "spz";
         const url = address.scene(id, format, whole ? {} : { max_splats: PREVIEW_SPLATS });
-        const bytes = await sceneBytes(url, ended.signal);
+        const bytes = new Uint8Array(await (await fetched(url, ended.signal)).arrayBuffer());
         await viewer.setScene(bytes, format, want.version);
         shown = { version: want.version, splats: viewer.splats, whole };
         setState({ job: id, shown, problem: null });

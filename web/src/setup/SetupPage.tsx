@@ -3,7 +3,7 @@
 import { type JSX, useState } from "react";
 
 import * as calls from "../api/calls";
-import type { ConfigurationItem, DoctorItem } from "../api/types";
+import type { Setting, Finding } from "../api/types";
 import { bytes, duration, when } from "../state/format";
 import { useService, wordsOf } from "../state/store";
 import { toast } from "../state/toasts";
@@ -11,7 +11,7 @@ import { type Asked, useAsked } from "../state/useAsked";
 import { Icon } from "../ui/icons";
 import { Badge, Empty, Loading, Panel, type Tone, Trouble } from "../ui/parts";
 
-const TONES: Record<DoctorItem["status"], Tone> = { ok: "good", warning: "warning", problem: "problem" };
+const TONES: Record<Finding["status"], Tone> = { ok: "good", warning: "warning", problem: "problem" };
 const LINKS = [
   { href: "docs", label: "API documentation", hint: "Every call, to try out" },
   { href: "openapi.json", label: "OpenAPI schema", hint: "To generate clients from" },
@@ -169,7 +169,7 @@ function Asking<T>({
   );
 }
 
-function Configuration({ asked }: { asked: Asked<ConfigurationItem[]> }): JSX.Element {
+function Configuration({ asked }: { asked: Asked<Setting[]> }): JSX.Element {
   const [busy, setBusy] = useState(false);
   const reload = async (): Promise<void> => {
     setBusy(true);

@@ -48,7 +48,7 @@ class Daemon:
             with suppress(psutil.NoSuchProcess):
                 words = child.cmdline()  # empty for a zombie, and without the role just after a fork
                 if words[1:3] == ["-m", "spiked_service.worker"]:
-                    found[words[3]] = child
+                    found.setdefault(words[3], child)  # the oldest: a spare recorder stands by
         return found
 
     def close(self) -> None:

@@ -398,3 +398,31 @@ def test_whatever_happens_each_frame_is_received_or_lost_once(script: list[Step]
             assert assert_contiguous(told) == writer.next_frame
         for row in writer.status().readers:
             assert row.received + row.lost == row.next_frame == writer.next_frame
+
+
+def test_a_reader_may_start_at_a_frame_that_the_ring_still_holds() -> None:
+    with RingWriter.create(SENSOR, slots=64, block_frames=8) as writer:
+        for _ in range(40):
+            writer.acquire()[:] = 0
+            writer.commit(8)
+        for start, first in ((200, 200), (203, 200), (0, 0), (319, 312)):
+            with RingReader.attach(writer.name, Policy.PRIORITY, "late", start_frame=start) as reader:
+                items = [reader.next(0)]
+                if first:
+                    assert items[0] == Gap(0, first, Cause.RING)
+                    items = [reader.next(0)]
+                assert isinstance(items[0], Frames)
+                assert items[0].first == first
+                assert reader.overruns == 0
+
+
+def test_a_reader_that_starts_too_far_back_gets_what_there_is() -> None:
+    with RingWriter.create(SENSOR, slots=16, block_frames=8) as writer:
+        for _ in range(40):
+            writer.acquire()[:] = 0
+            writer.commit(8)
+        with RingReader.attach(writer.name, Policy.PRIORITY, "late", start_frame=3) as reader:
+            gap, frames = reader.next(0), reader.next(0)
+            assert isinstance(gap, Gap) and isinstance(frames, Frames)
+            assert frames.first == gap.count >= (40 - 16) * 8
+            assert frames.valid()

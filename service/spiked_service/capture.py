@@ -1,215 +1,342 @@
-"""One capture: three workers, what they said last, and what became of them."""
+"""One live capture: a stream, its recorder, its live reconstruction, and what became of them."""
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from datetime import UTC, datetime
-from enum import StrEnum
-from pathlib import Path
 
-from spiked.ring import Ring, RingStatus, clean_stale
-from spiked.sensor import Intrinsics
-from spiked_service.child import Child
-from spiked_service.ids import new_id
+from spiked_service.announcer import Announcer
+from spiked_service.backoff import Backoff
+from spiked_service.child import Child, Spare
+from spiked_service.judging import judged
 from spiked_service.messages import (
-    AcquisitionOrder,
     News,
-    Order,
-    PreviewOrder,
-    ReconstructionOrder,
-    ReconstructionStatus,
+    PreviewTaken,
+    RecorderOrder,
+    RecordingEnded,
     Refused,
     RingOpened,
+    Role,
 )
-
-_CONSUMERS = 2  # reconstruction and preview
-_PREVIEW_RETRIES = 3
-
-
-class CaptureState(StrEnum):
-    """Where a capture stands."""
-
-    STARTING = "starting"
-    STREAMING = "streaming"
-    FINISHING = "finishing"
-    """The source has ended; the reconstruction refines what it has."""
-    COMPLETE = "complete"
-    FAILED = "failed"
-    """Something died or was refused, the reason says what; what was published stays available."""
-
-    @property
-    def over(self) -> bool:
-        """Whether nothing more will happen."""
-        return self in (CaptureState.COMPLETE, CaptureState.FAILED)
+from spiked_service.reconstructions import Reconstructions
+from spiked_service.store.catalogue import Catalogue, StoreError
+from spiked_service.store.folder import DataFolder
+from spiked_service.store.rows import (
+    CaptureRow,
+    CaptureState,
+    Counters,
+    Grade,
+    JobState,
+    Judgement,
+    ReconstructionRow,
+    Recorded,
+)
+from spiked_service.stream import Stream
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What to capture, and how to reconstruct it."""
+class LiveCapture:
+    """Follows a stream until all that reads it has ended. Every method may be called from any thread."""
 
-    source: str
-    frames: int | None = None
-    """None: until the source ends or the capture is stopped."""
-    seconds: float | None = None
-    """Instead of frames."""
-    seed: int = 0
-    steps: int = 4000
-    intrinsics: Intrinsics | None = None
-    """None: the source's own."""
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """All that is known of a capture at one moment."""
-
-    id: str
-    plan: Plan
-    started: datetime
-    state: CaptureState
-    reason: str
-    warnings: tuple[str, ...]
-    ring: RingOpened | None
-    counters: RingStatus | None
-    reconstruction: ReconstructionStatus | None
-
-
-class Capture:
-    """Supervises acquisition, reconstruction and preview. Every method may be called from any thread."""
-
-    def __init__(self, plan: Plan, runtime: Path) -> None:
-        self.id = new_id()
-        self.plan = plan
-        self.folder = runtime / self.id
-        self.folder.mkdir()
+    def __init__(
+        self,
+        row: CaptureRow,
+        folder: DataFolder,
+        catalogue: Catalogue,
+        reconstructions: Reconstructions,
+        announce: Announcer,
+        on_change: Callable[["LiveCapture"], None],
+    ) -> None:
+        self._folder = folder
+        self._catalogue = catalogue
+        self._reconstructions = reconstructions
+        self._announce = announce
+        self._on_change = on_change
         self._lock = threading.RLock()
-        self._started = datetime.now(UTC)
-        self._state = CaptureState.STARTING
-        self._reason = ""
-        self._warnings: list[str] = []
+        self._row = row
+        self._stream: Stream | None = None
         self._opened: RingOpened | None = None
-        self._ring: Ring | None = None
-        self._reconstruction: ReconstructionStatus | None = None
-        self._children: dict[str, Child] = {}
+        self._first_frame = 0
+        self._stop_frame: int | None = None
+        self._recorder: Child | None = None
+        self._spare: Spare | None = None
+        self._recorder_backoff = Backoff()
+        self._recording = row.plan.record
+        self._reconstructing = row.plan.reconstruct
+        self._reconstruction_id: str | None = None
+        self._account: RecordingEnded | None = None
+        self._refusal: str | None = None
+        self._failed = False
         self._closing = False
-        self._preview_deaths = 0
-        order = AcquisitionOrder(
-            source=plan.source, ring_id=self.id, frames=plan.frames, seconds=plan.seconds, consumers=_CONSUMERS
-        )
-        self._start(order, self._acquisition_ended)
+        self._over = threading.Event()
 
     @property
-    def preview(self) -> Path:
-        """Where the live picture is, once there is one."""
-        return self.folder / "preview.png"
+    def id(self) -> str:
+        """Of the capture."""
+        return self._row.id
 
-    def snapshot(self) -> Snapshot:
-        """What is known now."""
+    @property
+    def row(self) -> CaptureRow:
+        """As it stands now."""
+        return self._row
+
+    @property
+    def holds_device(self) -> bool:
+        """Whether its source is not free yet."""
+        return self._stream is not None and not self._stream.ended
+
+    @property
+    def picture(self) -> PreviewTaken | None:
+        """The newest pictures."""
+        return None if self._stream is None else self._stream.picture
+
+    def counters(self) -> Counters | None:
+        """Of the ring, now or at the end."""
+        return None if self._stream is None else self._stream.counters()
+
+    def flow(self, stream: Stream) -> None:
+        """Follow a stream that is about to open its ring."""
+        self._stream = stream
+
+    def join_stream(
+        self,
+        stream: Stream,
+        first_frame: int,
+        stop_frame: int | None,
+        recorder: Spare | None = None,
+        reconstructor: Spare | None = None,
+    ) -> None:
+        """Begin within a stream that flows already, at a frame that its ring still holds."""
+        assert stream.opened is not None, "a stream that flows has opened its ring"
         with self._lock:
-            counters = None if self._ring is None else self._ring.status()
-            return Snapshot(
-                self.id,
-                self.plan,
-                self._started,
-                self._state,
-                self._reason,
-                tuple(self._warnings),
-                self._opened,
-                counters,
-                self._reconstruction,
-            )
+            self._stream = stream
+            self._first_frame, self._stop_frame = first_frame, stop_frame
+            stream.follow(self)
+            self._begin(stream.opened, recorder, reconstructor)
+
+    def change(self, **fields: object) -> CaptureRow:
+        """Replace what a user may change of the row. Raises StoreError."""
+        with self._lock:
+            self._row = replace(self._row, **fields)  # type: ignore[arg-type]
+            self._catalogue.captures.put(self._row)
+        self._on_change(self)
+        return self._row
 
     def stop(self) -> None:
         """End the acquisition; the reconstruction goes on to refine. Asked again, it stops refining too."""
         with self._lock:
-            role = "reconstruction" if self._state is CaptureState.FINISHING else "acquisition"
-            child = self._children.get(role)
-        if child is not None:
-            child.stop()
+            if self._row.state is CaptureState.FINISHING and self._reconstruction_id is not None:
+                self._reconstructions.finish_early(self._reconstruction_id)
+            elif self._stream is not None:
+                self._stream.stop()
 
     def dismiss(self) -> None:
         """Tell all workers to leave at once."""
         with self._lock:
             self._closing = True
-            children = list(self._children.values())
-        for child in children:
-            child.dismiss()
+            self._recorder_backoff.cancel()
+            recorder, spare, stream = self._recorder, self._spare, self._stream
+            self._spare = None
+        if stream is not None:
+            stream.dismiss()
+        if recorder is not None:
+            recorder.dismiss()
+        if spare is not None:
+            spare.dismiss()
 
     def join(self, timeout_s: float) -> None:
         """Wait for dismissed workers, and kill those that stay."""
         with self._lock:
-            children = list(self._children.values())
-        for child in children:
-            child.kill_after(timeout_s)
+            recorder, stream = self._recorder, self._stream
+        if stream is not None:
+            stream.join(timeout_s)
+        if recorder is not None:
+            recorder.kill_after(timeout_s)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until it is over."""
+        return self._over.wait(timeout_s)
 
     def processes(self) -> dict[str, int]:
-        """Process ids of the living workers, by role."""
+        """Process ids of the living workers, by role, without the reconstruction's."""
         with self._lock:
-            return {role: child.pid for role, child in self._children.items()}
+            found = {} if self._stream is None else self._stream.processes()
+            return found | ({} if self._recorder is None else {Role.RECORDER: self._recorder.pid})
 
-    def _start(self, order: Order, on_exit: Callable[[str | None], None]) -> None:
+    def stream_opened(self, opened: RingOpened) -> None:
+        """See `StreamListener`."""
+        self._begin(opened, None, None)
+
+    def picture_taken(self, taken: PreviewTaken) -> None:
+        """See `StreamListener`."""
+        self._announce.preview(self.id, taken)
+
+    def warned(self, text: str) -> None:
+        """See `StreamListener`."""
+        self._announce.log("warning", text, self.id)
+        self._set(warnings=(*self._row.warnings, text))
+
+    def stream_ended(self, trouble: str | None) -> None:
+        """See `StreamListener`."""
+        with self._lock:
+            if trouble is not None:
+                self._fail(trouble)
+            if self._opened is None:
+                self._recording = self._reconstructing = False
+            elif self._row.state is CaptureState.STREAMING:
+                self._set(state=CaptureState.FINISHING)
+            self._settle()
+
+    def _begin(self, opened: RingOpened, recorder: Spare | None, reconstructor: Spare | None) -> None:
         with self._lock:
             if self._closing:
                 return
-            role = order.role
+            self._opened = opened
+            plan = self._row.plan
+            sensor = replace(opened.sensor, intrinsics=plan.intrinsics or opened.sensor.intrinsics)
+            frames = opened.frames if self._stop_frame is None else self._stop_frame - self._first_frame
+            self._set(state=CaptureState.STREAMING, sensor=sensor, frames_planned=frames)
+            if self._recording:
+                self._start_recorder(recorder)
+            if self._reconstructing:
+                row = self._reconstructions.begin_live(
+                    self._row,
+                    opened,
+                    self._reconstruction_ended,
+                    first_frame=self._first_frame,
+                    stop_frame=self._stop_frame,
+                    spare=reconstructor,
+                )
+                self._reconstruction_id = row.id
 
-            def ended(trouble: str | None) -> None:
-                with self._lock:
-                    self._children.pop(role, None)
-                    on_exit(trouble)
-
-            self._children[role] = Child(order, self.folder / f"{role}.log", self._hear, ended)
-
-    def _hear(self, news: News) -> None:
-        with self._lock:
-            match news:
-                case RingOpened():
-                    self._attach(news)
-                case ReconstructionStatus():
-                    self._reconstruction = news
-                case Refused():
-                    self._note(news.reason)
-
-    def _attach(self, opened: RingOpened) -> None:
-        self._opened = opened
-        self._ring = Ring.attach(opened.name)
-        self._state = CaptureState.STREAMING
-        order = ReconstructionOrder(
-            ring=opened.name,
-            folder=self.folder,
-            unhurried=opened.unhurried,
-            seed=self.plan.seed,
-            steps=self.plan.steps,
-            intrinsics=self.plan.intrinsics,
+    def _start_recorder(self, spare: Spare | None = None, resume: bool = False) -> None:
+        assert self._opened is not None
+        plan = self._row.plan
+        order = RecorderOrder(
+            ring=self._opened.name,
+            path=self._folder.recording(self.id),
+            first_frame=self._first_frame,
+            stop_frame=self._stop_frame,
+            resume=resume,
+            intrinsics=plan.intrinsics,
+            source=plan.source,
+            note=plan.name,
         )
-        self._start(order, self._reconstruction_ended)
-        self._start(PreviewOrder(ring=opened.name, file=self.preview), self._preview_ended)
+        log = self._folder.capture(self.id) / "logs" / "recorder.log"
+        self._recorder = Child(order, log, self._hear_recorder, self._recorder_ended, spare)
+        # Another stands by, so that a recorder that is killed is followed while the ring still holds what it missed.
+        self._spare = Spare(Role.RECORDER, log)
 
-    def _acquisition_ended(self, trouble: str | None) -> None:
-        clean_stale()
-        self._note(trouble)
-        if self._state is CaptureState.STREAMING:
-            self._state = CaptureState.FINISHING
-        elif self._state is CaptureState.STARTING:
-            self._state = CaptureState.FAILED if self._reason else CaptureState.COMPLETE
+    def _hear_recorder(self, news: News) -> None:
+        match news:
+            case RecordingEnded():
+                self._account = news
+            case Refused():
+                self._refusal = news.reason
 
-    def _reconstruction_ended(self, trouble: str | None) -> None:
-        if self._closing:
+    def _recorder_ended(self, trouble: str | None) -> None:
+        with self._lock:
+            self._recorder = None
+            if self._account is not None:
+                self._recorded(self._account)
+            elif self._closing:
+                return  # the next service makes the recording whole
+            elif self._refusal is not None:
+                self._not_recorded(self._refusal)
+            else:
+                delay_s = self._recorder_backoff.again(self._follow_recorder)
+                if delay_s is not None:
+                    self.warned(f"{trouble}; another went on where it stopped")
+                    return
+                self._not_recorded(f"{trouble}, again and again")
+            self._retire_spare()
+            self._recording = False
+            if self._stream is not None and not self._stream.ended:
+                self._stream.stop()
+            self._settle()
+        self._reconstructions.recording_closed()
+
+    def _follow_recorder(self) -> None:
+        with self._lock:
+            if self._closing or not self._recording:
+                return
+            spare, self._spare = self._spare, None
+            # One that was killed before it had begun leaves nothing to go on with.
+            begun = self._folder.recording(self.id).with_suffix(".json").exists()
+            self._start_recorder(spare, resume=begun)
+
+    def _retire_spare(self) -> None:
+        spare, self._spare = self._spare, None
+        if spare is not None:
+            spare.dismiss()
+            threading.Thread(target=spare.kill_after, args=(5.0,), name="reap spare", daemon=True).start()
+
+    def _recorded(self, account: RecordingEnded) -> None:
+        recording = Recorded(account.frames, account.bytes, lost=sum(account.lost.values()))
+        verdict = judged(account)
+        self._set(recording=recording, verdict=verdict)
+        if account.trouble:
+            self._announce.log("error", account.trouble, self.id)
+            if verdict.grade is Grade.BAD:
+                self._fail(account.trouble)
+            elif not self._row.reason:
+                self._set(reason=account.trouble)
+
+    def _not_recorded(self, reason: str) -> None:
+        self._fail(reason)
+        self._set(verdict=Judgement(Grade.BAD, (reason,)))
+        if self._stream is not None:
+            self._stream.bury(Role.RECORDER)
+
+    def _reconstruction_ended(self, row: ReconstructionRow) -> None:
+        with self._lock:
+            self._reconstructing = False
+            if self._stream is not None:
+                self._stream.bury(Role.RECONSTRUCTION)
+            if row.state is JobState.QUEUED:
+                self.warned(row.reason)
+            elif row.state is JobState.FAILED:
+                if self._row.plan.record:
+                    self.warned(row.reason)
+                else:
+                    self._fail(row.reason)
+                    if self._stream is not None:
+                        self._stream.stop()
+            self._settle()
+
+    def _settle(self) -> None:
+        """Over, once nothing acquires, records, or reconstructs."""
+        if self._stream is None or not self._stream.ended or self._recording or self._reconstructing:
             return
-        self._note(trouble)
-        self._state = CaptureState.FAILED if self._reason else CaptureState.COMPLETE
-        for child in list(self._children.values()):
-            child.dismiss()
-
-    def _preview_ended(self, trouble: str | None) -> None:
-        if trouble is None or self._closing or self._opened is None:
+        if self._over.is_set() or (self._closing and self._recorder is not None):
             return
-        self._preview_deaths += 1
-        again = self._preview_deaths <= _PREVIEW_RETRIES and self._state is CaptureState.STREAMING
-        self._warnings.append(f"{trouble}; {'it was started again' if again else 'there is no live picture'}")
-        if again:
-            self._start(PreviewOrder(ring=self._opened.name, file=self.preview), self._preview_ended)
+        self._stream.end_pictures()
+        counters = self._stream.counters()
+        self._stream.release()
+        if self._closing and not self._row.reason:
+            self._set(reason="ended, because the service was")
+        state = CaptureState.FAILED if self._failed else CaptureState.COMPLETE
+        self._set(state=state, counters=counters, ended_at=datetime.now(UTC))
+        self._over.set()
+        self._on_change(self)
 
-    def _note(self, trouble: str | None) -> None:
-        """The first trouble is the reason that counts; after a dismissal, deaths are no news."""
-        if trouble is not None and not self._closing and not self._reason:
-            self._reason = trouble
+    def _fail(self, reason: str) -> None:
+        """The first trouble is the reason that counts."""
+        self._failed = True
+        self._announce.log("error", reason, self.id)
+        if not self._row.reason:
+            self._set(reason=reason)
+
+    def _set(self, **fields: object) -> None:
+        with self._lock:
+            self._row = replace(self._row, **fields)  # type: ignore[arg-type]
+            self.save()
+        self._on_change(self)
+
+    def save(self) -> bool:
+        """Write the row down; false if the disk did not take it, which is tried again later."""
+        try:
+            self._catalogue.captures.put(self._row)
+        except StoreError as error:
+            self._announce.log("error", str(error), self.id)
+            return False
+        return True

@@ -7,7 +7,37 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
-from spiked_service.messages import STOP, News, Order, news_lines
+from spiked_service.messages import STOP, News, Order, Role, news_lines
+
+
+class Spare:
+    """A worker that has loaded what its role needs and stands by for an order."""
+
+    def __init__(self, role: Role, log: Path) -> None:
+        self.role = role
+        self.log = log
+        with log.open("ab") as errors:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "spiked_service.worker", role],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                process_group=0,  # Ctrl-C in the terminal is for the service alone
+            )
+
+    def dismiss(self) -> None:
+        """It is not needed any more."""
+        assert self.process.stdin is not None and self.process.stdout is not None
+        try:
+            self.process.stdin.close()
+        except BrokenPipeError:
+            return
+        finally:
+            self.process.stdout.close()
+
+    def kill_after(self, timeout_s: float) -> None:
+        """Wait for its end, and kill it if it does not come in time."""
+        _wait_or_kill(self.process, timeout_s)
 
 
 class Child:
@@ -18,22 +48,21 @@ class Child:
     """
 
     def __init__(
-        self, order: Order, log: Path, on_news: Callable[[News], None], on_exit: Callable[[str | None], None]
+        self,
+        order: Order,
+        log: Path,
+        on_news: Callable[[News], None],
+        on_exit: Callable[[str | None], None],
+        spare: Spare | None = None,
     ) -> None:
-        """Start it. `on_exit` gets None for a good end, otherwise a sentence."""
-        self.role = order.role
-        self._log = log
+        """Start it, or have a spare of the role do it. `on_exit` gets None for a good end, otherwise a sentence."""
+        self.role: Role = order.role
         self._on_news = on_news
         self._on_exit = on_exit
         self._writing = threading.Lock()
-        with log.open("ab") as errors:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "spiked_service.worker", order.role],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=errors,
-                process_group=0,  # Ctrl-C in the terminal is for the service alone
-            )
+        worker = spare if spare is not None and spare.process.poll() is None else Spare(order.role, log)
+        self._log = worker.log
+        self._process = worker.process
         assert self._process.stdin is not None and self._process.stdout is not None
         self._stdin: IO[bytes] = self._process.stdin
         self._stdout: IO[bytes] = self._process.stdout
@@ -60,11 +89,7 @@ class Child:
 
     def kill_after(self, timeout_s: float) -> None:
         """Wait for its end, and kill it if it does not come in time."""
-        try:
-            self._process.wait(timeout_s)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        _wait_or_kill(self._process, timeout_s)
         self._listener.join()
 
     def _send(self, line: str) -> None:
@@ -78,13 +103,26 @@ class Child:
     def _listen(self) -> None:
         with self._stdout:
             for line in self._stdout:
+                if not line.endswith(b"\n"):
+                    break  # it was killed while it spoke
                 self._on_news(news_lines.validate_json(line))
-        self._on_exit(self._verdict(self._process.wait()))
+        code = self._process.wait()
+        with self._writing:
+            self._stdin.close()
+        self._on_exit(self._verdict(code))
 
     def _verdict(self, code: int) -> str | None:
         if code == 0:
             return None
         if code < 0:
             return f"the {self.role} worker was killed by signal {-code}"
-        lines = self._log.read_text(errors="replace").strip().splitlines()
+        lines = self._log.read_text(errors="replace").strip().splitlines() if self._log.exists() else []
         return f"the {self.role} worker failed with exit code {code}: {lines[-1] if lines else 'it left no word'}"
+
+
+def _wait_or_kill(process: subprocess.Popen[bytes], timeout_s: float) -> None:
+    try:
+        process.wait(timeout_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

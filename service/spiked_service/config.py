@@ -100,7 +100,7 @@ class Settings(BaseSettings):
         1,
         ge=1,
         le=64,
-        description="Reconstructions of recordings at a time; live ones come on top.",
+        description="Reconstructions at a time; live ones count, but never wait.",
         json_schema_extra=_LIVE,
     )
     retention_days: float | None = Field(

@@ -13,13 +13,14 @@ from types import FrameType
 import uvicorn
 
 from spiked.errors import ConfigurationError, SpikedError
+from spiked_service.api.announce import BusAnnouncer
 from spiked_service.api.app import create_app
 from spiked_service.api.services import Services
-from spiked_service.captures import Captures
 from spiked_service.commands.version import installed_version
 from spiked_service.config import Settings
 from spiked_service.events import Bus
 from spiked_service.health import Health, Pulse, failed
+from spiked_service.keeping import Keeping
 from spiked_service.live import LiveSettings
 from spiked_service.logs import configure_logs, logger, set_level
 from spiked_service.runtime import RuntimeFolder
@@ -57,8 +58,10 @@ class Daemon:
             health = Health()
             self.pulse = Pulse()
             health.add("event loop", self.pulse.check, life=True)
-            captures = Captures(self._folder.path)
-            ends.callback(captures.close)
+            keeping = Keeping(now.data, BusAnnouncer(bus))
+            ends.callback(keeping.close)
+            health.add("catalogue", keeping.check_catalogue)
+            health.add("disk", keeping.check_disk)
             endpoints = None
             if now.zmq:
                 port = self.port + 1 if now.zmq_port is None and now.port else now.zmq_port or 0
@@ -66,7 +69,7 @@ class Daemon:
                 ends.callback(zmq.close)
                 health.add("zmq", zmq.check, life=True)
                 endpoints = zmq.endpoints
-            self.services = Services(settings, tokens, captures, bus, health, zmq=endpoints)
+            self.services = Services(settings, tokens, keeping, bus, health, zmq=endpoints)
             self._config = self._server_config(now)
             self._ends = ends.pop_all()
 

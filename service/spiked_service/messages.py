@@ -7,42 +7,77 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, Field, TypeAdapter
 
 from spiked.recon import State
-from spiked.sensor import Intrinsics
+from spiked.sensor import Intrinsics, Sensor
+from spiked_service.payloads import PosePayload
+from spiked_service.reconstruction_options import ReconstructionOptions
+
+
+class Role(StrEnum):
+    """What a worker process is for."""
+
+    ACQUISITION = "acquisition"
+    RECORDER = "recorder"
+    RECONSTRUCTION = "reconstruction"
+    PREVIEW = "preview"
 
 
 class AcquisitionOrder(BaseModel):
     """Move a source into a new ring."""
 
-    role: Literal["acquisition"] = "acquisition"
+    role: Literal[Role.ACQUISITION] = Role.ACQUISITION
     source: str
     ring_id: str
     frames: int | None
     seconds: float | None
     consumers: int
+    """Readers to wait for before the first frame."""
+    history_s: float
+    """What the ring shall hold for readers that begin in the past."""
+
+
+class RecorderOrder(BaseModel):
+    """Write what comes through a ring into a recording."""
+
+    role: Literal[Role.RECORDER] = Role.RECORDER
+    ring: str
+    path: Path
+    first_frame: int
+    """Index in the ring of the capture's first frame."""
+    stop_frame: int | None
+    """One past the index in the ring of its last frame; None: what the ring ends with."""
+    resume: bool
+    """Go on with what a killed recorder has left."""
+    intrinsics: Intrinsics | None
+    source: str
+    note: str
 
 
 class ReconstructionOrder(BaseModel):
-    """Reconstruct what comes through a ring, and publish it in a folder."""
+    """Reconstruct what comes through a ring, or lies in a recording, and publish it in a folder."""
 
-    role: Literal["reconstruction"] = "reconstruction"
-    ring: str
+    role: Literal[Role.RECONSTRUCTION] = Role.RECONSTRUCTION
+    ring: str | None
+    recording: Path | None
+    """Instead of a ring."""
     folder: Path
     unhurried: bool
     """The source waits for its consumers, so that there is time to map between frames."""
-    seed: int
-    steps: int
+    options: ReconstructionOptions
     intrinsics: Intrinsics | None
+    first_frame: int = 0
+    stop_frame: int | None = None
 
 
 class PreviewOrder(BaseModel):
-    """Keep a picture of the newest frames of a ring in a file."""
+    """Make pictures of the newest frames of a ring."""
 
-    role: Literal["preview"] = "preview"
+    role: Literal[Role.PREVIEW] = Role.PREVIEW
     ring: str
-    file: Path
+    thumbnail: Path | None
+    """Where to leave one of them."""
 
 
-Order = Annotated[AcquisitionOrder | ReconstructionOrder | PreviewOrder, Field(discriminator="role")]
+Order = Annotated[AcquisitionOrder | RecorderOrder | ReconstructionOrder | PreviewOrder, Field(discriminator="role")]
 STOP = "stop\n"
 """The order line that asks a worker to end in good order; the end of its stdin asks it to go at once."""
 
@@ -52,12 +87,27 @@ class RingOpened(BaseModel):
 
     news: Literal["ring_opened"] = "ring_opened"
     name: str
-    width: int
-    height: int
-    frame_rate_hz: float
+    sensor: Sensor
     frames: int | None
-    intrinsics: Intrinsics | None
     unhurried: bool
+
+
+class RecordingEnded(BaseModel):
+    """The recorder has closed its recording."""
+
+    news: Literal["recording_ended"] = "recording_ended"
+    frames: int
+    bytes: int
+    lost: dict[str, int]
+    """Frames, by cause."""
+    trouble: str
+    """What the disk refused; empty if nothing."""
+    dark: bool
+    """No pixel fired in any frame looked at."""
+    saturated: bool
+    """Every pixel fired in every frame looked at."""
+    died: bool
+    """The acquisition ended without a word."""
 
 
 class Stage(StrEnum):
@@ -83,6 +133,60 @@ class ReconstructionStatus(BaseModel):
     progress: float = Field(description="Share of the final refinement done, 0 to 1.")
     poses: int = Field(description="Frames that have a pose in the published trajectory.")
     version: int = Field(description="Number of the newest published scene and trajectory; 0: none yet.")
+    psnr_db: float | None = None
+    eta_s: float | None = None
+
+
+class Posed(BaseModel):
+    """One more view was tracked."""
+
+    news: Literal["pose"] = "pose"
+    pose: PosePayload
+
+
+class VersionPublished(BaseModel):
+    """A version lies in the folder."""
+
+    news: Literal["version"] = "version"
+    version: int
+    splats: int
+    poses: int
+    white: float
+    scene_bytes: int
+    psnr_db: float | None
+    kept: list[int]
+    """All versions that are still there."""
+
+
+class PreviewKind(StrEnum):
+    """What a live picture shows."""
+
+    INTERVAL = "interval"
+    """Charge between spikes: the least noisy picture of a moment."""
+    RATE = "rate"
+    """Plain counts of a moment."""
+    ACCUMULATION = "accumulation"
+    """Plain counts of the last second or so."""
+
+
+class PreviewTaken(BaseModel):
+    """Pictures of the newest frames."""
+
+    news: Literal["preview"] = "preview"
+    frame: int
+    """Index in the ring of the frame in the middle."""
+    width: int
+    height: int
+    white: dict[PreviewKind, float]
+    """Spikes a frame shown as white."""
+    images: dict[PreviewKind, str]
+    """WebP, base64."""
+    mean_rate: float
+    """Spikes a pixel and frame."""
+    rate_histogram: list[int]
+    """Pixels by rate, equal bins from 0 to 1 spike a frame."""
+    hot_pixels: list[tuple[int, int]]
+    """x, y of pixels that fire much more than those around them, at most 64."""
 
 
 class Refused(BaseModel):
@@ -92,6 +196,9 @@ class Refused(BaseModel):
     reason: str
 
 
-News = Annotated[RingOpened | ReconstructionStatus | Refused, Field(discriminator="news")]
+News = Annotated[
+    RingOpened | RecordingEnded | ReconstructionStatus | Posed | VersionPublished | PreviewTaken | Refused,
+    Field(discriminator="news"),
+]
 orders: TypeAdapter[Order] = TypeAdapter(Order)
 news_lines: TypeAdapter[News] = TypeAdapter(News)

@@ -2,46 +2,40 @@
 
 from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
 
-from spiked_service.captures import Captures
-from spiked_service.live import LiveSettings
+from spiked_service.keeping import Keeping
+from spiked_service.messages import Role
 from spiked_service.metrics import Reading, Readings
-from spiked_service.store.folder import default_folder
-from spiked_service.store.rows import Counters
 
 
-def readings_of(captures: Captures, settings: LiveSettings) -> Readings:
+def readings_of(keeping: Keeping) -> Readings:
     """Everything that `Metrics` asks for."""
     counted: set[str] = set()
+    captures, reconstructions = keeping.captures, keeping.reconstructions
 
     def running() -> Iterator[Reading]:
-        for capture in captures.all():
-            snapshot = capture.snapshot()
+        for snapshot in captures.recent():
+            over = snapshot.row.state.over
             if snapshot.counters is None or snapshot.id in counted:
                 continue
-            if snapshot.state.over:
+            if over:
                 counted.add(snapshot.id)
-            device = device_name(snapshot.plan.source)
-            yield Reading(snapshot.id, device, Counters.of(snapshot.counters), snapshot.state.over)
+            yield Reading(snapshot.id, device_name(snapshot.row.source), snapshot.counters, over)
 
     def workers() -> dict[str, int]:
-        return Counter(role for capture in captures.all() for role in capture.processes())
+        found = Counter(role for roles in captures.processes().values() for role in roles)
+        found[Role.RECONSTRUCTION] += len(reconstructions.processes())
+        return found
 
     return Readings(
         captures=running,
-        captures_by_state=lambda: Counter(str(capture.snapshot().state) for capture in captures.all()),
-        reconstructions_by_state=dict,
+        captures_by_state=captures.counts,
+        reconstructions_by_state=lambda: {str(state): count for state, count in reconstructions.counts().items()},
         workers_by_role=workers,
-        data=lambda: existing((settings.now.data or default_folder()).absolute()),
+        data=lambda: keeping.folder.path,
     )
 
 
 def device_name(source: str) -> str:
     """A source without its options, which may be different for every capture."""
     return source.partition("?")[0]
-
-
-def existing(folder: Path) -> Path:
-    """The folder, or the nearest above it that is there."""
-    return next(path for path in (folder, *folder.parents) if path.exists())

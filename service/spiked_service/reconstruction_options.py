@@ -3,6 +3,22 @@
 from pydantic import BaseModel, ConfigDict, Field
 
 from spiked.recon import Options
+from spiked.sensor import Intrinsics
+
+
+class IntrinsicsOption(BaseModel):
+    """A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    fx: float = Field(gt=0)
+    fy: float = Field(gt=0)
+    cx: float
+    cy: float
+
+    def intrinsics(self) -> Intrinsics:
+        """The same for the library."""
+        return Intrinsics(self.fx, self.fy, self.cx, self.cy)
 
 
 class ReconstructionOptions(BaseModel):
@@ -24,6 +40,10 @@ class ReconstructionOptions(BaseModel):
         default=400, ge=20, le=5000, description="Views kept for mapping; beyond it older ones thin out."
     )
     refine_poses: bool = Field(default=True, description="Whether the map corrects the trajectory.")
+
+    intrinsics: IntrinsicsOption | None = Field(
+        default=None, description="Optics, where neither the capture nor its recording says them, or to overrule them."
+    )
 
     def options(self) -> Options:
         """The same for the library."""

@@ -1,25 +1,20 @@
-"""A worker process: `python -m spiked_service.worker` takes one order from stdin and carries it out.
+"""A worker process: `python -m spiked_service.worker ROLE` takes one order from stdin and carries it out.
 
-The role in its arguments is for people who look at a list of processes.
+What its role needs is imported before the order comes, so that a worker can stand by and begin within milliseconds.
 """
 
+import importlib
 import os
+import select
 import sys
 import threading
-from typing import TextIO
+from collections.abc import Callable
+from typing import Any, TextIO
 
 from pydantic import BaseModel
 
 from spiked.errors import SpikedError
-from spiked_service.messages import (
-    STOP,
-    AcquisitionOrder,
-    Order,
-    PreviewOrder,
-    ReconstructionOrder,
-    Refused,
-    orders,
-)
+from spiked_service.messages import STOP, Refused, Role, orders
 
 _GRACE_S = 0.8
 """A worker that the service has left, or left alone, ends by itself within this time, whatever it is doing."""
@@ -31,6 +26,7 @@ class Link:
     def __init__(self, orders_in: TextIO, news_out: TextIO) -> None:
         self._orders = orders_in
         self._news = news_out
+        self._telling = threading.Lock()
         self.stop = threading.Event()
         """Set when the worker shall end in good order."""
         self.leave = threading.Event()
@@ -41,10 +37,18 @@ class Link:
     def tell(self, news: BaseModel) -> None:
         """Send news; a service that is gone does not hear it, and this worker is about to leave."""
         try:
-            self._news.write(news.model_dump_json() + "\n")
-            self._news.flush()
+            with self._telling:
+                self._news.write(news.model_dump_json() + "\n")
+                self._news.flush()
         except BrokenPipeError:
             self._abandon()
+
+    def mention(self, news: BaseModel) -> bool:
+        """Send news that another will follow, unless the service is slow to listen: then they are dropped."""
+        _, ready, _ = select.select([], [self._news], [], 0)
+        if ready:
+            self.tell(news)
+        return bool(ready)
 
     def _watch(self) -> None:
         for line in self._orders:
@@ -59,21 +63,11 @@ class Link:
         self.leave.set()
 
 
-def carry_out(order: Order, link: Link) -> None:
-    """Do what is ordered; each role's imports are its own, so that a worker loads only what it needs."""
-    match order:
-        case AcquisitionOrder():
-            from spiked_service.roles.acquisition import run_acquisition
-
-            run_acquisition(order, link)
-        case ReconstructionOrder():
-            from spiked_service.roles.reconstruction import run_reconstruction
-
-            run_reconstruction(order, link)
-        case PreviewOrder():
-            from spiked_service.roles.preview import run_preview
-
-            run_preview(order, link)
+def _carrier(role: Role) -> Callable[[Any, Link], None]:
+    """The function of a role, from a module that only workers of this role load."""
+    module = importlib.import_module(f"spiked_service.roles.{role}")
+    carrier: Callable[[Any, Link], None] = getattr(module, f"run_{role}")
+    return carrier
 
 
 def main() -> int:
@@ -81,9 +75,10 @@ def main() -> int:
     # Libraries may print: what they print belongs into the log, so the pipe of the news gets a descriptor of its own.
     news_out = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    carry_out = _carrier(Role(sys.argv[1]))
     line = sys.stdin.readline()
     if not line:
-        return 1
+        return 0  # it stood by and was not needed
     link = Link(sys.stdin, news_out)
     try:
         carry_out(orders.validate_json(line), link)

@@ -2,6 +2,6 @@
 
 from spiked.recon.odometry import State
 from spiked.recon.options import MapOptions, Options
-from spiked.recon.reconstructor import Reconstructor, Sample, Status
+from spiked.recon.reconstructor import Reconstructor, Sample, Status, Tracked
 
-__all__ = ["MapOptions", "Options", "Reconstructor", "Sample", "State", "Status"]
+__all__ = ["MapOptions", "Options", "Reconstructor", "Sample", "State", "Status", "Tracked"]

@@ -57,6 +57,26 @@ class Status:
 
 
 @dataclass(frozen=True)
+class Tracked:
+    """One view as it was tracked."""
+
+    time: float
+    """Middle of the view in frames."""
+    time_s: float
+    state: State
+    rotation: Array | None
+    """Camera to world, [3, 3]; None before the bootstrap and while lost."""
+    centre: Array | None
+    """[3], in the trajectory's unit."""
+    rate: float
+    """Mean spikes a pixel and frame."""
+    sigma_px: float | None = None
+    """Standard deviation of the pose in the image, where it is known."""
+    chi2: float | None = None
+    """Squared residual in units of its variance, where it is known."""
+
+
+@dataclass(frozen=True)
 class Sample:
     """One view's observed and rendered image [H, W, C], radiance, for people to compare."""
 
@@ -315,6 +335,21 @@ class Reconstructor:
         """Where the work stands."""
         o, m = self._odometry, self._mapper
         return Status(o.state, o.reason, self._stage, self._frames, len(m.scene), m.loss, self._version, self._progress)
+
+    def tracked(self, since: int = 0) -> list[Tracked]:
+        """The views tracked so far, in order, without the first `since`."""
+        rates = {view.time: float(view.rate.mean()) for view in self._views[-64:]}
+        return [
+            Tracked(
+                view.time,
+                view.time / self.sensor.frame_rate_hz,
+                view.state,
+                view.rotation,
+                None if view.centre is None else view.centre * self._unit,
+                rates.get(view.time, 0.0),
+            )
+            for view in self._odometry.views[since:]
+        ]
 
     def trajectory(self) -> Trajectory:
         """A pose for the middle of every frame whose surroundings were tracked; empty before the bootstrap."""

@@ -1,7 +1,7 @@
 """The reading end of a ring: one consumer in one process, which nobody waits for."""
 
 import time
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from types import TracebackType
 from typing import Self
 
@@ -65,7 +65,7 @@ class RingReader:
     Frames from before it attached that the ring no longer holds come as a gap too. Used by one thread.
     """
 
-    def __init__(self, segment: Segment, policy: Policy, consumer: str) -> None:
+    def __init__(self, segment: Segment, policy: Policy, consumer: str, start_frame: int | None = None) -> None:
         self._segment = segment
         self._control: Control = segment.control
         self._policy = policy
@@ -75,24 +75,33 @@ class RingReader:
         self._held: Frames | None = None
         self._end: End | None = None
         writer = self._control.writer()
-        self._counters.next_entry = self._position_to_take(writer)
+        self._counters.next_entry = (
+            self._position_to_take(writer) if start_frame is None else self._position_of(start_frame, writer)
+        )
         self._counters.next_slot = self._slot_of(self._counters.next_entry, writer)
         self._start = self._counters.next_entry  # what lies before was missed by joining late, not by being slow
         self._owner = own_identity()
         self._place = self._claim_place(consumer)
 
     @classmethod
-    def attach(cls, name: str, policy: Policy, consumer: str) -> Self:
+    def attach(cls, name: str, policy: Policy, consumer: str, start_frame: int | None = None) -> Self:
         """Read the ring of that name; `consumer` is shown in the ring's status.
 
+        With `start_frame` the first frames are those of the block that holds it, if the ring still has them and the
+        policy lets a reader lag so far; without, those that are a good distance from being overwritten.
         Raises RingError if there is no such ring or no place for another reader.
         """
-        return cls(attach_segment(name), policy, consumer)
+        return cls(attach_segment(name), policy, consumer, start_frame)
 
     @property
     def geometry(self) -> Geometry:
         """Sensor, number of slots, and frames a slot."""
         return self._segment.geometry
+
+    @property
+    def overruns(self) -> int:
+        """How often it fell behind and lost frames that the writer had published."""
+        return int(self._counters.overruns)
 
     def next(self, timeout_s: float) -> Item | None:
         """The next item, or None if none comes in time. After the end, the end again.
@@ -215,6 +224,23 @@ class RingReader:
         candidates = range(oldest, writer.entries)
         index = bisect_left(candidates, target_slot, key=lambda p: self._slot_of(p, writer))
         return candidates[min(index, len(candidates) - 1)]
+
+    def _position_of(self, frame: int, writer: WriterCounters) -> int:
+        """Position of the newest entry that begins at or before a frame, or of the oldest that the ring still holds."""
+        candidates = range(max(0, writer.entries - self.geometry.log_places // 2), writer.entries)
+
+        def first(position: int) -> int:
+            entry = self._control.read_entry(position)
+            return -1 if entry is None else int(entry.first)
+
+        position = max(candidates.start, candidates.start + bisect_right(candidates, frame, key=first) - 1)
+        while position < writer.entries and not self._has(position):
+            position += 1
+        return position
+
+    def _has(self, position: int) -> bool:
+        entry = self._control.read_entry(position)
+        return entry is not None and (entry.cause != 0 or self._holds(entry.slot))
 
     def _slot_of(self, position: int, writer: WriterCounters) -> int:
         """Number of the slot at or after this entry; if it is overwritten, a number older than any lease."""

@@ -94,6 +94,15 @@ class Ring:
         """Counters of the writer and of every reader."""
         return read_status(self._segment)
 
+    def bury(self, consumer: str) -> None:
+        """Take dead readers of that name off the list, so that no writer holds frames for a successor."""
+        for index in range(READER_PLACES):
+            place = self._segment.control.place(index)
+            owner = place.owner()
+            if owner and not is_alive(owner) and place.label()[2].decode(errors="ignore") == consumer:
+                place.claim(owner, 0)
+        self._segment.control.progress.ring()
+
 
 def read_places(segment: Segment) -> Iterator[ReaderPlace]:
     """The readers that attached and did not detach, dead ones too until another takes their place."""

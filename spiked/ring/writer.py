@@ -27,8 +27,10 @@ class RingWriter:
     the ring), as asynchronous transfers need, and are committed in the order of acquisition.
     """
 
-    def __init__(self, segment: Segment) -> None:
+    def __init__(self, segment: Segment, mourning_s: float = 0.0) -> None:
         self._segment = segment
+        self._mourning_s = mourning_s
+        self._dead_since: dict[int, float] = {}
         self._control = segment.control
         self._counters = WriterCounters()
         self._reserved = 0
@@ -36,9 +38,18 @@ class RingWriter:
 
     @classmethod
     def create(
-        cls, sensor: Sensor, *, slots: int | None = None, block_frames: int = 8, ring_id: str | None = None
+        cls,
+        sensor: Sensor,
+        *,
+        slots: int | None = None,
+        block_frames: int = 8,
+        ring_id: str | None = None,
+        mourning_s: float = 0.0,
     ) -> Self:
         """A new ring `spiked-<ring_id>` for compact frames of that sensor; without `slots`, of about DEFAULT_BYTES.
+
+        A writer that waits for room waits for a reader that was killed, too, for `mourning_s`: for its successor, who
+        can then go on where it stopped.
 
         Raises RingError if the name is taken, the sizes are not possible, or there is too little shared memory.
         """
@@ -49,7 +60,7 @@ class RingWriter:
             )
         compact = sensor.compact()
         count = max(MIN_SLOTS, DEFAULT_BYTES // (block_frames * compact.frame_bytes)) if slots is None else slots
-        return cls(create_segment(Geometry(compact, count, block_frames), ring_id))
+        return cls(create_segment(Geometry(compact, count, block_frames), ring_id), mourning_s)
 
     @property
     def name(self) -> str:
@@ -106,7 +117,10 @@ class RingWriter:
 
     def has_room(self) -> bool:
         """Whether another slot can be acquired without any lossless or priority reader losing frames."""
-        return not any(self._holds_back(reader) and is_alive(reader.owner) for reader in read_places(self._segment))
+        return not any(
+            self._holds_back(reader) and (is_alive(reader.owner) or self._mourns(reader.owner))
+            for reader in read_places(self._segment)
+        )
 
     def wait_for_room(self, timeout_s: float) -> bool:
         """Wait for `has_room`; for sources that can wait, as a recording can, and a camera cannot."""
@@ -147,6 +161,10 @@ class RingWriter:
             self._reserved - counters.next_slot >= reader.lease_slots
             or self._counters.entries - counters.next_entry >= self.geometry.log_places // 2
         )
+
+    def _mourns(self, owner: int) -> bool:
+        now_s = time.monotonic()
+        return self._mourning_s > 0 and now_s - self._dead_since.setdefault(owner, now_s) < self._mourning_s
 
     def _append(self, entry: Entry) -> None:
         self._control.write_entry(self._counters.entries, entry)

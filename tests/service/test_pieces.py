@@ -10,7 +10,7 @@ from spiked_service.captures import unhurried
 from spiked_service.ids import new_id
 from spiked_service.images import ImageFormat, encode
 from spiked_service.offline import Piece, pieces
-from spiked_service.publication import Publisher, newest
+from spiked_service.publication import Publisher, at, newest, versions
 
 from spiked.recording import RecordingWriter, open_recording
 from spiked.scene import Scene
@@ -48,14 +48,19 @@ def test_a_reader_of_an_older_index_still_finds_its_files(tmp_path: Path) -> Non
     assert newest(tmp_path) is None
     trajectory = Trajectory(np.array([0.5]), np.eye(3)[None], np.zeros((1, 3)))
     seen = []
-    for white in (0.1, 0.2, 0.3, 0.4, 0.5):
-        publisher.publish(Scene.empty(1), trajectory, white)
-        published = newest(tmp_path)
-        assert published is not None and published.white == white
+    for number in range(1, 61):
+        published = publisher.publish(Scene.empty(1), trajectory, white=0.1 * number)
+        assert newest(tmp_path) == published
         seen.append(published)
-        assert all((tmp_path / old.scene).exists() and (tmp_path / old.trajectory).exists() for old in seen[-2:])
-    assert [published.version for published in seen] == [1, 2, 3, 4, 5]
-    assert not (tmp_path / seen[0].scene).exists()
+        assert all((tmp_path / old.scene).exists() and (tmp_path / old.trajectory).exists() for old in seen[-3:])
+    kept = versions(tmp_path)
+    assert [one.version for one in kept] == publisher.kept
+    assert len(kept) <= 35 and kept[0].version == 1 and kept[-1].version == 60
+    assert at(tmp_path, kept[5].version) == kept[5]
+    assert at(tmp_path, 2) is None
+    files = {path.name for path in tmp_path.iterdir()}
+    assert files == {name for one in kept for name in (one.scene, one.trajectory)} | {"published.json"}
+    assert Publisher(tmp_path).publish(Scene.empty(1), trajectory, 0.1).version == 61
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ def create_app(services: Services) -> FastAPI:
     describe(app)
     install(app)
     api = APIRouter(prefix="/api/v1")
-    api.include_router(capture_routes(services.captures, ViewRenderer(services.renders)))
+    api.include_router(capture_routes(services.captures, services.reconstructions, ViewRenderer(services.renders)))
     api.include_router(event_routes(services.bus, services.event_clients))
     api.include_router(operations_routes(services))
 

@@ -1,5 +1,6 @@
 """The routes of captures: start, stop, look at, and take away what they have produced."""
 
+import base64
 from enum import StrEnum
 from http import HTTPStatus
 from pathlib import Path
@@ -14,10 +15,14 @@ from spiked.render import Camera
 from spiked.trajectory import Trajectory
 from spiked_service.api.old_schemas import CaptureOut, CaptureRequest, TrajectoryOut, ViewRequest
 from spiked_service.api.problems import NotReadyError, Problem
-from spiked_service.capture import Capture, Plan
 from spiked_service.captures import Captures, unhurried
 from spiked_service.images import ImageFormat, encode
+from spiked_service.messages import PreviewKind
 from spiked_service.publication import Published, newest
+from spiked_service.reconstruction_options import ReconstructionOptions
+from spiked_service.reconstructions import Reconstructions
+from spiked_service.snapshot import Snapshot
+from spiked_service.store.rows import Plan
 from spiked_service.views import Pose, ViewRenderer
 
 
@@ -41,7 +46,7 @@ _NOT_FOUND: _Responses = {404: {**_PROBLEM, "description": "No such capture, or 
 _PICTURES: dict[str, Any] = {"image/png": {}, "image/x-exr": {}}
 
 
-def capture_routes(captures: Captures, views: ViewRenderer) -> APIRouter:
+def capture_routes(captures: Captures, reconstructions: Reconstructions, views: ViewRenderer) -> APIRouter:
     """Routes below `captures`. Plain functions: they run on threads, the event loop only passes requests on."""
     router = APIRouter(prefix="/captures", tags=["captures"])
 
@@ -52,30 +57,28 @@ def capture_routes(captures: Captures, views: ViewRenderer) -> APIRouter:
             source=unhurried(request.source),
             frames=request.frames,
             seconds=request.seconds,
-            seed=request.seed,
-            steps=request.steps,
+            options=ReconstructionOptions(seed=request.seed, steps=request.steps),
             intrinsics=request.intrinsics.intrinsics() if request.intrinsics else None,
         )
         capture = captures.start(plan)
         response.headers["Location"] = str(http.url_for("get_capture", capture_id=capture.id))
-        return CaptureOut.of(capture.snapshot())
+        return CaptureOut.shown(capture)
 
     @router.get("")
     def list_captures() -> list[CaptureOut]:
         """All captures since the service was started, oldest first."""
-        return [CaptureOut.of(capture.snapshot()) for capture in captures.all()]
+        return [CaptureOut.shown(captures.snapshot(row)) for row in reversed(captures.list().items)]
 
     @router.get("/{capture_id}", responses=_NOT_FOUND)
     def get_capture(capture_id: str) -> CaptureOut:
         """State, counters and reconstruction of a capture."""
-        return CaptureOut.of(captures.get(capture_id).snapshot())
+        return CaptureOut.shown(captures.get(capture_id))
 
     @router.post("/{capture_id}:stop", status_code=HTTPStatus.ACCEPTED, responses=_NOT_FOUND)
     def stop_capture(capture_id: str) -> CaptureOut:
         """End the acquisition and refine what there is; asked again, end the refinement too."""
-        capture = captures.get(capture_id)
-        capture.stop()
-        return CaptureOut.of(capture.snapshot())
+        capture = captures.stop(capture_id)
+        return CaptureOut.shown(capture)
 
     @router.get("/{capture_id}/trajectory", responses=_NOT_FOUND, response_model=TrajectoryOut)
     def get_trajectory(
@@ -85,11 +88,11 @@ def capture_routes(captures: Captures, views: ViewRenderer) -> APIRouter:
     ) -> Response:
         """The newest trajectory, as JSON or as a TUM file."""
         capture = captures.get(capture_id)
-        published = _published(capture)
+        folder, published = _published(capture, reconstructions)
         etag = _etag(published, format)
         if if_none_match == etag["ETag"]:
             return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=etag)
-        path = capture.folder / published.trajectory
+        path = folder / published.trajectory
         if format is TrajectoryFormat.TUM:
             return Response(path.read_bytes(), media_type="text/plain; charset=utf-8", headers=etag)
         body = _trajectory(path, published.version).model_dump_json()
@@ -107,12 +110,12 @@ def capture_routes(captures: Captures, views: ViewRenderer) -> APIRouter:
     ) -> Response:
         """The newest scene as a 3DGS PLY; its ETag changes with the version."""
         capture = captures.get(capture_id)
-        published = _published(capture)
+        folder, published = _published(capture, reconstructions)
         etag = _etag(published, format)
         if if_none_match == etag["ETag"]:
             return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=etag)
         headers = {**etag, "Content-Disposition": f'attachment; filename="{published.scene}"'}
-        content = (capture.folder / published.scene).read_bytes()
+        content = (folder / published.scene).read_bytes()
         return Response(content, media_type="application/octet-stream", headers=headers)
 
     @router.post(
@@ -128,34 +131,37 @@ def capture_routes(captures: Captures, views: ViewRenderer) -> APIRouter:
     ) -> Response:
         """The newest scene from a pose, as PNG, or as EXR with radiance in spikes a frame."""
         capture = captures.get(capture_id)
-        published = _published(capture)
+        folder, published = _published(capture, reconstructions)
         kind = format or (ImageFormat.EXR if ImageFormat.EXR.media_type in accept else ImageFormat.PNG)
         rotation, centre = request.pose()
-        image = views.render(capture.folder / published.scene, _camera(capture, request), Pose(rotation, centre))
+        image = views.render(folder / published.scene, _camera(capture, request), Pose(rotation, centre))
         picture = encode(image.values, kind, request.white or published.white)
         return Response(picture, media_type=kind.media_type, headers={"X-Scene-Version": str(published.version)})
 
     @router.get(
         "/{capture_id}/preview",
-        responses={**_NOT_FOUND, 200: {"content": {"image/png": {}}}},
+        responses={**_NOT_FOUND, 200: {"content": {"image/webp": {}}}},
         response_class=Response,
     )
     def get_preview(capture_id: str) -> Response:
-        """The newest frames as a rate image, PNG."""
-        try:
-            content = captures.get(capture_id).preview.read_bytes()
-        except FileNotFoundError as error:
-            raise NotReadyError(f"capture {capture_id} has no live picture yet; ask again in a moment") from error
-        return Response(content, media_type="image/png", headers={"Cache-Control": "no-store"})
+        """The newest frames as a picture, WebP."""
+        captures.get(capture_id)
+        picture = captures.picture(capture_id)
+        if picture is None:
+            raise NotReadyError(f"capture {capture_id} has no live picture yet; ask again in a moment")
+        content = base64.b64decode(picture.images[PreviewKind.INTERVAL])
+        return Response(content, media_type="image/webp", headers={"Cache-Control": "no-store"})
 
     return router
 
 
-def _published(capture: Capture) -> Published:
-    published = newest(capture.folder)
-    if published is None:
-        raise NotReadyError(f"capture {capture.id} has no trajectory yet; its reconstruction says how far it is")
-    return published
+def _published(capture: Snapshot, reconstructions: Reconstructions) -> tuple[Path, Published]:
+    for row in reversed(capture.reconstructions):
+        folder = reconstructions.folder(row.id)
+        published = newest(folder)
+        if published is not None:
+            return folder, published
+    raise NotReadyError(f"capture {capture.id} has no trajectory yet; its reconstruction says how far it is")
 
 
 def _etag(published: Published, kind: StrEnum) -> dict[str, str]:
@@ -172,13 +178,12 @@ def _trajectory(path: Path, version: int) -> TrajectoryOut:
     )
 
 
-def _camera(capture: Capture, request: ViewRequest) -> Camera:
-    snapshot = capture.snapshot()
-    ring = snapshot.ring
+def _camera(capture: Snapshot, request: ViewRequest) -> Camera:
+    sensor = capture.row.sensor
     k = request.intrinsics.intrinsics() if request.intrinsics else None
-    if ring is None:
+    if sensor is None:
         raise NotReadyError(f"capture {capture.id} has not opened its source yet")
-    k = k or snapshot.plan.intrinsics or ring.intrinsics
+    k = k or sensor.intrinsics
     if k is None:
         raise ConfigurationError("the optics of this capture are not known; give intrinsics")
-    return Camera(k, request.width or ring.width, request.height or ring.height)
+    return Camera(k, request.width or sensor.width, request.height or sensor.height)

@@ -1,6 +1,5 @@
 """What goes over HTTP, with an example of each."""
 
-from datetime import datetime
 from typing import Self
 
 import numpy as np
@@ -8,10 +7,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from spiked.pose import rotation_of
-from spiked.ring import Policy
 from spiked.sensor import Intrinsics
-from spiked_service.capture import CaptureState, Snapshot
-from spiked_service.messages import ReconstructionStatus
+from spiked_service.api.schemas.captures import CaptureOut as NewCaptureOut
+from spiked_service.api.schemas.reconstructions import ReconstructionOut
+from spiked_service.snapshot import Snapshot
 
 Array = NDArray[np.float64]
 
@@ -62,104 +61,18 @@ class CaptureRequest(_Schema):
         return self
 
 
-class SensorOut(BaseModel):
-    """The camera of a capture."""
+class CaptureOut(NewCaptureOut):
+    """A capture with its newest reconstruction."""
 
-    width: int
-    height: int
-    frame_rate_hz: float
-    frames: int | None = Field(description="Length of the capture if it is known.")
-    intrinsics: IntrinsicsModel | None
-
-
-class ConsumerOut(BaseModel):
-    """One reader of the ring."""
-
-    name: str
-    policy: Policy = Field(description="latest skips frames by intention; the others want them all.")
-    received: int
-    lost: int
-    lag_frames: int
-    fill: float = Field(description="Its lag as a part of what it may lag; at 1 it loses frames.")
-    lagging: bool
-
-
-class CountersOut(BaseModel):
-    """Frames of a capture; received + lost is the index of the next frame."""
-
-    device: str = Field(description="State of the device, with its reason.")
-    received: int
-    lost: dict[str, int] = Field(description="By cause: device, usb, ring, disk.")
-    next_frame: int
-    consumers: list[ConsumerOut]
-
-
-class CaptureOut(BaseModel):
-    """A capture."""
-
-    id: str = Field(description="UUID version 7: ids sort by time.")
-    source: str
-    started: datetime
-    state: CaptureState
-    reason: str = Field(description="Why, if the capture has failed or is about to.")
-    warnings: list[str]
-    sensor: SensorOut | None
-    counters: CountersOut | None
-    reconstruction: ReconstructionStatus | None
+    reconstruction: ReconstructionOut | None
 
     @classmethod
-    def of(cls, snapshot: Snapshot) -> "CaptureOut":
+    def shown(cls, snapshot: Snapshot) -> "CaptureOut":
         """A snapshot as it is shown."""
-        return cls(
-            id=snapshot.id,
-            source=snapshot.plan.source,
-            started=snapshot.started,
-            state=snapshot.state,
-            reason=snapshot.reason,
-            warnings=list(snapshot.warnings),
-            sensor=_sensor(snapshot),
-            counters=_counters(snapshot),
-            reconstruction=snapshot.reconstruction,
-        )
-
-
-def _sensor(snapshot: Snapshot) -> SensorOut | None:
-    ring = snapshot.ring
-    if ring is None:
-        return None
-    k = snapshot.plan.intrinsics or ring.intrinsics
-    return SensorOut(
-        width=ring.width,
-        height=ring.height,
-        frame_rate_hz=ring.frame_rate_hz,
-        frames=ring.frames,
-        intrinsics=None if k is None else IntrinsicsModel(fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy),
-    )
-
-
-def _counters(snapshot: Snapshot) -> CountersOut | None:
-    counters = snapshot.counters
-    if counters is None:
-        return None
-    writer, condition = counters.writer, counters.writer.condition
-    return CountersOut(
-        device=f"{condition.state}: {condition.reason}" if condition.reason else str(condition.state),
-        received=writer.committed,
-        lost={str(cause): count for cause, count in writer.lost.items()},
-        next_frame=writer.next_frame,
-        consumers=[
-            ConsumerOut(
-                name=reader.consumer,
-                policy=reader.policy,
-                received=reader.received,
-                lost=reader.lost,
-                lag_frames=reader.lag_frames,
-                fill=reader.fill,
-                lagging=reader.lagging,
-            )
-            for reader in counters.readers
-        ],
-    )
+        ids = [row.id for row in snapshot.reconstructions]
+        base = NewCaptureOut.of(snapshot.row, snapshot.counters, ids)
+        newest = snapshot.reconstructions[-1] if snapshot.reconstructions else None
+        return cls(**vars(base), reconstruction=ReconstructionOut.of(newest) if newest else None)
 
 
 class TrajectoryOut(BaseModel):

@@ -17,8 +17,6 @@ from spiked_service.api.services import Services
 from spiked_service.commands.version import installed_version
 from spiked_service.config import Origin, field, reloadable
 from spiked_service.health import Finding, Verdict, failed
-from spiked_service.readings import existing
-from spiked_service.store.folder import default_folder
 
 
 class FindingOut(BaseModel):
@@ -140,14 +138,14 @@ def operations_routes(services: Services) -> APIRouter:
     @router.get("/system", responses=problems())
     def get_system() -> SystemOut:
         """Version, uptime, disk and memory."""
-        folder = (services.settings.now.data or default_folder()).absolute()
-        stat = os.statvfs(existing(folder))
+        folder = services.keeping.folder
+        space = folder.space()
         return SystemOut(
             version=installed_version(),
             started_at=started_at,
             uptime_s=time.monotonic() - started_s,
-            data_folder=str(folder),
-            disk=DiskOut(free_bytes=stat.f_bavail * stat.f_frsize, total_bytes=stat.f_blocks * stat.f_frsize),
+            data_folder=str(folder.path),
+            disk=DiskOut(free_bytes=space.free_bytes, total_bytes=space.total_bytes),
             memory_bytes=resident_bytes(),
             pid=os.getpid(),
             events_seq=services.bus.seq,

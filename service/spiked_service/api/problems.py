@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
 
 from spiked.errors import SpikedError
-from spiked_service.captures import BusyError, UnknownCaptureError
+from spiked_service.errors import BusyError
 from spiked_service.limits import OverloadedError
 from spiked_service.store.catalogue import StoreError, UnknownIdError
 
@@ -62,7 +62,6 @@ class KeyReusedError(SpikedError):
 
 
 _STATUS: dict[type[SpikedError], HTTPStatus] = {
-    UnknownCaptureError: HTTPStatus.NOT_FOUND,
     UnknownIdError: HTTPStatus.NOT_FOUND,
     NotReadyError: HTTPStatus.NOT_FOUND,
     GoneError: HTTPStatus.NOT_FOUND,

@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 from spiked.recon import State
-from spiked_service.capture import CaptureState, Plan, Snapshot
 from spiked_service.captures import Captures, unhurried
 from spiked_service.commands.fault_flags import Corrupt, Drop, Gap, Stall, UnplugAt, with_faults
 from spiked_service.config import LogFormat, LogLevel, setting
@@ -17,6 +16,8 @@ from spiked_service.console import output
 from spiked_service.daemon import Daemon
 from spiked_service.geometry import parse_intrinsics
 from spiked_service.live import LiveSettings
+from spiked_service.snapshot import Snapshot
+from spiked_service.store.rows import CaptureState, Plan
 
 _FOLLOW_S = 2.0
 
@@ -95,8 +96,8 @@ def _followed(captures: Captures) -> Iterator[None]:
     def follow() -> None:
         last = ""
         while not over.wait(_FOLLOW_S):
-            for capture in captures.all()[-1:]:
-                line = _line(capture.snapshot())
+            for row in captures.list(limit=1).items:
+                line = _line(captures.snapshot(row))
                 if line != last:
                     output.print(line, markup=False)
                     last = line
@@ -112,11 +113,12 @@ def _followed(captures: Captures) -> Iterator[None]:
 
 def _line(snapshot: Snapshot) -> str:
     """How a capture stands, in one line."""
-    status = snapshot.reconstruction
-    if status is None or snapshot.state is CaptureState.FAILED:
-        return f"{snapshot.state}  {snapshot.reason}".rstrip()
-    loss = "" if status.loss is None else f"  loss {status.loss:.1e}"
-    left = f"  {100 * status.progress:.0f} % refined" if snapshot.state is CaptureState.FINISHING else ""
-    growth = f"{status.frames} frames  {status.poses} poses  {status.splats} splats"
-    why = "" if status.state is State.TRACK or not status.reason else f"  ({status.reason})"
-    return f"{snapshot.state}  {status.state}{why}  {growth}{loss}  version {status.version}{left}"
+    row = snapshot.row
+    if not snapshot.reconstructions or row.state is CaptureState.FAILED:
+        return f"{row.state}  {row.reason}".rstrip()
+    job = snapshot.reconstructions[-1]
+    loss = "" if job.loss is None else f"  loss {job.loss:.1e}"
+    left = f"  {100 * job.progress:.0f} % refined" if row.state is CaptureState.FINISHING else ""
+    growth = f"{job.frames} frames  {job.poses} poses  {job.splats} splats"
+    why = "" if job.tracking_state is State.TRACK or not job.reason else f"  ({job.reason})"
+    return f"{row.state}  {job.tracking_state}{why}  {growth}{loss}  version {job.version}{left}"

@@ -1,1 +1,1 @@
-"""What the workers do: acquisition, reconstruction, preview, each in a process of its own."""
+"""What workers do: one module a role, with a function `run_ROLE`."""

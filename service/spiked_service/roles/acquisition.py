@@ -1,17 +1,25 @@
 """The acquisition worker: a source into a ring, and nothing else."""
 
 import logging
+import math
 
 from spiked_driver.acquisition import acquire
 from spiked_driver.realtime import take_priority
 from spiked_driver.spec import is_camera, open_source
 
 from spiked.ring import RingWriter
+from spiked.ring.writer import DEFAULT_BYTES
+from spiked.sensor import Sensor
 from spiked_service.messages import AcquisitionOrder, RingOpened
 from spiked_service.worker import Link
 
+_BLOCK_FRAMES = 8
 _SLOTS_UNHURRIED = 64
 """A source that waits stays this little ahead of the slowest consumer, so that what is seen live belongs together."""
+_MOURNING_S = 15.0
+"""A source that waits holds its frames so long for the successor of a consumer that was killed."""
+_HISTORY_SHARE = 0.4
+"""Part of the ring that a lossless reader may begin in the past; it may lag half of it."""
 
 
 def run_acquisition(order: AcquisitionOrder, link: Link) -> None:
@@ -19,15 +27,15 @@ def run_acquisition(order: AcquisitionOrder, link: Link) -> None:
     source = open_source(order.source)
     sensor = source.sensor
     limit = order.frames if order.seconds is None else max(1, round(order.seconds * sensor.frame_rate_hz))
-    with RingWriter.create(sensor, slots=_SLOTS_UNHURRIED if source.waits else None, ring_id=order.ring_id) as writer:
+    slots = _slots(sensor, order.history_s, source.waits)
+    with RingWriter.create(
+        sensor, slots=slots, block_frames=_BLOCK_FRAMES, ring_id=order.ring_id, mourning_s=_MOURNING_S
+    ) as writer:
         link.tell(
             RingOpened(
                 name=writer.name,
-                width=sensor.width,
-                height=sensor.height,
-                frame_rate_hz=sensor.frame_rate_hz,
+                sensor=sensor,
                 frames=limit if limit is not None else source.frames,
-                intrinsics=sensor.intrinsics,
                 unhurried=source.waits,
             )
         )
@@ -35,3 +43,12 @@ def run_acquisition(order: AcquisitionOrder, link: Link) -> None:
             for note in take_priority():
                 logging.getLogger(__name__).warning("%s", note)
         acquire(source, writer, link.stop, limit_frames=limit, consumers=order.consumers)
+
+
+def _slots(sensor: Sensor, history_s: float, waits: bool) -> int | None:
+    """Slots of the ring; None for the usual number."""
+    if waits and not history_s:
+        return _SLOTS_UNHURRIED
+    wanted = math.ceil(history_s * sensor.frame_rate_hz / _HISTORY_SHARE / _BLOCK_FRAMES)
+    usual = DEFAULT_BYTES // (_BLOCK_FRAMES * sensor.compact().frame_bytes)
+    return wanted if wanted > usual else None

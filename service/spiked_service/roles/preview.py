@@ -1,15 +1,19 @@
-"""The preview worker: the newest frames as a picture, as often as a person can see a difference."""
+"""The preview worker: the newest frames as pictures, as often as a person can see a difference."""
 
+import base64
+import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.blocks import aligned_window
+from spiked.blocks import Window, aligned_window
 from spiked.recon.mapping import fill_mosaic
 from spiked.ring import End, Frames, Gap, Policy, RingReader
-from spiked_service.images import ImageFormat, display_white, encode
-from spiked_service.messages import PreviewOrder
+from spiked.sensor import Sensor
+from spiked_service.images import display_white
+from spiked_service.messages import PreviewKind, PreviewOrder, PreviewTaken
 from spiked_service.publication import write_atomically
 from spiked_service.worker import Link
 
@@ -17,23 +21,35 @@ _BLOCKS = 4
 """Blocks of a picture; the nominal window leaves one at either end for the edge spikes."""
 _PERIOD_S = 0.15
 _WAIT_S = 0.1
+_BINS = 64
+_HOT_RATE = 0.3
+"""Spikes a frame that a hot pixel fires above the median of those around it."""
+_HOT_MOST = 64
+_MEMORY = 0.85
+"""What stays of the accumulated picture when another is added."""
+_THUMBNAIL_WIDTH = 200
+_QUALITY = 85
+
+Image = NDArray[np.float32]
 
 
 def run_preview(order: PreviewOrder, link: Link) -> None:
-    """Write the picture until the capture ends."""
+    """Make pictures until the capture ends."""
     with RingReader.attach(order.ring, Policy.LATEST, "preview") as reader:
+        painter = _Painter(reader.geometry.sensor, order.thumbnail)
+        block = reader.geometry.block_frames
         blocks: list[NDArray[np.uint8]] = []
         first = 0
         while not link.stop.is_set():
             item = reader.next(_WAIT_S)
             match item:
                 case End():
-                    return
+                    break
                 case Gap():
                     blocks.clear()
                 case Frames():
                     copied = np.array(item.data)
-                    if not item.release():
+                    if not item.release() or (blocks and item.count < block):
                         blocks.clear()
                         continue
                     first = first if blocks else item.first
@@ -41,14 +57,76 @@ def run_preview(order: PreviewOrder, link: Link) -> None:
                 case None:
                     continue
             if len(blocks) == _BLOCKS:
-                _write(np.concatenate(blocks), first, reader, order.file)
+                frames = np.concatenate(blocks)
+                if len(frames) > 2 * block:
+                    link.tell(painter.paint(frames, first, block))
                 blocks.clear()
                 link.leave.wait(_PERIOD_S)
+        painter.keep(replace=True)
 
 
-def _write(frames: NDArray[np.uint8], first: int, reader: RingReader, file: Path) -> None:
-    block, sensor = reader.geometry.block_frames, reader.geometry.sensor
-    window = aligned_window(frames, sensor, first, first + block, first + len(frames) - block)
-    channels = sensor.mosaic.channels(sensor.height, sensor.width) if sensor.mosaic else None
-    image = fill_mosaic(window.rate(fill=True), channels)
-    write_atomically(file, encode(image, ImageFormat.PNG, display_white(image)))
+class _Painter:
+    def __init__(self, sensor: Sensor, thumbnail: Path | None) -> None:
+        self._sensor = sensor
+        self._channels = sensor.mosaic.channels(sensor.height, sensor.width) if sensor.mosaic else None
+        self._thumbnail = thumbnail
+        self._accumulated: Image | None = None
+        self._newest: Image | None = None
+        self._kept_s: float | None = None
+
+    def paint(self, frames: NDArray[np.uint8], first: int, block: int) -> PreviewTaken:
+        """Pictures of compact frames uint8 [n, frame_bytes] from index `first` on."""
+        window = aligned_window(frames, self._sensor, first, first + block, first + len(frames) - block)
+        interval = window.rate(fill=True)
+        rate = window.count.astype(np.float32) / np.float32(window.end - window.begin)
+        old = rate if self._accumulated is None else self._accumulated
+        accumulated = (_MEMORY * old + (1 - _MEMORY) * rate).astype(np.float32)
+        self._accumulated = accumulated
+        self._newest = interval
+        self.keep(replace=False)
+        pictures: dict[PreviewKind, Image] = {
+            PreviewKind.INTERVAL: interval,
+            PreviewKind.RATE: rate,
+            PreviewKind.ACCUMULATION: accumulated,
+        }
+        shown = {kind: fill_mosaic(picture, self._channels) for kind, picture in pictures.items()}
+        white = {kind: display_white(picture) for kind, picture in shown.items()}
+        return PreviewTaken(
+            frame=(window.begin + window.end) // 2,
+            width=self._sensor.width,
+            height=self._sensor.height,
+            white=white,
+            images={kind: base64.b64encode(_webp(shown[kind], white[kind])).decode() for kind in shown},
+            mean_rate=float(rate.mean()),
+            rate_histogram=np.histogram(rate, _BINS, (0, 1))[0].tolist(),
+            hot_pixels=_hot(window),
+        )
+
+    def keep(self, *, replace: bool) -> None:
+        """Leave a thumbnail: of the first picture, and at last of the last one."""
+        if self._newest is None or self._thumbnail is None or (self._kept_s is not None and not replace):
+            return
+        self._kept_s = time.monotonic()
+        picture = fill_mosaic(self._newest, self._channels)
+        size = (_THUMBNAIL_WIDTH, max(1, _THUMBNAIL_WIDTH * picture.shape[0] // picture.shape[1]))
+        small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+        write_atomically(self._thumbnail, _webp(small, display_white(small)))
+
+
+def _webp(image: Image, white: float) -> bytes:
+    """Radiance [H, W] or [H, W, C], C 1 or 3 (RGB), as lossy WebP."""
+    pixels = (np.clip(np.nan_to_num(image) / white, 0, 1) * 255 + 0.5).astype(np.uint8)
+    if pixels.ndim == 3 and pixels.shape[2] == 3:
+        pixels = pixels[..., ::-1]
+    _, encoded = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
+    return encoded.tobytes()
+
+
+def _hot(window: Window) -> list[tuple[int, int]]:
+    """x, y of pixels that fire far more often than the median of their neighbours."""
+    frames = window.end - window.begin
+    rate = (window.count * (255.0 / frames)).clip(0, 255).astype(np.uint8)
+    excess = rate.astype(np.int16) - cv2.medianBlur(rate, 5)
+    rows, columns = np.nonzero(excess > _HOT_RATE * 255)
+    worst = np.argsort(-excess[rows, columns])[:_HOT_MOST]
+    return [(int(columns[k]), int(rows[k])) for k in worst]

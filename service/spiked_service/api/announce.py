@@ -1,0 +1,64 @@
+"""What the parts of the service tell of, put on the bus as the messages that everybody gets."""
+
+import base64
+import logging
+
+from spiked_service.api.schemas import CaptureOut, ReconstructionOut
+from spiked_service.events import Bus, Topic
+from spiked_service.logs import logger
+from spiked_service.messages import PreviewKind, PreviewTaken, VersionPublished
+from spiked_service.payloads import PosePayload, PreviewPayload, ScenePayload
+from spiked_service.snapshot import Snapshot
+from spiked_service.store.rows import ReconstructionRow
+
+_LOG = logger("spiked.service")
+_SHOWN = (PreviewKind.INTERVAL, PreviewKind.RATE)
+
+
+class BusAnnouncer:
+    """See `announcer.Announcer`."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+
+    def capture(self, snapshot: Snapshot) -> None:
+        """A capture has changed, or its counters have."""
+        ids = [row.id for row in snapshot.reconstructions]
+        self._bus.publish(Topic.CAPTURE, CaptureOut.of(snapshot.row, snapshot.counters, ids), capture_id=snapshot.id)
+
+    def job(self, row: ReconstructionRow) -> None:
+        """A reconstruction has changed."""
+        self._bus.publish(Topic.JOB, ReconstructionOut.of(row), row.capture_id, row.id)
+
+    def pose(self, row: ReconstructionRow, pose: PosePayload) -> None:
+        """A block was tracked."""
+        self._bus.publish(Topic.POSE, pose, row.capture_id, row.id)
+
+    def scene(self, row: ReconstructionRow, published: VersionPublished) -> None:
+        """A version was published."""
+        payload = ScenePayload(
+            version=published.version,
+            splats=published.splats,
+            psnr_db=published.psnr_db,
+            bytes=published.scene_bytes,
+        )
+        self._bus.publish(Topic.SCENE, payload, row.capture_id, row.id)
+
+    def preview(self, capture_id: str | None, taken: PreviewTaken) -> None:
+        """There are newer pictures."""
+        for kind in _SHOWN:
+            payload = PreviewPayload(
+                frame=taken.frame,
+                kind="interval" if kind is PreviewKind.INTERVAL else "rate",
+                width=taken.width,
+                height=taken.height,
+                image=base64.b64decode(taken.images[kind]),
+                rate_histogram=taken.rate_histogram,
+            )
+            self._bus.publish(Topic.PREVIEW, payload, capture_id)
+
+    def log(self, level: str, event: str, capture_id: str | None = None, reconstruction_id: str | None = None) -> None:
+        """Something a person should know; the log's lines go to the bus by themselves."""
+        ids = {"capture_id": capture_id, "reconstruction_id": reconstruction_id}
+        known = {name: value for name, value in ids.items() if value is not None}
+        _LOG.log(logging.getLevelNamesMapping()[level.upper()], event, **known)

@@ -1,0 +1,117 @@
+"""What is removed when, so that the disk does not fill."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Protocol
+
+from spiked_service.store.catalogue import Catalogue
+from spiked_service.store.folder import DataFolder
+from spiked_service.store.rows import CaptureRow
+
+_UPLOAD_DAYS = 1.0
+
+
+@dataclass(frozen=True)
+class Policy:
+    """Limits; None: none."""
+
+    days: float | None = None
+    """Captures older than this are removed, and can still be restored."""
+    bytes: int | None = None
+    """Captures and reconstructions together; beyond it the oldest go for good, removed ones first."""
+    deleted_days: float = 7.0
+    """Removed captures go for good after this time."""
+
+
+class Removing(Protocol):
+    """What retention may do to captures."""
+
+    def remove(self, capture_id: str) -> object:
+        """Hide it."""
+        ...
+
+    def purge(self, capture_id: str) -> None:
+        """Remove it for good."""
+        ...
+
+
+class Retention:
+    """Applies a policy. A capture that is marked to be kept, or not over, is left alone, unless a person removed it."""
+
+    def __init__(
+        self, folder: DataFolder, catalogue: Catalogue, captures: Removing, log: Callable[[str], None]
+    ) -> None:
+        self._folder = folder
+        self._catalogue = catalogue
+        self._captures = captures
+        self._log = log
+        self.policy = Policy()
+        """May be changed at any time."""
+
+    def apply(self, now: datetime | None = None) -> None:
+        """Remove what the policy does not let stay. Raises StoreError, and BusyError when a job is in the way."""
+        now = now or datetime.now(UTC)
+        policy = self.policy
+        rows = [row for row in self._catalogue.captures.where("1 ORDER BY id") if row.state.over]
+        for row in rows:
+            if row.deleted_at is not None and now - row.deleted_at >= timedelta(days=policy.deleted_days):
+                self._purge(row, f"it was removed {policy.deleted_days:g} days ago")
+            elif policy.days is not None and _disposable(row) and _age(row, now) > timedelta(days=policy.days):
+                self._captures.remove(row.id)
+                self._log(f"capture {row.id} was removed: it is older than {policy.days:g} days")
+        self._shrink(policy.bytes)
+        self._drop_uploads(now)
+
+    def used_bytes(self) -> dict[str, int]:
+        """Bytes on disk by capture, with its reconstructions."""
+        used = {row.id: _size(self._folder.capture(row.id)) for row in self._catalogue.captures.where()}
+        for row in self._catalogue.reconstructions.where():
+            used[row.capture_id] = used.get(row.capture_id, 0) + _size(self._folder.reconstruction(row.id))
+        return used
+
+    def _shrink(self, limit: int | None) -> None:
+        if limit is None:
+            return
+        used = self.used_bytes()
+        total = sum(used.values())
+        rows = [row for row in self._catalogue.captures.where("1 ORDER BY id") if row.state.over]
+        candidates = [row for row in rows if row.deleted_at] + [row for row in rows if _disposable(row)]
+        for row in candidates:
+            if total <= limit:
+                return
+            self._purge(row, f"all captures together are larger than {limit} bytes")
+            total -= used.get(row.id, 0)
+
+    def _purge(self, row: CaptureRow, why: str) -> None:
+        self._captures.purge(row.id)
+        self._log(f"capture {row.id} is gone: {why}")
+
+    def _drop_uploads(self, now: datetime) -> None:
+        for row in self._catalogue.uploads.where():
+            if row.capture_id is not None or now - row.updated_at > timedelta(days=_UPLOAD_DAYS):
+                self._catalogue.uploads.remove(row.id)
+        known = {row.id for row in self._catalogue.uploads.where()}
+        for upload_id in self._folder.contents()[2] - known:
+            for suffix in (".part", ".json"):
+                self._folder.upload(upload_id).with_suffix(suffix).unlink(missing_ok=True)
+
+
+def _disposable(row: CaptureRow) -> bool:
+    return not row.keep and row.deleted_at is None
+
+
+def _age(row: CaptureRow, now: datetime) -> timedelta:
+    return now - (row.ended_at or row.started_at)
+
+
+def _size(folder: Path) -> int:
+    """Bytes that the files below take on the disk."""
+    total = 0
+    for path in folder.rglob("*"):
+        try:
+            total += path.lstat().st_blocks * 512
+        except FileNotFoundError:
+            continue  # a running reconstruction lets go of versions
+    return total

@@ -1,0 +1,114 @@
+"""The whole way: a virtual camera on a mocked machine, the daemon, a capture over REST, bytes and a reconstruction."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from virtual_camera.host import CameraSettings
+from virtual_camera.rig import VirtualCameras
+
+from spiked.ring import End, Frames, Gap, Policy, RingReader
+from spiked.sensor import Sensor
+from spiked.simulate import SimulatedCamera
+from spiked.simulate.record import simulate
+
+RATE = 2000
+FRAMES = 1500
+FOV_DEG = 60.0
+PATIENCE_S = 120.0
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of a camera that moves through a room, as long as the captures here."""
+    folder = tmp_path_factory.mktemp("usb") / "room"
+    simulate(SimulatedCamera(Sensor(400, 250, 20_000.0), seed=3), folder, "room", FRAMES, views=2)
+    return folder / "room.dat"
+
+
+def wait_for(condition: Callable[[], Any], what: str) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s, f"not so within {PATIENCE_S:g} s: {what}"
+        time.sleep(0.05)
+
+
+def read_ring(capture_id: str) -> tuple[dict[int, NDArray[np.uint8]], list[Gap]]:
+    """Everything of a capture, from its first frame to its end, read beside the daemon."""
+    frames: dict[int, NDArray[np.uint8]] = {}
+    gaps: list[Gap] = []
+    with RingReader.attach(f"spiked-{capture_id}", Policy.LOSSLESS, "test") as reader:
+        deadline_s = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline_s:
+            match reader.next(0.2):
+                case Frames() as item:
+                    frames |= {item.first + k: frame.copy() for k, frame in enumerate(item.data)}
+                    assert item.release()
+                case Gap() as gap:
+                    gaps.append(gap)
+                case End():
+                    return frames, gaps
+    raise TimeoutError("the capture did not end")
+
+
+def sent(room: Path, number: int) -> NDArray[np.uint8]:
+    """A frame as the camera sent it: with its number in the first 8 bytes."""
+    frame = np.fromfile(room, np.uint8, 12_500, offset=number * 12_500)
+    frame[:8] = np.array([number], "<i8").view(np.uint8)
+    return frame
+
+
+def test_a_capture_over_rest_gets_every_frame_and_is_reconstructed(
+    cameras: Callable[..., VirtualCameras], daemon: Callable[..., Any], room: Path
+) -> None:
+    rig = cameras(CameraSettings(str(room), plugged=False))
+    http = daemon("--device", f"usb0?fov={FOV_DEG:g}&rate={RATE}", "--no-capture", seen=rig).http
+    device = http.get("devices").json()[0]
+    assert (device["source"], device["kind"]) == (f"usb0?fov={FOV_DEG:g}&rate={RATE}", "usb")
+    capture_id = http.post("captures", json={"source": device["source"], "frames": FRAMES, "steps": 20}).json()["id"]
+
+    def counters() -> dict[str, Any]:
+        return http.get(f"captures/{capture_id}").json().get("counters") or {}
+
+    wait_for(lambda: (counters().get("device") or "").startswith("absent"), "the daemon waits for the camera")
+    rig.plug()
+    wait_for(lambda: counters().get("received", 0) > 0, "frames come")
+    frames, gaps = read_ring(capture_id)
+    assert gaps == []
+    assert sorted(frames) == list(range(FRAMES))
+    for number, frame in frames.items():
+        np.testing.assert_array_equal(frame, sent(room, number))
+    wait_for(lambda: http.get(f"captures/{capture_id}").json()["state"] in ("complete", "failed"), "it ends")
+    capture = http.get(f"captures/{capture_id}").json()
+    assert (capture["state"], capture["reason"]) == ("complete", "")
+    assert capture["counters"]["received"] == FRAMES
+    assert sum(capture["counters"]["lost"].values()) == 0
+    assert capture["reconstruction"]["frames"] == FRAMES
+    assert capture["reconstruction"]["poses"] > 0.9 * FRAMES
+    assert capture["reconstruction"]["splats"] > 100
+
+
+def test_a_capture_goes_on_when_the_camera_is_back(
+    cameras: Callable[..., VirtualCameras], daemon: Callable[..., Any], room: Path
+) -> None:
+    rig = cameras(CameraSettings(str(room), rate_hz=RATE, buffer_frames=2 * RATE))
+    http = daemon("--device", f"usb0?fov={FOV_DEG:g}&rate={RATE}&transfer_kib=256", seen=rig).http
+    capture_id = http.get("captures").json()[0]["id"]
+
+    def counters() -> dict[str, Any]:
+        return http.get(f"captures/{capture_id}").json().get("counters") or {}
+
+    wait_for(lambda: counters().get("received", 0) > 100, "frames come")
+    rig.unplug()
+    wait_for(lambda: counters()["device"].startswith("absent"), "it is seen that the camera is gone")
+    before = counters()["received"]
+    rig.plug(port="2-5")
+    wait_for(lambda: counters()["received"] > before + 500, "frames come again")
+    after = counters()
+    assert after["device"].startswith("streaming")
+    assert after["lost"]["device"] > 0
+    assert after["received"] + sum(after["lost"].values()) == after["next_frame"]

@@ -43,14 +43,14 @@ struct Record {
     float p, q, r;
     float log2_opacity;
     float z;
-    float radius;   // px, largest half axis of the ellipse where alpha reaches 1/255
-    float half_y;   // px, of that ellipse's box
-    float extreme;  // px, where its rightmost point is above or below the mean; the leftmost is opposite
+    float radius;          // px, largest half axis of the ellipse where alpha reaches 1/255
+    float half_x, half_y;  // px, of that ellipse's box
+    float extreme;         // px, where its rightmost point is above or below the mean; the leftmost is opposite
     float over_p;
     float colour[3];
     uint32_t splat;
-    float unused;
 };
+constexpr int kRecordFields = 12;  // the first ones, which come from the projection
 static_assert(sizeof(Record) == 64, "a record is a cache line");
 
 // What a splat that crosses the image during a sub-frame adds to its record, whose ellipse then holds all of its path.
@@ -63,9 +63,9 @@ struct Motion {
     float unused[2];
 };
 
-// A splat seen by a tile. Slots are numbered by splat, so that a splat's sums lie together.
+// A splat seen by a tile.
 struct Entry {
-    uint32_t slot, rank, blocks;
+    uint32_t rank, blocks;
 };
 
 struct Pair {
@@ -175,7 +175,7 @@ struct Kernels {
     int (*emit)(const Record* records, int first, int last, const Lens&, int32_t* columns, const Pairs& out);
     void (*forward)(const Tile&, int colours, const float background[3], const Planes&, const TileState&, TileImage*);
     void (*store)(const Tile&, const TileImage*, int colours, const Planes&, float* values, float* alpha, float* depth);
-    // d_values [height][width] or [height][width][3]; slots are slot_floats(colours) floats each.
+    // d_values [height][width] or [height][width][3]; a slot for each entry of slot_floats(colours) floats.
     void (*backward)(const Tile&, int colours, const float* d_values, const Planes&, const TileState&, float* slots);
     // As project, for a camera on its way.
     void (*project_moving)(const Prepared&, const Lens&, const Passage&, int count, int first, int last,

@@ -137,7 +137,8 @@ static void project_moving(const Prepared& splats, const Lens& lens, const Passa
                           is_finite(determinant) & is_finite(radius) & (o.p > 0.0f) & is_finite(o.q) & (p > 0.0f) &
                           is_finite(q) & is_finite(s);
         const Int visible = inside & sound & (o.begin.z >= lens.near) & (o.end.z >= lens.near) & (reach >= 0.0f);
-        const Vec fields[11] = {o.u, o.v, p, q, r, rim - kLog2Cut, z, radius, half_y, xy / xx * half_x, 1.0f / p};
+        const Vec fields[kRecordFields] = {
+            o.u, o.v, p, q, r, rim - kLog2Cut, z, radius, half_x, half_y, xy / xx * half_x, 1.0f / p};
         write_records(fields, visible, base, count, records, keys);
         const Vec motion[6] = {o.p, o.q, o.r, log2_opacity, u_rate, w_rate};
         for (int k = 0; k < 6; ++k) store(out[k], motion[k]);

@@ -106,19 +106,19 @@ static inline Projection project_lanes(const Prepared& s, const Lens& lens, cons
 }
 
 // Writes kLanes records of splats that are seen, and their keys.
-static inline void write_records(const Vec fields[11], Int visible, int base, int count, Record* records,
+static inline void write_records(const Vec fields[kRecordFields], Int visible, int base, int count, Record* records,
                                  uint32_t* keys) {
-    alignas(64) float out[11][kLanes];
+    alignas(64) float out[kRecordFields][kLanes];
     alignas(64) int32_t seen[kLanes];
-    for (int k = 0; k < 11; ++k) store(out[k], fields[k]);
+    for (int k = 0; k < kRecordFields; ++k) store(out[k], fields[k]);
     __builtin_memcpy(seen, &visible, sizeof seen);
     for (int i = 0; i < kLanes && base + i < count; ++i) {
         keys[base + i] = kCulled;
         if (!seen[i]) continue;
         __builtin_memcpy(&keys[base + i], &out[6][i], 4);
-        // The fields are the record's first eleven floats, in order.
+        // The fields are the record's first floats, in order.
         float* record = &records[base + i].x;
-        for (int k = 0; k < 11; ++k) record[k] = out[k][i];
+        for (int k = 0; k < kRecordFields; ++k) record[k] = out[k][i];
     }
 }
 
@@ -138,8 +138,8 @@ static void project(const Prepared& splats, const Lens& lens, const View& view, 
                      (v - half_y <= lens.height - 0.5f);
         Int sound = is_finite(u + v) & is_finite(o.determinant) & is_finite(radius) & (o.p > 0.0f) & is_finite(o.q);
         Int visible = inside & sound & (o.z >= lens.near) & (reach >= 0.0f);
-        const Vec fields[11] = {u,         v, o.p, o.q, o.r, log2_opacity, o.z, radius, half_y, o.xy / o.xx * half_x,
-                                1.0f / o.p};
+        const Vec fields[kRecordFields] = {
+            u, v, o.p, o.q, o.r, log2_opacity, o.z, radius, half_x, half_y, o.xy / o.xx * half_x, 1.0f / o.p};
         write_records(fields, visible, base, count, records, keys);
     }
 }

@@ -18,6 +18,18 @@ struct Centres {
 };
 static constexpr Centres kCentres;
 
+// Offsets of the blocks of a tile.
+struct BlockCorners {
+    alignas(64) float x[kBlocks], y[kBlocks];
+    constexpr BlockCorners() : x(), y() {
+        for (int i = 0; i < kBlocks; ++i) {
+            x[i] = (float)(i % 4 * 4);
+            y[i] = (float)(i / 4 * 4);
+        }
+    }
+};
+static constexpr BlockCorners kBlockCorners;
+
 // What the inner loops read of an entry. u = p x + q y + s and w = r y + t for a pixel centre (x, y) in the tile.
 // While the camera moves, u is smaller by u_rate times the pixel's time, and w by w_rate times it.
 enum Local { kP, kQ, kS, kR, kT, kLog2Opacity, kZ, kC, kURate = kC + 3, kWRate };
@@ -172,19 +184,33 @@ static void forward_tile(const Tile& tile, const float background[3], const Plan
     }
 }
 
+static inline void copy_run(float* out, const float* in, int pixels) {
+    if (pixels == 4) {
+        __builtin_memcpy(out, in, 4 * sizeof(float));
+    } else {
+        for (int j = 0; j < pixels; ++j) out[j] = in[j];
+    }
+}
+
 static void store_tile(const Tile& tile, const TileImage* image, int colours, const Planes& planes, float* values,
                        float* alpha, float* depth) {
-    each_run(tile, [&](int i, int x, int y, int pixels) {
+    alignas(64) float opacity[kTilePixels], distance[kTilePixels];
+    for (int k = 0; k < kTilePixels; k += kLanes) {
+        const Vec w = load(image->weight + k), a = load(image->alpha + k), d = load(image->depth + k);
+        store(opacity + k, choose(w > 0.0f, a / w, Vec{}));
+        store(distance + k, choose(a > 0.0f, d / a, Vec{}));
+    }
+    each_run(tile, [&](int k, int x, int y, int pixels) {
+        const int64_t at = (int64_t)y * tile.lens->width + x;
+        copy_run(alpha + at, opacity + k, pixels);
+        copy_run(depth + at, distance + k, pixels);
+        if (colours == 1) return copy_run(values + at, image->value[0] + k, pixels);
         for (int j = 0; j < pixels; ++j) {
-            const int64_t at = (int64_t)y * tile.lens->width + x + j;
-            const int k = i + j;
-            if (colours == 1 || planes.channels) {
-                values[at] = image->value[colours == 1 ? 0 : planes.channels[at]][k];
+            if (planes.channels) {
+                values[at + j] = image->value[planes.channels[at + j]][k + j];
             } else {
-                for (int c = 0; c < 3; ++c) values[3 * at + c] = image->value[c][k];
+                for (int c = 0; c < 3; ++c) values[3 * (at + j) + c] = image->value[c][k + j];
             }
-            alpha[at] = image->weight[k] > 0 ? image->alpha[k] / image->weight[k] : 0;
-            depth[at] = image->alpha[k] > 0 ? image->depth[k] / image->alpha[k] : 0;
         }
     });
 }
@@ -226,48 +252,75 @@ struct Pixels {
 };
 
 // Sums of one entry over its blocks. Capped: the splat is opaque enough to reach the cap, where alpha has no gradient.
+// In two passes over the blocks, with less to wait for in each: a single chain from the offsets to the sums is longer
+// than processors look ahead.
 template <int C, bool Moving, bool Capped>
 static inline void backward_entry(const float* s, uint32_t blocks, int index, const int32_t* ends,
                                   Pixels<C, Moving>& pixels, float* slot) {
     const Vec cut = splat(-kLog2Cut), cap = splat(0.99f);
-    Vec sum[kColour0 + C] = {}, vut{}, vwt{};
+    alignas(64) float us[kTilePixels], ws[kTilePixels], alphas[kTilePixels];
+    int32_t places[kBlocks * kParts];
+    int count = 0;
+    // u and w are linear: those of the first block's pixels, and what each block adds to them.
+    alignas(64) float u_blocks[kBlocks], w_blocks[kBlocks];
+    for (int block = 0; block < kBlocks; block += kLanes) {
+        const Vec x = load(kBlockCorners.x + block), y = load(kBlockCorners.y + block);
+        store(u_blocks + block, s[kP] * x + (s[kQ] * y + s[kS]));
+        store(w_blocks + block, s[kR] * y + s[kT]);
+    }
+    Vec u_pixels[kParts], w_pixels[kParts];
+    for (int part = 0; part < kParts; ++part) {
+        const Vec x = load(kCentres.x + part * kLanes), y = load(kCentres.y + part * kLanes);
+        u_pixels[part] = s[kP] * x + s[kQ] * y;
+        w_pixels[part] = s[kR] * y;
+    }
     for (; blocks; blocks &= blocks - 1) {
         const int block = __builtin_ctz(blocks);
         for (int part = 0; part < kParts; ++part) {
             if (kParts > 1 && index >= ends[block * kParts + part]) continue;
             const int at = block * 16 + part * kLanes;
-            const Vec x = load(kCentres.x + at), y = load(kCentres.y + at);
-            Vec u = s[kP] * x + (s[kQ] * y + s[kS]), w = s[kR] * y + s[kT];
+            Vec u = u_pixels[part] + u_blocks[block], w = w_pixels[part] + w_blocks[block];
             if (Moving) {
                 u -= s[kURate] * load(pixels.time + at);
                 w -= s[kWRate] * load(pixels.time + at);
             }
             Vec log2_alpha = (s[kLog2Opacity] - u * u) - w * w;
             Vec alpha = where_reaches(log2_alpha, cut, exp2_fast(log2_alpha));
-            if (Capped) alpha = min(alpha, cap);
-            Vec t = load(pixels.t + at), rest = load(pixels.rest + at);
-            Vec share = alpha * t, d = s[kC] * load(pixels.d[0] + at);
-            for (int k = 1; k < C; ++k) d += s[kC + k] * load(pixels.d[k] + at);
-            Vec shown = share * d;
-            rest -= shown;
-            store(pixels.t + at, t - share);
-            store(pixels.rest + at, rest);
-            Vec v = shown - rest * (reciprocal(1.0f - alpha) * alpha);
-            if (Capped) v = where_reaches(splat(kLog2Cap), log2_alpha, v);
-            Vec vu = v * u, vw = v * w;
-            sum[kV] += v;
-            sum[kVu] += vu;
-            sum[kVw] += vw;
-            sum[kVuu] += vu * u;
-            sum[kVuw] += vu * w;
-            sum[kVww] += vw * w;
-            if (Moving) {
-                vut += vu * load(pixels.time + at);
-                vwt += vw * load(pixels.time + at);
-            }
-            sum[kShare] += share;
-            for (int k = 0; k < C; ++k) sum[kColour0 + k] += share * load(pixels.d[k] + at);
+            store(us + count * kLanes, u);
+            store(ws + count * kLanes, w);
+            store(alphas + count * kLanes, alpha);
+            places[count++] = at;
         }
+    }
+    Vec sum[kColour0 + C] = {}, vut{}, vwt{};
+    for (int i = 0; i < count; ++i) {
+        const int at = places[i];
+        const Vec u = load(us + i * kLanes), w = load(ws + i * kLanes), uncapped = load(alphas + i * kLanes);
+        const Vec alpha = Capped ? min(uncapped, cap) : uncapped;
+        Vec t = load(pixels.t + at), rest = load(pixels.rest + at);
+        Vec share = alpha * t, by_colour[C], shown{};
+        for (int k = 0; k < C; ++k) {
+            by_colour[k] = share * load(pixels.d[k] + at);
+            sum[kColour0 + k] += by_colour[k];
+            shown += s[kC + k] * by_colour[k];
+        }
+        rest -= shown;
+        store(pixels.t + at, t - share);
+        store(pixels.rest + at, rest);
+        Vec v = shown - rest * quotient(alpha, 1.0f - alpha);
+        if (Capped) v = where_reaches(cap, uncapped, v);
+        Vec vu = v * u, vw = v * w;
+        sum[kV] += v;
+        sum[kVu] += vu;
+        sum[kVw] += vw;
+        sum[kVuu] += vu * u;
+        sum[kVuw] += vu * w;
+        sum[kVww] += vw * w;
+        if (Moving) {
+            vut += vu * load(pixels.time + at);
+            vwt += vw * load(pixels.time + at);
+        }
+        sum[kShare] += share;
     }
     totals<8>(sum, slot);
     if (C == 3 || Moving) {
@@ -306,7 +359,7 @@ static void backward_tile(const Tile& tile, const float* d_values, const Planes&
 #if defined(__AVX512F__)
         blocks &= _mm512_cmpgt_epi32_mask(ends, _mm512_set1_epi32(i));
 #endif
-        float* slot = slots + (int64_t)tile.entries[i].slot * slot_floats(C, Moving);
+        float* slot = slots + (int64_t)i * slot_floats(C, Moving);
         if (s[kLog2Opacity] > kLog2Cap) {
             backward_entry<C, Moving, true>(s, blocks, i, state.ends, pixels, slot);
         } else {

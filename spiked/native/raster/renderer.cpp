@@ -140,7 +140,7 @@ void Renderer::sort(SubPose& sub) {
 void Renderer::bin(SubPose& sub) {
     const int tiles = lens_.tiles_x * lens_.tiles_y, runs = pool_.threads();
     const size_t rows = static_cast<size_t>(lens_.tiles_y) * 4 + kGroup;
-    uint32_t* counts = sub.first_slot.grow(splats_.count + 1);
+    uint32_t* counts = sub.first_pair.grow(splats_.count + 1);
     std::fill_n(counts, splats_.count, 0u);
     auto first_rank = [&](int run) { return static_cast<int>(static_cast<int64_t>(sub.visible) * run / runs); };
     pool_.run(runs, [&](int run, int) {
@@ -172,6 +172,8 @@ void Renderer::bin(SubPose& sub) {
     tile_start[tiles] = sum;
 
     Entry* entries = sub.entries.grow(sum);
+    uint32_t* places = sub.places.grow(static_cast<size_t>(sum) + kAhead);
+    std::fill_n(places + sum, kAhead, 0u);
     pool_.run(runs, [&](int run, int) {
         Emission& emission = emissions_[run];
         uint32_t slot = 0, rank = kCulled;
@@ -179,9 +181,11 @@ void Renderer::bin(SubPose& sub) {
             const Pair pair = emission.pairs[i];
             if (pair.rank != rank) {
                 rank = pair.rank;
-                slot = sub.first_slot[sub.records[rank].splat];
+                slot = sub.first_pair[sub.records[rank].splat];
             }
-            entries[emission.tile_counts[pair.tile_blocks >> 16]++] = {slot, rank, pair.tile_blocks & 0xffffu};
+            const uint32_t place = emission.tile_counts[pair.tile_blocks >> 16]++;
+            entries[place] = {rank, pair.tile_blocks & 0xffffu};
+            places[slot] = place;
         }
     });
 }
@@ -221,7 +225,8 @@ void Renderer::backward(const float* d_values, const GradientArrays& out) {
     pool_.run(lens_.tiles_x * lens_.tiles_y, [&](int tile, int thread) {
         for (int i = 0; i < sub_poses_; ++i)
             kernels_.backward(tile_of(views_[i], tile, thread), splats_.colours, d_values, planes_of(i),
-                              state_of(views_[i], tile), views_[i].slots.data());
+                              state_of(views_[i], tile),
+                              views_[i].slots.data() + static_cast<size_t>(views_[i].tile_start[tile]) * slot_floats());
     });
 
     const int chunks = chunks_of(stride_);
@@ -273,15 +278,18 @@ void Renderer::backward(const float* d_values, const GradientArrays& out) {
 // The sums of a group's splats over their tiles.
 void Renderer::gather(const SubPose& sub, int first, float* sums, uint8_t* visible) const {
     const int stride = slot_floats(), used = moving() ? kSums : kColour0 + splats_.colours;
+    const float* slots = sub.slots.data();
     for (int lane = 0; lane < kGroup; ++lane) {
         const int splat = std::min(first + lane, splats_.count);
-        const uint32_t from = sub.first_slot[splat];
-        const uint32_t to = splat < splats_.count ? sub.first_slot[splat + 1] : from;
+        const uint32_t from = sub.first_pair[splat];
+        const uint32_t to = splat < splats_.count ? sub.first_pair[splat + 1] : from;
         visible[lane] = to > from;
         float sum[16] = {};
-        const float* slot = sub.slots.data() + static_cast<size_t>(from) * stride;
-        for (uint32_t n = to - from; n > 0; --n, slot += stride)
+        for (uint32_t n = from; n < to; ++n) {
+            __builtin_prefetch(slots + static_cast<size_t>(sub.places[n + kAhead]) * stride);
+            const float* slot = slots + static_cast<size_t>(sub.places[n]) * stride;
             for (int k = 0; k < used; ++k) sum[k] += slot[k];
+        }
         for (int k = 0; k < used; ++k) sums[k * kGroup + lane] = sum[k];
     }
 }

@@ -17,12 +17,13 @@ struct SubPose {
     uint32_t pairs = 0;
     Buffer<Record> records;       // [visible], by depth
     Buffer<Motion> motions;       // [visible], by depth; while the camera moves
-    Buffer<uint32_t> first_slot;  // [splats + 1]
+    Buffer<uint32_t> first_pair;  // [splats + 1]
+    Buffer<uint32_t> places;      // [pairs] by splat: which of the entries it is
     Buffer<uint32_t> tile_start;  // [tiles + 1]
     Buffer<Entry> entries;        // [pairs], by tile, then depth
     Buffer<float> colour;         // [tiles][colours][kTilePixels]
     Buffer<int32_t> ends;         // [tiles][kBlocks * kMaxParts]
-    Buffer<float> slots;          // [pairs][slot_floats]
+    Buffer<float> slots;          // [pairs][slot_floats], by tile
 };
 
 // What to see the splats from, and when.

@@ -37,11 +37,8 @@ static inline Vec where_reaches(Vec x, Vec limit, Vec value) {
 static inline bool any_reaches(Vec x, Vec limit) {
     return _mm512_cmp_ps_mask((__m512)x, (__m512)limit, _CMP_GE_OQ) != 0;
 }
-// 1 / x to about 1e-7.
-static inline Vec reciprocal(Vec x) {
-    Vec y = (Vec)_mm512_rcp14_ps((__m512)x);
-    return y + y * (1.0f - x * y);
-}
+// 1 / x, roughly.
+static inline Vec reciprocal(Vec x) { return (Vec)_mm512_rcp14_ps((__m512)x); }
 #elif defined(__AVX2__)
 static inline Vec min(Vec a, Vec b) { return (Vec)_mm256_min_ps((__m256)a, (__m256)b); }
 static inline Vec max(Vec a, Vec b) { return (Vec)_mm256_max_ps((__m256)a, (__m256)b); }
@@ -56,10 +53,7 @@ static inline Vec where_reaches(Vec x, Vec limit, Vec value) {
 static inline bool any_reaches(Vec x, Vec limit) {
     return _mm256_movemask_ps(_mm256_cmp_ps((__m256)x, (__m256)limit, _CMP_GE_OQ)) != 0;
 }
-static inline Vec reciprocal(Vec x) {
-    Vec y = (Vec)_mm256_rcp_ps((__m256)x);
-    return y + y * (1.0f - x * y);
-}
+static inline Vec reciprocal(Vec x) { return (Vec)_mm256_rcp_ps((__m256)x); }
 #elif defined(__SSE2__)
 static inline Vec min(Vec a, Vec b) { return (Vec)_mm_min_ps((__m128)a, (__m128)b); }
 static inline Vec max(Vec a, Vec b) { return (Vec)_mm_max_ps((__m128)a, (__m128)b); }
@@ -74,10 +68,7 @@ static inline Vec where_reaches(Vec x, Vec limit, Vec value) {
 static inline bool any_reaches(Vec x, Vec limit) {
     return _mm_movemask_ps(_mm_cmpge_ps((__m128)x, (__m128)limit)) != 0;
 }
-static inline Vec reciprocal(Vec x) {
-    Vec y = (Vec)_mm_rcp_ps((__m128)x);
-    return y + y * (1.0f - x * y);
-}
+static inline Vec reciprocal(Vec x) { return (Vec)_mm_rcp_ps((__m128)x); }
 #else
 static inline Vec min(Vec a, Vec b) { return a < b ? a : b; }
 static inline Vec max(Vec a, Vec b) { return a > b ? a : b; }
@@ -103,6 +94,12 @@ static inline Vec interleaved_sum(const Vec* v) {
     return low_pairs(a, b) + high_pairs(a, b);
 }
 #endif
+
+// x / y to about 1e-7, if y is not tiny.
+static inline Vec quotient(Vec x, Vec y) {
+    const Vec over = reciprocal(y), rough = x * over;
+    return rough + rough * (1.0f - y * over);
+}
 
 static inline Vec clamp(Vec x, Vec low, Vec high) { return min(max(x, low), high); }
 static inline Vec choose(Int condition, Vec yes, Vec no) { return condition ? yes : no; }

@@ -38,6 +38,7 @@ class Camera:
         """The last ones, for tests of the session."""
         self.bad_requests = 0
         self._asked: deque[int] = deque()
+        self._room_since_s: float | None = None
 
     @property
     def credit(self) -> int:
@@ -103,13 +104,20 @@ class Camera:
         self.requests.append(Request(index, length))
         self._asked.append(length)
 
-    def wait_s(self, endpoint: int, now_s: float) -> float | None:
-        """How long until this IN endpoint has something; None: not before the host does something."""
+    def make_room(self, nbytes: int) -> None:
+        """So much can be written at the host's end of the data endpoint now; tell of it whenever it changes."""
+        if not nbytes or not self._asked or self.halted:
+            self._room_since_s = None
+        elif self._room_since_s is None:
+            self._room_since_s = time.monotonic()
+
+    def wait_s(self, endpoint: int, now_s: float, wanted_bytes: int) -> float | None:
+        """How long until this IN endpoint has so many bytes; None: not before the host does something."""
         if endpoint == SESSION_IN:
             return None
         if self.halted:
             return 0.0
-        return self.stream.wait_s(now_s) if self._asked else None
+        return self.stream.wait_s(now_s, min(wanted_bytes, self.credit)) if self._asked else None
 
     def read(self, endpoint: int, limit: int) -> tuple[list[memoryview], Fault | None]:
         """Bytes for a transfer that has room for `limit` more, and what befalls it behind them."""
@@ -119,7 +127,8 @@ class Camera:
             raise Stalled
         if self.halted:
             return [], Fault(0, Kind.STALL)
-        pieces, fault = self.stream.pull(min(limit, self.credit), time.monotonic())
+        now_s = time.monotonic()
+        pieces, fault = self.stream.pull(min(limit, self.credit), now_s, self._room_since_s or now_s)
         self._use(sum(map(len, pieces)))
         if fault is not None:
             self.halted = self.halted or fault.kind is Kind.STALL

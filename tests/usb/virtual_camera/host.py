@@ -185,7 +185,7 @@ class Host:
         now_s = time.monotonic()
         waits = [timer[0] - now_s for timer in self._timers]
         waits += [wait for node in self._nodes() if (wait := node.wait_s(now_s)) is not None]
-        return max(0.0002, min(waits)) if waits else None  # not more often than a fraction of a transfer
+        return max(0.0002, min(waits)) if waits else None
 
     def _listen(self) -> None:
         for line in sys.stdin:

@@ -37,9 +37,10 @@ def wire_frames(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
 class Stream:
     """An endless camera that plays its pictures over and over.
 
-    With a rate it free-runs by the clock, whether it is read or not: what the host does not take in time is dropped in
-    whole frames and counted. Without one (0) there is always a next frame and none is dropped. With `stamp` the first
-    8 bytes of pixels are the frame's number, so that no two frames are the same.
+    With a rate it free-runs by the clock, whether it is read or not: what finds no room at the host in time is dropped
+    in whole frames and counted. What the host has room for is sent by the clock even if this process is late: a camera
+    is not slowed down by a busy machine. Without a rate (0) there is always a next frame and none is dropped. With
+    `stamp` the first 8 bytes of pixels are the frame's number, so that no two frames are the same.
     """
 
     def __init__(
@@ -80,24 +81,33 @@ class Stream:
         """Start anew with the counters at these values for the next frame; what was in the buffer is gone."""
         self._pieces.clear()
         self._breaks.clear()
-        self._skip_missed(time.monotonic())
+        self._skip_missed(self._due(time.monotonic()))
         self._lines = lines - ROWS * self.next_frame
         self._nbytes = nbytes - COMPACT_BYTES * self.next_frame
 
-    def wait_s(self, now_s: float) -> float:
-        """How long until there is something to send."""
-        if self._pieces:
+    def wait_s(self, now_s: float, wanted_bytes: int = 1) -> float:
+        """How long until there are so many bytes to send, if nothing goes wrong meanwhile."""
+        wanted_bytes -= sum(map(len, self._pieces))
+        if wanted_bytes <= 0:
             return 0.0
         wait_s = self._silent_until_s - now_s
         if self._rate_hz:
-            wait_s = max(wait_s, self._start_s + (self.next_frame + 1) / self._rate_hz - now_s)
+            frames = -(-wanted_bytes // FRAME_BYTES)
+            wait_s = max(wait_s, self._start_s + (self.next_frame + frames) / self._rate_hz - now_s)
         return max(0.0, wait_s)
 
-    def pull(self, limit: int, now_s: float) -> tuple[list[memoryview], Fault | None]:
-        """The next bytes, `limit` at most, and what happens then. They are valid until the next call."""
+    def _due(self, time_s: float) -> int:
+        """Frames that were taken by then."""
+        return int((time_s - self._start_s) * self._rate_hz)
+
+    def pull(self, limit: int, now_s: float, room_since_s: float) -> tuple[list[memoryview], Fault | None]:
+        """The next bytes, `limit` at most, and what happens then. They are valid until the next call.
+
+        Since `room_since_s` the host has had room for what the camera sends.
+        """
         taken: list[memoryview] = []
         while limit > 0:
-            if not self._pieces and not self._compose(limit, now_s):
+            if not self._pieces and not self._compose(limit, now_s, room_since_s):
                 break
             piece, happens = self._pieces[0], self._breaks[0]
             if len(piece) > limit:
@@ -112,17 +122,17 @@ class Stream:
                 return taken, happens
         return taken, None
 
-    def _compose(self, wanted_bytes: int, now_s: float) -> bool:
+    def _compose(self, wanted_bytes: int, now_s: float, room_since_s: float) -> bool:
         """Put the next frames in front, up to the next fault; false if none is due."""
         if self.wait_s(now_s) > 0:
             return False
-        self._skip_missed(now_s)
+        self._skip_missed(self._due(room_since_s) - self._buffer_frames)
         while self._faults and self._faults[0].frame <= self.next_frame:
             if not self._misbehave(heapq.heappop(self._faults), now_s):
                 return bool(self._pieces)
         count = -(-wanted_bytes // FRAME_BYTES)
         if self._rate_hz:
-            count = min(count, int((now_s - self._start_s) * self._rate_hz) - self.next_frame)
+            count = min(count, self._due(now_s) - self.next_frame)
         if self._faults:
             count = min(count, self._faults[0].frame - self.next_frame)
         self._push(self._frames(max(1, count)).reshape(-1))
@@ -150,12 +160,11 @@ class Stream:
         self._pieces.append(memoryview(data))  # type: ignore[arg-type]
         self._breaks.append(happens)
 
-    def _skip_missed(self, now_s: float) -> None:
-        if self._rate_hz:
-            oldest = int((now_s - self._start_s) * self._rate_hz) - self._buffer_frames
-            if oldest > self.next_frame:
-                self.dropped += oldest - self.next_frame
-                self.next_frame = oldest
+    def _skip_missed(self, oldest: int) -> None:
+        """Go on with this frame, if there is a clock and the camera has not sent it already."""
+        if self._rate_hz and oldest > self.next_frame:
+            self.dropped += oldest - self.next_frame
+            self.next_frame = oldest
 
     def _misbehave(self, fault: Fault, now_s: float) -> bool:
         """Put what is wrong in front of the next frame; false if nothing may follow for now."""
@@ -182,6 +191,8 @@ class Stream:
                 self._push(whole[fault.offset :])
             case Kind.SILENCE:
                 self._silent_until_s = now_s + fault.seconds
+                if self._rate_hz:
+                    self.next_frame = max(self.next_frame, self._due(self._silent_until_s))
                 return False
             case Kind.RESTART:
                 self.power_on(fault.offset, fault.count)

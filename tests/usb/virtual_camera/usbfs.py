@@ -14,7 +14,7 @@ import os
 import socket
 import struct
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -34,6 +34,7 @@ _URB_OVERHEAD = 320
 """Bytes of the kernel's memory that usbfs counts for a transfer besides its buffer."""
 _CAPABILITIES = 0x01 | 0x02 | 0x04 | 0x08 | 0x10  # zero packet, continuation, no size limit, scatter-gather, late reap
 _F_SETPIPE_SZ = 1031
+_LOOK_AGAIN_S = 0.01
 
 
 def _io(number: int, size: int = 0, direction: int = 0) -> int:
@@ -244,6 +245,10 @@ class Client:
         self.completed.append(urb)
 
     def _discard(self, address: int) -> int:
+        self.node.pump()  # what has come by now stays
+        for urb in self.completed:
+            if urb.address == address:
+                raise OSError(errno.EINVAL, "over by now")
         for urb in self.pending:
             if urb.address == address:
                 self.pending.remove(urb)
@@ -314,19 +319,32 @@ class Node:
 
     def wait_s(self, now_s: float) -> float | None:
         """How long until a transfer in flight can go on; None: not by itself."""
-        waits = [self.camera.wait_s(urb.endpoint, now_s) for client in self.clients for urb in client.pending]
-        return min((wait for wait in waits if wait is not None), default=None)
+        waits = []
+        for client in self.clients:
+            urb = _first_bulk(client.pending)
+            if urb is not None:
+                waits.append(self.camera.wait_s(urb.endpoint, now_s, urb.length - urb.actual))
+        soonest = min((wait for wait in waits if wait is not None), default=None)
+        return None if soonest is None else min(soonest, _LOOK_AGAIN_S)
 
     def pump(self) -> None:
         """Let the camera send into the transfers in flight, in their order, and say what is to be reaped."""
+        self._tell_room()
         for client in self.clients:
             while client.pending and not self.gone and self._send(client):
                 pass
             client.answer_waiting()
+        self._tell_room()
         self._show()
 
+    def _tell_room(self) -> None:
+        room = sum(
+            urb.length - urb.actual for client in self.clients for urb in client.pending if urb.kind == _URB_BULK
+        )
+        self.camera.make_room(room)
+
     def _send(self, client: Client) -> bool:
-        urb = next((urb for urb in client.pending if urb.kind == _URB_BULK), None)
+        urb = _first_bulk(client.pending)
         if urb is None:
             return False
         try:
@@ -384,3 +402,7 @@ class Node:
             client.connection.close()
         self.clients.clear()
         os.close(self._fifo)
+
+
+def _first_bulk(urbs: Iterable[Urb]) -> Urb | None:
+    return next((urb for urb in urbs if urb.kind == _URB_BULK), None)

@@ -13,6 +13,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from .core import Camera, Stalled
+from .descriptors import DATA_IN, SESSION_IN
 from .faults import Fault, Kind
 from .usbfs import receive
 
@@ -80,9 +81,12 @@ class UsbIpCamera:
 
     def _timeout_s(self) -> float | None:
         now_s = time.monotonic()
-        waits = [self.camera.wait_s(0x80 | transfer.endpoint, now_s) for transfer in self._waiting]
+        waits = [
+            self.camera.wait_s(0x80 | transfer.endpoint, now_s, transfer.length - len(transfer.data))
+            for transfer in self._waiting
+        ]
         soonest = min((wait for wait in waits if wait is not None), default=None)
-        return None if soonest is None else max(0.001, soonest)
+        return None if soonest is None else min(max(0.001, soonest), 0.01)
 
     def _obey(self) -> None:
         command, number, _, direction, endpoint = _HEADER.unpack(receive(self._connection, _HEADER.size))
@@ -121,11 +125,17 @@ class UsbIpCamera:
         self._connection.sendall(_ANSWER.pack(_RET_UNLINK, number, 0, 0, 0, status, 0, 0, 0, 0))
 
     def _pump(self) -> None:
+        self.camera.make_room(self._room())
         for transfer in list(self._waiting):
             if self._send(transfer):
                 self._waiting.remove(transfer)
-            elif 0x80 | transfer.endpoint != 0x81:
+            elif 0x80 | transfer.endpoint != SESSION_IN:
                 break  # in their order
+        self.camera.make_room(self._room())
+
+    def _room(self) -> int:
+        data = [transfer for transfer in self._waiting if 0x80 | transfer.endpoint == DATA_IN]
+        return sum(transfer.length - len(transfer.data) for transfer in data)
 
     def _send(self, transfer: _Transfer) -> bool:
         """Let the camera send into the transfer; whether it is over."""

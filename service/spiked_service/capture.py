@@ -212,6 +212,7 @@ class LiveCapture:
         assert self._opened is not None
         plan = self._row.plan
         order = RecorderOrder(
+            capture_id=self.id,
             ring=self._opened.name,
             path=self._folder.recording(self.id),
             first_frame=self._first_frame,

@@ -313,6 +313,7 @@ class Captures:
 
     def _flow(self, capture: LiveCapture, plan: Plan) -> None:
         order = AcquisitionOrder(
+            capture_id=capture.id,
             source=plan.source,
             ring_id=capture.id,
             frames=plan.frames,

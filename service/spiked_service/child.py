@@ -7,7 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
-from spiked_service.messages import STOP, News, Order, Role, news_lines
+from spiked_service.logs import relay
+from spiked_service.messages import STOP, Logged, News, Order, Role, news_lines
 
 
 class Spare:
@@ -105,7 +106,11 @@ class Child:
             for line in self._stdout:
                 if not line.endswith(b"\n"):
                     break  # it was killed while it spoke
-                self._on_news(news_lines.validate_json(line))
+                news = news_lines.validate_json(line)
+                if isinstance(news, Logged):
+                    relay(news)
+                else:
+                    self._on_news(news)
         code = self._process.wait()
         with self._writing:
             self._stdin.close()

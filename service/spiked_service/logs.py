@@ -9,6 +9,7 @@ import structlog
 
 from spiked_service.config import LogFormat, LogLevel
 from spiked_service.events import Bus, Topic
+from spiked_service.messages import Logged
 from spiked_service.payloads import LogPayload
 
 _QUIET = ("uvicorn.access", "uvicorn.error", "asyncio", "websockets")
@@ -66,6 +67,12 @@ def logger(name: str, **known: object) -> structlog.stdlib.BoundLogger:
     """A logger whose every line says what is known: `capture_id`, `reconstruction_id`, `role`."""
     bound: structlog.stdlib.BoundLogger = structlog.stdlib.get_logger(name, **known)
     return bound
+
+
+def relay(line: Logged) -> None:
+    """A worker's line, as one of this process."""
+    level = logging.getLevelNamesMapping().get(line.level.upper(), logging.WARNING)
+    logger(line.logger, **line.known).log(level, line.event)
 
 
 class _ToBus(logging.Handler):

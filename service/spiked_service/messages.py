@@ -21,7 +21,15 @@ class Role(StrEnum):
     PREVIEW = "preview"
 
 
-class AcquisitionOrder(BaseModel):
+class _Order(BaseModel):
+    """What every order says."""
+
+    capture_id: str | None = None
+    reconstruction_id: str | None = None
+    """Whose work it is, for the log."""
+
+
+class AcquisitionOrder(_Order):
     """Move a source into a new ring."""
 
     role: Literal[Role.ACQUISITION] = Role.ACQUISITION
@@ -35,7 +43,7 @@ class AcquisitionOrder(BaseModel):
     """What the ring shall hold for readers that begin in the past."""
 
 
-class RecorderOrder(BaseModel):
+class RecorderOrder(_Order):
     """Write what comes through a ring into a recording."""
 
     role: Literal[Role.RECORDER] = Role.RECORDER
@@ -52,7 +60,7 @@ class RecorderOrder(BaseModel):
     note: str
 
 
-class ReconstructionOrder(BaseModel):
+class ReconstructionOrder(_Order):
     """Reconstruct what comes through a ring, or lies in a recording, and publish it in a folder."""
 
     role: Literal[Role.RECONSTRUCTION] = Role.RECONSTRUCTION
@@ -68,7 +76,7 @@ class ReconstructionOrder(BaseModel):
     stop_frame: int | None = None
 
 
-class PreviewOrder(BaseModel):
+class PreviewOrder(_Order):
     """Make pictures of the newest frames of a ring."""
 
     role: Literal[Role.PREVIEW] = Role.PREVIEW
@@ -189,6 +197,17 @@ class PreviewTaken(BaseModel):
     """x, y of pixels that fire much more than those around them, at most 64."""
 
 
+class Logged(BaseModel):
+    """A line of the worker's log."""
+
+    news: Literal["log"] = "log"
+    level: str
+    event: str
+    logger: str
+    known: dict[str, str]
+    """Role, and whose work it is."""
+
+
 class Refused(BaseModel):
     """A worker cannot do what it was ordered, for a reason that is the user's to mend."""
 
@@ -197,7 +216,7 @@ class Refused(BaseModel):
 
 
 News = Annotated[
-    RingOpened | RecordingEnded | ReconstructionStatus | Posed | VersionPublished | PreviewTaken | Refused,
+    RingOpened | RecordingEnded | ReconstructionStatus | Posed | VersionPublished | PreviewTaken | Logged | Refused,
     Field(discriminator="news"),
 ]
 orders: TypeAdapter[Order] = TypeAdapter(Order)

@@ -107,6 +107,8 @@ class Reconstructions:
         now = datetime.now(UTC)
         row = ReconstructionRow(new_id(), capture.id, True, JobState.RUNNING, now, options=options, started_at=now)
         order = ReconstructionOrder(
+            capture_id=capture.id,
+            reconstruction_id=row.id,
             ring=opened.name,
             recording=None,
             folder=self._folder.reconstruction(row.id),
@@ -302,6 +304,8 @@ class Reconstructions:
 
     def _begin_from_recording(self, row: ReconstructionRow, capture: CaptureRow) -> None:
         order = ReconstructionOrder(
+            capture_id=capture.id,
+            reconstruction_id=row.id,
             ring=None,
             recording=self._folder.recording(capture.id),
             folder=self._folder.reconstruction(row.id),

@@ -153,7 +153,7 @@ class Stream:
         with self._lock:
             if self._closing or self._ended or self._opened is None:
                 return
-            order = PreviewOrder(ring=self._opened.name, thumbnail=self._thumbnail)
+            order = PreviewOrder(capture_id=self._order.capture_id, ring=self._opened.name, thumbnail=self._thumbnail)
             self._children[Role.PREVIEW] = Child(
                 order, self._logs / "preview.log", self._hear, self._preview_ended, spare
             )

@@ -15,6 +15,7 @@ from pydantic import BaseModel
 
 from spiked.errors import SpikedError
 from spiked_service.messages import STOP, Refused, Role, orders
+from spiked_service.worker_logs import join_logs
 
 _GRACE_S = 0.8
 """A worker that the service has left, or left alone, ends by itself within this time, whatever it is doing."""
@@ -80,8 +81,10 @@ def main() -> int:
     if not line:
         return 0  # it stood by and was not needed
     link = Link(sys.stdin, news_out)
+    order = orders.validate_json(line)
+    join_logs(order, link.mention)
     try:
-        carry_out(orders.validate_json(line), link)
+        carry_out(order, link)
     except SpikedError as error:
         link.tell(Refused(reason=str(error)))
         print(error, file=sys.stderr)

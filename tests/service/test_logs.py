@@ -2,13 +2,16 @@
 
 import json
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 import structlog
 from spiked_service.config import LogFormat, LogLevel
 from spiked_service.events import Bus, Topic
 from spiked_service.logs import configure_logs, logger, set_level
+from websockets.sync.client import connect
 
 
 @pytest.fixture(autouse=True)
@@ -55,6 +58,21 @@ def test_the_level_changes_while_it_runs(capsys: pytest.CaptureFixture[str]) -> 
     log.debug("heard")
     told = capsys.readouterr().err
     assert "unheard" not in told and "heard" in told
+
+
+def test_lines_of_workers_are_in_the_services_log_with_their_ids(daemon: Callable[..., Any], tmp_path: Path) -> None:
+    one = daemon()
+    address = one.address.replace("http", "ws")
+    with connect(f"{address}api/v1/events?topics=log", compression=None) as events:
+        source = "sim:?width=96&height=64"
+        capture = one.http.post("captures", json={"source": source, "frames": 64}).json()["id"]
+        for message in map(json.loads, events):
+            if message["data"].get("role") == "recorder":
+                break
+    assert message["capture_id"] == capture
+    assert message["data"]["event"].startswith("recording closed with 64 frames")
+    own = (tmp_path / "data" / "captures" / capture / "logs" / "recorder.log").read_text()
+    assert "recording closed with 64 frames" in own
 
 
 def test_lines_are_events_with_their_ids(capsys: pytest.CaptureFixture[str]) -> None:

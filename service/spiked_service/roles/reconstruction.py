@@ -1,5 +1,6 @@
 """The reconstruction worker: frames from a ring or a recording into a `Reconstructor`, its scene into a folder."""
 
+import logging
 import os
 import time
 from dataclasses import dataclass, replace
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from spiked.errors import SceneError
 from spiked.pose import quaternion
-from spiked.recon import Reconstructor, Status, Tracked
+from spiked.recon import Reconstructor, State, Status, Tracked
 from spiked.recording import open_recording
 from spiked.ring import End, Frames, Gap, Policy, RingReader
 from spiked.sensor import Intrinsics, Sensor
@@ -20,6 +21,7 @@ from spiked_service.payloads import PosePayload
 from spiked_service.publication import Publisher
 from spiked_service.worker import Link
 
+_log = logging.getLogger("spiked.reconstruction")
 _WAIT_S = 0.05
 _SPARE_S = 0.1
 """Mapping at a time while no frames wait, short enough to come back before the ring is full."""
@@ -139,6 +141,7 @@ class _Herald:
         self._begun_s = time.monotonic()
         self._refining_s: float | None = None
         self._expected: int | None = None
+        self._state = State.BOOT
 
     def expect(self, frames: int) -> None:
         """So many frames will come."""
@@ -161,6 +164,11 @@ class _Herald:
 
     def progress(self, status: Status) -> None:
         now_s = time.monotonic()
+        if status.state is not self._state:
+            _log.info(
+                "%s after %d frames%s", status.state, status.frames, f": {status.reason}" if status.reason else ""
+            )
+            self._state = status.state
         if status.version != self._seen and now_s - self._published_s > _PUBLISH_S:
             self._publish(status)
         if now_s - self._told_s > _TELL_S:

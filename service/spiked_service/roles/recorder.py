@@ -1,5 +1,6 @@
 """The recorder worker: a ring into a recording, before anything else that is done with its frames."""
 
+import logging
 import os
 import time
 from collections import Counter
@@ -15,6 +16,7 @@ from spiked.ring import Cause, End, EndReason, Frames, Gap, Policy, RingReader
 from spiked_service.messages import RecorderOrder, RecordingEnded
 from spiked_service.worker import Link
 
+_log = logging.getLogger("spiked.recorder")
 _WAIT_S = 0.1
 _BATCH_BLOCKS = 16
 """Written at once when the disk is behind; otherwise every block by itself, as soon as it is there."""
@@ -49,7 +51,9 @@ def run_recorder(order: RecorderOrder, link: Link) -> None:
             writer.close()
         except RecordingError as error:
             scribe.trouble = scribe.trouble or str(error)
-    link.tell(scribe.account(end))
+    account = scribe.account(end)
+    _log.info("recording closed with %d frames; lost %s", account.frames, account.lost or "none")
+    link.tell(account)
 
 
 class _Scribe:

@@ -206,7 +206,7 @@ function Recording({ capture }: { capture: Capture }): JSX.Element {
           </>
         )}
         <dt>Size</dt>
-        <dd>{recording === null ? "not recorded" : bytes(recording.bytes)}</dd>
+        <dd>{recording === null ? (isOver(capture) ? "not recorded" : "not closed yet") : bytes(recording.bytes)}</dd>
       </dl>
       {recording !== null && (
         <div className="downloads">

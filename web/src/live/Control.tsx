@@ -78,7 +78,7 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
         >
           {devices.map((one) => (
             <option key={one.source} value={one.source}>
-              {one.description || one.source}
+              {one.source} · {one.description}
             </option>
           ))}
           <option value={OTHER}>Another source…</option>

@@ -6,6 +6,14 @@ import type { RateHistogram } from "../api/types";
 
 const HEIGHT = 40;
 
+/** Leave out the empty bins at the bright end, but not so many that the scale jumps about. */
+export function trimmed(histogram: RateHistogram): RateHistogram {
+  const last = histogram.counts.findLastIndex((n) => n > 0) + 1;
+  const quarter = Math.max(1, Math.ceil(histogram.counts.length / 4));
+  const kept = Math.max(quarter, Math.ceil(last / quarter) * quarter);
+  return { edges: histogram.edges.slice(0, kept + 1), counts: histogram.counts.slice(0, kept) };
+}
+
 /** Bars of a histogram: square root of the counts, so that the few bright pixels are seen too. */
 export function bars(counts: readonly number[]): number[] {
   const most = Math.max(1, ...counts);
@@ -13,7 +21,7 @@ export function bars(counts: readonly number[]): number[] {
 }
 
 export function Histogram({
-  histogram,
+  histogram: all,
   meanRate,
   frameRateHz,
 }: {
@@ -21,6 +29,7 @@ export function Histogram({
   meanRate: number | null;
   frameRateHz: number | null;
 }): JSX.Element {
+  const histogram = all === null ? null : trimmed(all);
   const heights = histogram === null ? [] : bars(histogram.counts);
   const first = histogram?.edges[0] ?? 0;
   const last = histogram?.edges.at(-1) ?? 1;

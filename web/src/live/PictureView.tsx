@@ -26,8 +26,9 @@ function useStats(capture: Capture | null): Stats | null {
   const [value, setValue] = useState<{ id: string; stats: Stats } | null>(null);
   const id = capture?.id ?? null;
   const over = capture === null || isOver(capture);
+  const begun = over || (capture.counters?.received ?? 0) > 0;
   useEffect(() => {
-    if (id === null) return;
+    if (id === null || !begun) return;
     let current = true;
     const ask = (): void => {
       stats(id).then(
@@ -41,7 +42,7 @@ function useStats(capture: Capture | null): Stats | null {
       current = false;
       clearInterval(timer);
     };
-  }, [id, over]);
+  }, [id, over, begun]);
   return value?.id === id ? value.stats : null;
 }
 

@@ -77,7 +77,7 @@ export function Frames({ capture, rateHz }: { capture: Capture; rateHz: number |
                       <Meter
                         share={one.fill}
                         label={`Ring fill of ${one.name}`}
-                        tone={one.fill > 0.8 && !skips ? "problem" : "active"}
+                        tone={skips ? "active" : one.lagging ? "problem" : one.fill > 0.8 ? "warning" : "active"}
                       />
                     </td>
                     <td className="number">
@@ -138,12 +138,12 @@ export function VerdictCard({ capture }: { capture: Capture }): JSX.Element | nu
 }
 
 export function DevicePanel({ device }: { device: Device }): JSX.Element {
-  const facts = [device.kind, device.speed, device.port, device.serial, device.firmware].filter(
+  const facts = [device.description, device.kind, device.speed, device.port, device.serial, device.firmware].filter(
     (fact) => fact != null && fact !== "",
   );
   return (
     <div className="device">
-      <strong>{device.description || device.source}</strong>
+      <strong>{device.source}</strong>
       <span className="dim">{facts.join(" · ")}</span>
       {device.reason !== "" && <p className={device.state === "lost" ? "problem" : "dim"}>{device.reason}</p>}
     </div>

@@ -26,11 +26,12 @@ export function usePicture(capture: Capture | null, kind: PreviewKind, gain: num
   const [asked, setAsked] = useState<(Picture & { key: string }) | null>(null);
   const id = capture?.id ?? null;
   const over = capture === null || isOver(capture);
+  const begun = over || (capture.counters?.received ?? 0) > 0;
   const served = pushed !== undefined && !over;
   const askedGain = served ? 1 : gain;
 
   useEffect(() => {
-    if (id === null || served) return;
+    if (id === null || served || !begun) return;
     const key = `${id} ${kind}`;
     let timer: ReturnType<typeof setTimeout> | undefined;
     let url: string | null = null;
@@ -62,7 +63,7 @@ export function usePicture(capture: Capture | null, kind: PreviewKind, gain: num
       // The picture on show keeps its address until the next one has come.
       if (url !== null) setTimeout(() => URL.revokeObjectURL(url ?? ""), 2000);
     };
-  }, [id, kind, askedGain, over, served]);
+  }, [id, kind, askedGain, over, served, begun]);
 
   if (served) return { url: `data:image/webp;base64,${pushed.image}`, frame: pushed.frame, gained: false };
   return asked !== null && asked.key === `${id ?? ""} ${kind}` ? asked : null;

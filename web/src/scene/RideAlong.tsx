@@ -13,8 +13,7 @@ const CHOICES = [
   { value: "rendered", label: "Rendered" },
   { value: "observed", label: "Observed" },
 ] as const;
-const SETTLE_MS = 60;
-const NEWEST_MS = 400;
+const LOOK_MS = 60;
 /** Differences are small; so much are they brightened. */
 const DIFFERENCE_GAIN = 4;
 
@@ -23,18 +22,16 @@ export function RideAlong({
   job,
   sensor,
   frame,
-  live,
 }: {
   capture: Capture;
   job: Reconstruction;
   sensor: Sensor;
   frame: number | null;
-  live: boolean;
 }): JSX.Element {
   const [comparison, setComparison] = useState<Comparison>("wipe");
   const [share, setShare] = useState(0.5);
   const image = useRef<HTMLImageElement>(null);
-  const observed = useObserved(capture, job.white ?? undefined, frame, live && job.state === "running");
+  const observed = useObserved(capture.id, job.white ?? undefined, frame);
   const bar = useRef<HTMLDivElement>(null);
   useFitted(bar, sensor.width / sensor.height);
 
@@ -118,24 +115,32 @@ function useFitted(inside: { readonly current: HTMLElement | null }, aspect: num
   }, [inside, aspect]);
 }
 
-/** The picture of a frame as the camera saw it, at the brightness of the scene. */
+/**
+ * The picture of a frame as the camera saw it, at the brightness of the scene. Frames may change faster than pictures
+ * come: one is asked for at a time, always of the newest frame wanted.
+ */
 function useObserved(
-  capture: Capture,
+  captureId: string,
   white: number | undefined,
   frame: number | null,
-  newest: boolean,
 ): { url: string | null; missing: boolean } {
   const [url, setUrl] = useState<string | null>(null);
   const [missing, setMissing] = useState(false);
-  const id = capture.id;
-  // At the live edge the newest picture is asked for a few times a second, not one for each pose.
-  const asked = newest ? undefined : (frame ?? undefined);
+  const wanted = useRef(frame);
+  useEffect(() => {
+    wanted.current = frame;
+  }, [frame]);
   useEffect(() => {
     const ended = new AbortController();
-    let timer: ReturnType<typeof setTimeout> | undefined;
+    let shown: number | null = null;
+    let busy = false;
     const ask = async (): Promise<void> => {
+      const asked = wanted.current;
+      if (busy || asked === null || asked === shown) return;
+      busy = true;
+      shown = asked;
       try {
-        const picture = address.preview(id, "interval", { frame: asked, white });
+        const picture = address.preview(captureId, "interval", { frame: asked, white });
         const next = URL.createObjectURL(await (await fetched(picture, ended.signal)).blob());
         setUrl((before) => {
           if (before !== null) URL.revokeObjectURL(before);
@@ -145,13 +150,13 @@ function useObserved(
       } catch {
         if (!ended.signal.aborted) setMissing(true);
       }
-      if (newest && !ended.signal.aborted) timer = setTimeout(() => void ask(), NEWEST_MS);
+      busy = false;
     };
-    timer = setTimeout(() => void ask(), SETTLE_MS);
+    const timer = setInterval(() => void ask(), LOOK_MS);
     return () => {
       ended.abort();
-      clearTimeout(timer);
+      clearInterval(timer);
     };
-  }, [id, asked, white, newest]);
+  }, [captureId, white]);
   return { url, missing };
 }

@@ -157,13 +157,7 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
             data-splats={shown?.splats ?? 0}
           />
           {at.ride && sensor !== null && (
-            <RideAlong
-              capture={capture}
-              job={job}
-              sensor={sensor}
-              frame={path?.frames[row] ?? null}
-              live={at.frame === null}
-            />
+            <RideAlong capture={capture} job={job} sensor={sensor} frame={path?.frames[row] ?? null} />
           )}
         </div>
         {fault !== null && <Trouble text={fault} />}

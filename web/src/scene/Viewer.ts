@@ -21,7 +21,8 @@ import { LineSegments2 } from "three/addons/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "three/addons/lines/LineSegmentsGeometry.js";
 
 import type { Sensor } from "../api/types";
-import { placementOf, pointOf, projectionOf, type Placement } from "./axes";
+import { type Placement, placementOf, pointOf, projectionOf } from "./axes";
+import { axisNames } from "./axisNames";
 import { type Colouring, colours, type Path, quantile, thinned } from "./path";
 
 export type Steering = "orbit" | "fly";
@@ -112,6 +113,11 @@ export class Viewer {
       overlay.material.transparent = true;
       overlay.visible = false;
     }
+    // Of the capture's world, OpenCV's: y points down and z ahead.
+    this.axes.scale.set(1, -1, -1);
+    const names = axisNames();
+    names.scale.set(1, -1, -1);
+    this.axes.add(names);
     this.axes.visible = false;
     this.orbit = new OrbitControls(this.camera, canvas);
     this.orbit.addEventListener("change", () => this.draw());
@@ -261,7 +267,7 @@ export class Viewer {
     this.camera.far = depth * 200;
     this.camera.updateProjectionMatrix();
     this.buildGrid();
-    this.axes.scale.setScalar(depth / 6);
+    this.axes.scale.set(1, -1, -1).multiplyScalar(depth / 8);
     if (this.placed) return;
     this.home();
   }

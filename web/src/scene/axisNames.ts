@@ -1,0 +1,37 @@
+/** Names at the ends of the axes: they are told apart by more than their colours. */
+
+import { CanvasTexture, Group, Sprite, SpriteMaterial } from "three";
+
+const SIDE_PX = 64;
+const SIZE = 0.22;
+
+/** x, y and z of the OpenCV world at the ends of axes of length 1, in three.js' axes. */
+const ENDS = [
+  { name: "x", at: [1.12, 0, 0], colour: "#ff7a6b" },
+  { name: "y", at: [0, -1.12, 0], colour: "#7fd65c" },
+  { name: "z", at: [0, 0, -1.12], colour: "#6aa9ff" },
+] as const;
+
+export function axisNames(): Group {
+  const group = new Group();
+  for (const { name, at, colour } of ENDS) {
+    const canvas = document.createElement("canvas");
+    canvas.width = canvas.height = SIDE_PX;
+    const pen = canvas.getContext("2d");
+    if (pen === null) continue;
+    pen.font = `600 ${0.7 * SIDE_PX}px system-ui, sans-serif`;
+    pen.textAlign = "center";
+    pen.textBaseline = "middle";
+    pen.lineWidth = 6;
+    pen.strokeStyle = "#05070a";
+    pen.strokeText(name, SIDE_PX / 2, SIDE_PX / 2);
+    pen.fillStyle = colour;
+    pen.fillText(name, SIDE_PX / 2, SIDE_PX / 2);
+    const sprite = new Sprite(new SpriteMaterial({ map: new CanvasTexture(canvas), depthTest: false }));
+    sprite.position.fromArray(at);
+    sprite.scale.setScalar(SIZE);
+    sprite.renderOrder = 11;
+    group.add(sprite);
+  }
+  return group;
+}

@@ -2,6 +2,7 @@
 
 import os
 import threading
+import tty
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from spiked_driver.pcie import (
     encode_pcie,
 )
 from spiked_driver.source import Chunk
+from spiked_driver.spec import open_source
 
 from spiked.errors import SourceError
 from spiked.ring import Cause, DeviceState, End, EndReason, Gap
@@ -187,6 +189,36 @@ def _rest_of(source: PcieSource, received: int) -> None:
             np.testing.assert_array_equal(view[: item.frames], FRAMES[received : received + item.frames])
             received += item.frames
     assert received == SENT
+
+
+def test_a_character_device_is_a_source_by_its_name() -> None:
+    """A pseudo-terminal without any line discipline, as the capture card's node."""
+    card, node = os.openpty()
+    tty.setraw(node)
+    source = open_source(f"pcie:{os.ttyname(node)}?fov=50")
+    source.open()
+    sender = threading.Thread(target=_write_all, args=(card, WIRE.tobytes()), daemon=True)
+    sender.start()
+    view, received = np.zeros((4, PCIE_COMPACT_BYTES), np.uint8), 0
+    while received < SENT:
+        item = source.read_into(view)
+        if isinstance(item, Chunk):
+            np.testing.assert_array_equal(view[: item.frames], FRAMES[received : received + item.frames])
+            received += item.frames
+        else:
+            assert item is None
+    assert not source.waits
+    assert source.condition.state is DeviceState.STREAMING
+    sender.join()
+    source.close()
+    os.close(card)
+    os.close(node)
+
+
+def _write_all(file: int, data: bytes) -> None:
+    sent = 0
+    while sent < len(data):
+        sent += os.write(file, data[sent : sent + 4096])
 
 
 def test_a_missing_device_says_where_to_look(tmp_path: Path) -> None:

@@ -115,6 +115,28 @@ def test_two_cameras_do_not_get_mixed_up(cameras: Cameras, drive: Drive, picture
     assert second.stop().gaps == []
 
 
+def test_a_reset_hub_takes_both_cameras_and_gives_each_back_to_its_capture(
+    cameras: Cameras, drive: Drive, pictures: Path
+) -> None:
+    rig = cameras(settings(pictures, port="2-1.1"), settings(pictures, port="2-1.2"), usbfs_memory_mb=64)
+    drivers = [drive(rig, f"usb{number}{SPEC}") for number in range(2)]
+    for driver in drivers:
+        driver.wait_for_frames(200)
+    rig.unplug(0)
+    rig.unplug(1)
+    for driver in drivers:
+        driver.wait_for_state("absent")
+    rig.plug(1)  # the order in which they come back is any
+    drivers[1].wait_for_frames(200)
+    assert states(drivers[0])[-1] == "absent"
+    rig.plug(0)
+    drivers[0].wait_for_frames(200)
+    for number, driver in enumerate(drivers):
+        told = driver.stop()
+        assert [cause for _, _, cause in told.gaps] == ["device"]
+        check_sent(told, rig.report(number))
+
+
 def test_cameras_with_the_same_serial_must_be_named_by_port(cameras: Cameras, drive: Drive, pictures: Path) -> None:
     rig = cameras(settings(pictures), settings(pictures, port="2-2"))
     driver = drive(rig, "usb:000000000001")

@@ -5,10 +5,22 @@ constexpr float kMargin = 0.01f;  // px; absorbs rounding, costs next to nothing
 
 alignas(64) static constexpr float kFours[16] = {0, 4, 8, 12, 16, 20, 24, 28, 32, 36, 40, 44, 48, 52, 56, 60};
 
-// Fills first[] and last[] (columns of blocks, empty when first > last) for `rows` rows of blocks from `row`.
-static void block_columns(const Record& s, const Lens& lens, int row, int rows, int32_t* first, int32_t* last) {
+// Columns of blocks that a splat reaches in each row of blocks, empty where first > last.
+struct Columns {
+    int32_t *first, *last;
+    uint16_t* bits;  // the same as bits of the 16 columns that begin at `from`; only while narrow
+    int from;
+    bool narrow;  // no row goes beyond those
+};
+
+// Fills the columns of `rows` rows of blocks from `row`.
+static void block_columns(const Record& s, const Lens& lens, int row, int rows, Columns& out) {
     const float reach = s.log2_opacity + kLog2Cut;
     const float half_y = s.half_y + kMargin;
+    // As far as the ellipse reaches anywhere, which no row goes beyond.
+    const float left_most = s.x - s.half_x - (0.5f + 4 * kMargin), right_most = s.x + s.half_x - (0.5f - 4 * kMargin);
+    out.from = left_most <= 0 ? 0 : (int)(left_most < lens.width ? left_most : lens.width) / kTile * 4;
+    out.narrow = (right_most < lens.width - 1 ? right_most : lens.width - 1) < (float)(4 * (out.from + 16));
     const Vec lane = load(kFours);
     for (int at = 0; at < rows; at += kLanes) {
         Vec low = lane + (4.0f * (row + at) + 0.5f - s.y), high = low + 3.0f;
@@ -23,10 +35,20 @@ static void block_columns(const Record& s, const Lens& lens, int row, int rows, 
         Int b = (__builtin_convertvector(last_pixel, Int) - 1) >> 2;
         Int a = (lens.width - __builtin_convertvector(first_pixel, Int)) >> 2;
         Int active = low <= high;
+        if (out.narrow) {
+            active &= a <= b;
+            const Int from = active ? a - out.from : Int{} + 16;
+            const Int to = active ? b - out.from : Int{} + 15;
+            const Int bits = ((Int{} + 2) << to) - ((Int{} + 1) << from);
+            typedef uint16_t Bits __attribute__((vector_size(kLanes * 2)));
+            const Bits narrow = __builtin_convertvector(bits, Bits);
+            __builtin_memcpy(out.bits + at, &narrow, sizeof narrow);
+            continue;
+        }
         a = active ? a : Int{} + kMaxSide;
         b = active ? b : Int{} - 1;
-        __builtin_memcpy(first + at, &a, sizeof a);
-        __builtin_memcpy(last + at, &b, sizeof b);
+        __builtin_memcpy(out.first + at, &a, sizeof a);
+        __builtin_memcpy(out.last + at, &b, sizeof b);
     }
 }
 
@@ -55,10 +77,30 @@ static inline TileRows tile_rows(const Record& s, const Lens& lens) {
     return {top <= 0 ? 0 : (int)top / kTile, (bottom >= lens.height - 1 ? lens.height - 1 : (int)bottom) / kTile};
 }
 
+// Writes the pairs of four tiles from `tile` on that four rows of sixteen blocks reach.
+static inline Pair* emit_four(uint64_t rows, uint32_t tile, uint32_t rank, Pair* end) {
+    uint64_t tiles = tiles_of(rows);
+    // Written whether reached or not, which is cheaper than to ask; `out` has room for three more.
+    for (uint32_t k = 0; k < 4; ++k, tiles >>= 16) {
+        *end = {(tile + k) << 16 | (uint32_t)(tiles & 0xffff), rank};
+        end += (tiles & 0xffff) != 0;
+    }
+    return end;
+}
+
 // From the columns of blocks that one splat reaches to its pairs.
-static inline int emit_tiles(TileRows span, const int32_t* first, const int32_t* last, uint32_t rank, const Lens& lens,
-                             Pair* out) {
+static inline int emit_tiles(TileRows span, const Columns& columns, uint32_t rank, const Lens& lens, Pair* out) {
     Pair* end = out;
+    if (columns.narrow) {
+        const uint16_t* bits = columns.bits;
+        for (int tile_y = span.first; tile_y <= span.last; ++tile_y, bits += 4) {
+            uint64_t rows;
+            __builtin_memcpy(&rows, bits, sizeof rows);
+            end = emit_four(rows, (uint32_t)(tile_y * lens.tiles_x + columns.from / 4), rank, end);
+        }
+        return (int)(end - out);
+    }
+    const int32_t *first = columns.first, *last = columns.last;
     for (int tile_y = span.first; tile_y <= span.last; ++tile_y, first += 4, last += 4) {
         int from = kMaxSide, to = -1;
         for (int k = 0; k < 4; ++k) {
@@ -68,13 +110,7 @@ static inline int emit_tiles(TileRows span, const int32_t* first, const int32_t*
         for (from &= ~3; from <= to; from += 16) {
             uint64_t rows = 0;
             for (int k = 0; k < 4; ++k) rows |= columns_of(first[k], last[k], from) << (16 * k);
-            uint64_t tiles = tiles_of(rows);
-            const uint32_t tile = (uint32_t)(tile_y * lens.tiles_x + from / 4);
-            // Written whether reached or not, which is cheaper than to ask; `out` has room for three more.
-            for (uint32_t k = 0; k < 4; ++k, tiles >>= 16) {
-                *end = {(tile + k) << 16 | (uint32_t)(tiles & 0xffff), rank};
-                end += (tiles & 0xffff) != 0;
-            }
+            end = emit_four(rows, (uint32_t)(tile_y * lens.tiles_x + from / 4), rank, end);
         }
     }
     return (int)(end - out);
@@ -89,15 +125,19 @@ static int emit(const Record* records, int first, int last, const Lens& lens, in
         const int count = last - rank < kEmitBatch ? last - rank : kEmitBatch;
         // In two passes, since the second one's branches are hard to foretell: they must not wait for the arithmetic.
         TileRows rows[kEmitBatch];
+        Columns reached[kEmitBatch];
         for (int i = 0; i < count; ++i) {
             rows[i] = tile_rows(records[rank + i], lens);
+            int32_t* own = columns + 2 * i * stride;
+            reached[i].first = own;
+            reached[i].last = own + stride;
+            reached[i].bits = (uint16_t*)own;
             block_columns(records[rank + i], lens, 4 * rows[i].first, 4 * (rows[i].last - rows[i].first + 1),
-                          columns + 2 * i * stride, columns + (2 * i + 1) * stride);
+                          reached[i]);
         }
         for (int i = 0; i < count; ++i, ++rank) {
             Pair* pairs = out.pairs + size;
-            const int emitted = emit_tiles(rows[i], columns + 2 * i * stride, columns + (2 * i + 1) * stride,
-                                           (uint32_t)rank, lens, pairs);
+            const int emitted = emit_tiles(rows[i], reached[i], (uint32_t)rank, lens, pairs);
             for (int k = 0; k < emitted; ++k) ++out.tile_counts[pairs[k].tile_blocks >> 16];
             out.counts[records[rank].splat] = (uint32_t)emitted;
             size += (uint32_t)emitted;

@@ -1,5 +1,8 @@
 """The native reductions against plain NumPy, on random bits and on real recordings, for every instruction set."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -279,3 +282,18 @@ def test_benchmark_measures_both_operations_on_every_instruction_set() -> None:
     rows = benchmark(repeats=1)
     assert len(rows) == 4 * len(SETS)
     assert all(row.ns_per_frame > 0 and row.memcpy_ratio > 0 for row in rows)
+
+
+@pytest.mark.parametrize("level", SETS)
+def test_the_environment_forces_an_instruction_set(level: str) -> None:
+    program = "from spiked import blocks; print(*blocks.instruction_sets())"
+    environment = {**os.environ, "SPIKED_SIMD": level}
+    run = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    assert run.stdout.split() == [level]
+
+
+def test_an_unknown_instruction_set_is_refused() -> None:
+    program = "from spiked import blocks; blocks.instruction_sets()"
+    environment = {**os.environ, "SPIKED_SIMD": "mmx"}
+    run = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False)
+    assert "SPIKED_SIMD=mmx" in run.stderr

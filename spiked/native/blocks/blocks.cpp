@@ -5,6 +5,7 @@
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
+#include <cstdlib>
 #include <cstring>
 #include <stdexcept>
 #include <string>
@@ -35,7 +36,17 @@ std::vector<const Kernels*> supported_kernels() {
         kernels.push_back(avx2_kernels());
     }
 #endif
+    if (neon_kernels()) kernels.push_back(neon_kernels());
     kernels.push_back(baseline_kernels());
+    // SPIKED_SIMD forces one of them, for tests and comparisons.
+    if (const char* wanted = std::getenv("SPIKED_SIMD"); wanted && *wanted) {
+        const auto other = [&](const Kernels* k) { return std::strcmp(k->name, wanted) != 0; };
+        kernels.erase(std::remove_if(kernels.begin(), kernels.end(), other), kernels.end());
+        if (kernels.empty())
+            throw std::invalid_argument("SPIKED_SIMD=" + std::string(wanted) +
+                                        " is not an instruction set of this machine; use avx512, avx2, neon or "
+                                        "baseline, or unset it");
+    }
     return kernels;
 }
 

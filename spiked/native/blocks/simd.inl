@@ -6,6 +6,8 @@
 
 #if defined(__AVX2__)
 #include <immintrin.h>
+#elif defined(SPIKED_NEON)
+#include <arm_neon.h>
 #endif
 
 namespace {
@@ -92,11 +94,15 @@ inline vec popcount(vec h) {
 #else
 
 inline vec smaller(vec a, vec b) { return a < b ? a : b; }
+#if defined(SPIKED_NEON)
+inline vec popcount(vec h) { return (vec)vcntq_u8((uint8x16_t)h); }
+#else
 inline vec popcount(vec h) {
     h -= (vec)((lanes)h >> 1) & 0x55;
     h = (h & 0x33) + ((vec)((lanes)h >> 2) & 0x33);
     return low_nibble(h + (vec)((lanes)h >> 4));
 }
+#endif
 
 // Index of the only set bit of each byte.
 inline vec bit_index(vec one) {
@@ -137,6 +143,11 @@ inline vec highest(vec h) {
 
 #else
 
+#if defined(SPIKED_NEON)
+// Leading zeros are 8 for none; turned around, those of the reversed byte are the trailing ones.
+inline vec lowest(vec h) { return (vec)vclzq_u8(vrbitq_u8((uint8x16_t)h)) | is_zero(h); }
+inline vec highest(vec h) { return 7 - (vec)vclzq_u8((uint8x16_t)h); }
+#else
 inline vec lowest(vec h) { return bit_index(h & -h) | is_zero(h); }
 
 inline vec highest(vec h) {
@@ -145,6 +156,7 @@ inline vec highest(vec h) {
     smeared |= high_nibble(smeared);
     return popcount(smeared) - 1;
 }
+#endif
 
 #endif
 

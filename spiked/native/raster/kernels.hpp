@@ -211,6 +211,8 @@ extern const Kernels kBaseline;
 #if defined(__x86_64__)
 extern const Kernels kAvx2;
 extern const Kernels kAvx512;
+#elif defined(__aarch64__)
+extern const Kernels kNeon;
 #endif
 
 const Kernels& choose_kernels();  // throws std::invalid_argument for an unknown or unsupported SPIKED_SIMD

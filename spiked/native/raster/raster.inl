@@ -218,7 +218,7 @@ static void store_tile(const Tile& tile, const TileImage* image, int colours, co
 // out[i] = the sum of v[i]'s lanes, for i < N; N is 8 or 4. The lanes are added as a tree, N sums at a time.
 template <int N>
 static inline void totals(const Vec* v, float* out) {
-#if defined(__SSE2__)
+#if defined(__SSE2__) || defined(SPIKED_NEON)
     Vec quads[2];  // in each 128 bits, the sums of four vectors over those 128 bits
     for (int i = 0; i < N / 4; ++i) quads[i] = interleaved_sum(v + 4 * i);
 #if defined(__AVX512F__)

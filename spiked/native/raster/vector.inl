@@ -69,6 +69,19 @@ static inline bool any_reaches(Vec x, Vec limit) {
     return _mm_movemask_ps(_mm_cmpge_ps((__m128)x, (__m128)limit)) != 0;
 }
 static inline Vec reciprocal(Vec x) { return (Vec)_mm_rcp_ps((__m128)x); }
+#elif defined(SPIKED_NEON)
+// As on the other machines b where either is NaN, which NEON's own minimum does not give.
+static inline Vec min(Vec a, Vec b) { return (Vec)vbslq_f32(vcltq_f32(a, b), a, b); }
+static inline Vec max(Vec a, Vec b) { return (Vec)vbslq_f32(vcgtq_f32(a, b), a, b); }
+static inline Vec root(Vec a) { return (Vec)vsqrtq_f32(a); }
+static inline Vec where_reaches(Vec x, Vec limit, Vec value) {
+    return (Vec)vandq_u32(vcgeq_f32(x, limit), vreinterpretq_u32_f32(value));
+}
+static inline bool any_reaches(Vec x, Vec limit) { return vmaxvq_u32(vcgeq_f32(x, limit)) != 0; }
+static inline Vec reciprocal(Vec x) {
+    const float32x4_t rough = vrecpeq_f32(x);  // eight bits
+    return (Vec)vmulq_f32(rough, vrecpsq_f32(x, rough));
+}
 #else
 static inline Vec min(Vec a, Vec b) { return a < b ? a : b; }
 static inline Vec max(Vec a, Vec b) { return a > b ? a : b; }
@@ -92,6 +105,10 @@ static inline Vec interleaved_sum(const Vec* v) {
     const Vec a = unpack_low(v[0], v[1]) + unpack_high(v[0], v[1]),
               b = unpack_low(v[2], v[3]) + unpack_high(v[2], v[3]);
     return low_pairs(a, b) + high_pairs(a, b);
+}
+#elif defined(SPIKED_NEON)
+static inline Vec interleaved_sum(const Vec* v) {
+    return (Vec)vpaddq_f32(vpaddq_f32(v[0], v[1]), vpaddq_f32(v[2], v[3]));
 }
 #endif
 

@@ -1,0 +1,23 @@
+#include <arm_neon.h>
+
+#include "kernels.hpp"
+
+#define SPIKED_NEON 1
+
+namespace raster {
+namespace {
+// Each part uses the ones before it.
+// clang-format off
+#include "vector.inl"
+#include "project.inl"
+#include "emit.inl"
+#include "moving.inl"
+#include "raster.inl"
+#include "losses.inl"
+// clang-format on
+}  // namespace
+
+const Kernels kNeon = {"neon",    prepare,          project, emit,   forward, store_tile, backward, project_moving,
+                       unproject, unproject_moving, cover,   finish, adam,    robust,     ssim,     multiply_add,
+                       kLanes};
+}  // namespace raster

@@ -186,6 +186,11 @@ class LiveCapture:
                 self._set(state=CaptureState.FINISHING)
             self._settle()
 
+    def stream_settled(self) -> None:
+        """See `StreamListener`."""
+        with self._lock:
+            self._settle()
+
     def _begin(self, opened: RingOpened, recorder: Spare | None, reconstructor: Spare | None) -> None:
         with self._lock:
             if self._closing:
@@ -269,7 +274,6 @@ class LiveCapture:
         spare, self._spare = self._spare, None
         if spare is not None:
             spare.dismiss()
-            threading.Thread(target=spare.kill_after, args=(5.0,), name="reap spare", daemon=True).start()
 
     def _recorded(self, account: RecordingEnded) -> None:
         recording = Recorded(account.frames, account.bytes, lost=sum(account.lost.values()))
@@ -306,11 +310,10 @@ class LiveCapture:
 
     def _settle(self) -> None:
         """Over, once nothing acquires, records, or reconstructs."""
-        if self._stream is None or not self._stream.ended or self._recording or self._reconstructing:
+        if self._stream is None or not self._stream.settled or self._recording or self._reconstructing:
             return
         if self._over.is_set() or (self._closing and self._recorder is not None):
             return
-        self._stream.end_pictures()
         counters = self._stream.counters()
         self._stream.release()
         if self._closing and not self._row.reason:

@@ -126,7 +126,7 @@ class Captures:
         Raises as `start`.
         """
         device = device_of(source)
-        _check(Plan(source))
+        _check(Plan(source, reconstruct=False))
         with self._lock:
             self._refuse_if_busy(device)
             if device in self._armed:

@@ -10,6 +10,9 @@ from typing import IO
 from spiked_service.logs import relay
 from spiked_service.messages import STOP, Logged, News, Order, Role, news_lines
 
+_LEAVE_S = 10.0
+"""A spare that still starts leaves when it has started."""
+
 
 class Spare:
     """A worker that has loaded what its role needs and stands by for an order."""
@@ -27,14 +30,17 @@ class Spare:
             )
 
     def dismiss(self) -> None:
-        """It is not needed any more."""
+        """It is not needed any more, and leaves."""
         assert self.process.stdin is not None and self.process.stdout is not None
         try:
             self.process.stdin.close()
         except BrokenPipeError:
-            return
+            pass  # it was killed
         finally:
             self.process.stdout.close()
+        threading.Thread(
+            target=self.kill_after, args=(_LEAVE_S,), name=f"end of spare {self.role}", daemon=True
+        ).start()
 
     def kill_after(self, timeout_s: float) -> None:
         """Wait for its end, and kill it if it does not come in time."""

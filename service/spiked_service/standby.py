@@ -123,3 +123,6 @@ class Standby:
         for spare in self._spares:
             spare.dismiss()
         self._on_end(self)
+
+    def stream_settled(self) -> None:
+        """See `StreamListener`."""

@@ -26,6 +26,9 @@ class StreamListener(Protocol):
     def stream_ended(self, trouble: str | None) -> None:
         """No more frames will come; the ring can be read to its end."""
 
+    def stream_settled(self) -> None:
+        """After that, its workers have left."""
+
 
 class Stream:
     """Supervises acquisition and preview. Every method may be called from any thread."""
@@ -66,6 +69,11 @@ class Stream:
         """Whether the source is free again."""
         return self._ended
 
+    @property
+    def settled(self) -> bool:
+        """Whether all its workers have left, too."""
+        return self._ended and not self._children
+
     def follow(self, listener: StreamListener) -> None:
         """Tell another one from now on."""
         with self._lock:
@@ -96,13 +104,6 @@ class Stream:
             child = self._children.get(Role.ACQUISITION)
         if child is not None:
             child.stop()
-
-    def end_pictures(self) -> None:
-        """The preview is not needed any more."""
-        with self._lock:
-            child = self._children.get(Role.PREVIEW)
-        if child is not None:
-            child.dismiss()
 
     def dismiss(self) -> None:
         """Tell the workers to leave at once."""
@@ -147,7 +148,10 @@ class Stream:
             if self._opened is None:
                 self._backoff.cancel()
             reason = None if self._closing else self._refusal or trouble
+            settled = self.settled
         self._listener.stream_ended(reason)
+        if settled:
+            self._listener.stream_settled()
 
     def _start_preview(self, spare: Spare | None = None) -> None:
         with self._lock:
@@ -161,7 +165,13 @@ class Stream:
     def _preview_ended(self, trouble: str | None) -> None:
         with self._lock:
             self._children.pop(Role.PREVIEW, None)
-            if trouble is None or self._closing or self._ended:
-                return
-            delay_s = self._backoff.again(self._start_preview)
-        self._listener.warned(f"{trouble}; {'there is no live picture' if delay_s is None else 'it was started again'}")
+            settled = self.settled
+            if trouble is not None and not self._closing and not self._ended:
+                delay_s = self._backoff.again(self._start_preview)
+                how = "there is no live picture" if delay_s is None else "it was started again"
+            else:
+                trouble = None
+        if trouble is not None:
+            self._listener.warned(f"{trouble}; {how}")
+        if settled:
+            self._listener.stream_settled()

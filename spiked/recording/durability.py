@@ -55,7 +55,7 @@ class Allocator:
         """To be called before the file grows to `end` bytes. Raises OSError ENOSPC when only the reserve is left."""
         if self._reserve and end > self._checked:
             stat = os.fstatvfs(self._file)
-            left = stat.f_bavail * stat.f_frsize + max(0, self._allocated - end)
+            left = stat.f_bavail * stat.f_frsize - (end - self._allocated)
             if left < self._reserve:
                 raise OSError(errno.ENOSPC, f"the disk is full up to {self._reserve >> 20 or 1} MiB kept for others")
             # Looked at again well before the rest could be used up.
@@ -64,9 +64,10 @@ class Allocator:
             size = max(self._step, end - self._allocated)
             if _libc.fallocate(self._file, _KEEP_SIZE, ctypes.c_int64(self._allocated), ctypes.c_int64(size)):
                 # Too little space for a whole step, or a file system without the means: writing itself will tell.
-                self._possible = ctypes.get_errno() in (errno.EINTR,)
+                self._possible = ctypes.get_errno() == errno.EINTR
             else:
                 self._allocated += size
+        self._allocated = max(self._allocated, end)
 
 
 def _fitting(file: int, durability: Durability) -> tuple[int, int]:

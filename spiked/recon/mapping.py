@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from spiked.pose import Array
 from spiked.recon.depth import Sweep
+from spiked.recon.nuisances import Nuisances
 from spiked.recon.options import MapOptions
 from spiked.recon.views import Image, View
 from spiked.render import Camera, Gradients, Rasteriser
@@ -16,6 +17,12 @@ from spiked.sensor import Sensor
 
 SSIM_SCALE = 0.01
 """Brings 1 - SSIM to the size of the mean squared error."""
+
+
+NUISANCES_FROM = 300
+"""Steps before they are estimated at all: first the map has to look like something."""
+NUISANCE_STEPS = 200
+"""Steps between estimates of the pixels' gains."""
 
 
 class Mapper:
@@ -32,6 +39,7 @@ class Mapper:
         self.white = 1.0
         self.rasteriser = Rasteriser(camera, threads)
         self.adam = Adam(self.scene.arrays())
+        self.nuisances = Nuisances(sensor.height, sensor.width)
         self.steps = 0
         self._rng = np.random.default_rng(seed)
         self._residuals: dict[int, float] = {}
@@ -87,16 +95,31 @@ class Mapper:
         self.scene = self.scene.join(fresh)
         self.adam.grow(n)
 
-    def step(self, key: int, view: View, rotation: Array, centre: Array, decay: float = 1.0) -> Gradients:
-        """One gradient step on a view; `decay` scales the rate of the means. Returns the gradients (for its pose)."""
-        image = self.rasteriser.forward(self.scene, rotation[None], centre[None], channels=self.channels)
-        error = image.values - view.rate
+    def step(
+        self, key: int, view: View, rotations: Array, centres: Array, weights: Image | None, decay: float = 1.0
+    ) -> Gradients:
+        """One gradient step on a view, seen from sub-poses [S] with the shares weights [S, H, W] of each pixel's charge.
+
+        `decay` scales the rate of the means. Returns the gradients (for the poses).
+        """
+        image = self.rasteriser.forward(self.scene, rotations, centres, weights=weights, channels=self.channels)
+        expected = image.values
+        factor: Image | None = None
+        if self.options.nuisances and self.steps >= NUISANCES_FROM:
+            factor = self.nuisances.factor(key)
+            self.nuisances.observe(key, image.values, view.rate, view.deviation)
+            expected = expected * factor
+            if self.steps % NUISANCE_STEPS == NUISANCE_STEPS - 1:
+                self.nuisances.update()
+        error = expected - view.rate
         weight = self.weights(view)
         scale = np.float32(1 / (self.white**2 * error.size))
         slope = 2 * scale * weight * error
         if self.options.ssim > 0 and self.channels is None:
-            _, structural = dssim(image.values, view.rate, self.white)
+            _, structural = dssim(expected, view.rate, self.white)
             slope = (1 - self.options.ssim) * slope + self.options.ssim * SSIM_SCALE * structural
+        if factor is not None:
+            slope *= factor
         gradients = self.rasteriser.backward(slope)
         self._residuals[key] = float(np.mean(weight * error * error)) / self.white**2
         self.steps += 1
@@ -114,11 +137,12 @@ class Mapper:
     def forget_residuals(self) -> None:
         """Views are numbered anew."""
         self._residuals.clear()
+        self.nuisances.forget_views()
 
-    def densify(self, view: View, rotation: Array, centre: Array, share: float = 0.03) -> None:
+    def densify(self, key: int, view: View, rotation: Array, centre: Array, share: float = 0.03) -> None:
         """Give splats to what is rendered worst: in place of dead ones first, then new ones up to the cap."""
         image = self.rasteriser.forward(self.scene, rotation[None], centre[None], channels=self.channels)
-        error = (view.rate - image.values) * self.weights(view)
+        error = (view.rate - self.nuisances.factor(key) * image.values) * self.weights(view)
         badness = cv2.GaussianBlur(np.abs(cv2.GaussianBlur(error, (0, 0), 0.7)), (0, 0), 1.0)
         badness = np.maximum(badness - np.median(badness), 0)
         dead = np.flatnonzero(self.scene.opacity_logits < -4.0)

@@ -22,6 +22,10 @@ class MapOptions:
     rate_colours: float = 4e-3
     ssim: float = 0.2
     """Share of structural similarity in the loss of grey views, as in 3D Gaussian splatting."""
+    sub_frames: int = 1
+    """Moments at which a view is rendered, each pixel weighing them by when it gathered its charge."""
+    nuisances: bool = True
+    """Estimate each pixel's gain and the brightness of each view (flicker, lamps)."""
     floor: float = 0.03
     """Part of the scene's white added to the noise of each pixel: small values trust dark pixels more."""
 

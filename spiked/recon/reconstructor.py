@@ -250,10 +250,12 @@ class Reconstructor:
         if not self._queue:
             self._queue = [int(i) for i in self._rng.permutation(self._mappable())]
         view = self._views[number := self._queue.pop()]
-        rotation, centre = spline.poses([view.time])
-        self._mapper.step(number, view, rotation[0], centre[0], decay)
+        times, weights = view.exposure(self.options.mapping.sub_frames)
+        rotations, centres = spline.poses(np.clip(times, spline.begin, spline.end))
+        self._mapper.step(number, view, rotations, centres, weights, decay)
         if densify and self._mapper.steps % 100 == 0:
-            self._mapper.densify(view, rotation[0], centre[0])
+            rotation, centre = spline.poses([view.time])
+            self._mapper.densify(number, view, rotation[0], centre[0])
         self._version += self._mapper.steps % 20 == 0
 
     def finish(

@@ -28,6 +28,8 @@ class View:
     """Standard deviation of `rate`."""
     delay: NDArray[np.float16]
     """Frames from the middle of the window to the middle of the charge that `rate` was measured from."""
+    duration: NDArray[np.float16]
+    """Frames over which that charge came together."""
     spikes_a_pixel: float
     """Mean plain count."""
     after_gap: bool = False
@@ -38,6 +40,21 @@ class View:
         """The middle of the window in frames."""
         return 0.5 * (self.begin + self.end)
 
+    def exposure(self, parts: int) -> tuple[NDArray[np.float64], Image | None]:
+        """When each pixel looked: times [S] in frames and the share of a pixel's charge that came at each, [S, H, W].
+
+        The times are the middles of `parts` equal pieces of the time in which most pixels gathered their charge.
+        """
+        if parts == 1:
+            return np.array([self.time + float(np.median(self.delay))]), None
+        half = 0.5 * self.duration.astype(np.float32)
+        start, stop = self.delay - half, self.delay + half
+        edges = np.linspace(*np.percentile(start[::4, ::4], [10]), *np.percentile(stop[::4, ::4], [90]), parts + 1)
+        inner = [np.clip(edge, start, stop) for edge in edges[1:-1].astype(np.float32)]
+        bounds = np.stack([start, *inner, stop])
+        weights = np.diff(bounds, axis=0) / np.maximum(stop - start, 1e-3)
+        return self.time + 0.5 * (edges[1:] + edges[:-1]), np.ascontiguousarray(weights, np.float32)
+
 
 def make_view(window: Window, after_gap: bool) -> View:
     """The view of a spike-aligned window."""
@@ -46,7 +63,8 @@ def make_view(window: Window, after_gap: bool) -> View:
     deviation = np.where(window.valid, np.sqrt(variance), window.rate_bound()).astype(np.float32)
     middle = 0.5 * (window.begin + window.end)
     delay = np.nan_to_num(window.centre() - middle, nan=0.0).astype(np.float16)
-    return View(window.begin, window.end, rate, deviation, delay, float(window.count.mean()), after_gap)
+    duration = np.where(window.valid, window.duration(), window.end - window.begin).astype(np.float16)
+    return View(window.begin, window.end, rate, deviation, delay, duration, float(window.count.mean()), after_gap)
 
 
 class Windows:

@@ -19,3 +19,7 @@ class SourceError(SpikedError):
 
 class ConfigurationError(SpikedError):
     """An option has a value that cannot be used."""
+
+
+class CalibrationError(SpikedError):
+    """A calibration, or a recording to make one from, cannot be used."""

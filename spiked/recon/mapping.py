@@ -1,5 +1,7 @@
 """The map: Gaussians fitted to views by gradient descent, added where it is empty or wrong, moved where dead."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -8,10 +10,11 @@ from spiked.pose import Array
 from spiked.recon.depth import Sweep
 from spiked.recon.nuisances import Nuisances
 from spiked.recon.options import MapOptions
-from spiked.recon.views import Image, View
+from spiked.recon.views import Image, View, luminance
 from spiked.render import Camera, Gradients, Rasteriser
 from spiked.render.loss import dssim
 from spiked.render.optimiser import Adam
+from spiked.render.splats import Image as Rendered
 from spiked.scene import Scene
 from spiked.sensor import Sensor
 
@@ -25,6 +28,18 @@ NUISANCE_STEPS = 200
 """Steps between estimates of the pixels' gains."""
 
 
+@dataclass(frozen=True)
+class Sight:
+    """From where a view was seen: poses, camera-to-world, and when each pixel looked."""
+
+    rotations: Array
+    """[S, 3, 3]"""
+    centres: Array
+    """[S, 3]"""
+    windows: Image | None
+    """[2, H, W] for a camera that moves from pose to pose (`Rasteriser.forward_moving`); None: it stands still."""
+
+
 class Mapper:
     """Holds the scene and improves it, a view at a time."""
 
@@ -33,6 +48,7 @@ class Mapper:
     ) -> None:
         self.options = options
         self.camera = camera
+        self.sensor = sensor
         self.colours = 1 if sensor.mosaic is None else 3
         self.channels = None if sensor.mosaic is None else sensor.mosaic.channels(sensor.height, sensor.width)
         self.scene = Scene.empty(self.colours)
@@ -95,14 +111,10 @@ class Mapper:
         self.scene = self.scene.join(fresh)
         self.adam.grow(n)
 
-    def step(
-        self, key: int, view: View, rotations: Array, centres: Array, weights: Image | None, decay: float = 1.0
-    ) -> Gradients:
-        """One gradient step on a view, seen from sub-poses [S] with the shares weights [S, H, W] of each pixel's charge.
-
-        `decay` scales the rate of the means. Returns the gradients (for the poses).
-        """
-        image = self.rasteriser.forward(self.scene, rotations, centres, weights=weights, channels=self.channels)
+    def step(self, key: int, view: View, sight: Sight, decay: float = 1.0) -> Gradients:
+        """One gradient step on a view; `decay` scales the rate of the means. Returns the gradients (for the poses)."""
+        # A background of any brightness: dark things have to be there, not to be holes.
+        image = self.look(sight, float(self._rng.uniform(0, self.options.background)) * self.white)
         expected = image.values
         factor: Image | None = None
         if self.options.nuisances and self.steps >= NUISANCES_FROM:
@@ -115,9 +127,8 @@ class Mapper:
         weight = self.weights(view)
         scale = np.float32(1 / (self.white**2 * error.size))
         slope = 2 * scale * weight * error
-        if self.options.ssim > 0 and self.channels is None:
-            _, structural = dssim(expected, view.rate, self.white)
-            slope = (1 - self.options.ssim) * slope + self.options.ssim * SSIM_SCALE * structural
+        if self.options.ssim > 0:
+            slope = (1 - self.options.ssim) * slope + self.options.ssim * SSIM_SCALE * self._structural(expected, view)
         if factor is not None:
             slope *= factor
         gradients = self.rasteriser.backward(slope)
@@ -129,6 +140,14 @@ class Mapper:
         self.adam.step(self.scene.arrays(), slopes, rates, gradients.radius_px > 0)
         return gradients
 
+    def _structural(self, expected: Image, view: View) -> Image:
+        """The slope of 1 - SSIM; a mosaic is compared in grey, where every colour has the same share everywhere."""
+        if self.channels is None:
+            return dssim(expected, view.rate, self.white)[1]
+        grey = luminance(expected, self.sensor.mosaic), luminance(view.rate, self.sensor.mosaic)
+        # The mean over sites is symmetric, so that its transpose is itself.
+        return luminance(dssim(*grey, self.white)[1], self.sensor.mosaic)
+
     @property
     def loss(self) -> float | None:
         """Mean over the views of the last weighted squared error, in units of white squared; None before any step."""
@@ -139,7 +158,14 @@ class Mapper:
         self._residuals.clear()
         self.nuisances.forget_views()
 
-    def densify(self, key: int, view: View, rotation: Array, centre: Array, share: float = 0.03) -> None:
+    def look(self, sight: Sight, background: float = 0.0) -> Rendered:
+        """The map as a view saw it, before a background of that radiance."""
+        r, c, channels = sight.rotations, sight.centres, self.channels
+        if sight.windows is None:
+            return self.rasteriser.forward(self.scene, r, c, channels=channels, background=background)
+        return self.rasteriser.forward_moving(self.scene, r, c, sight.windows, channels=channels, background=background)
+
+    def densify(self, key: int, view: View, rotation: Array, centre: Array, share: float = 0.06) -> None:
         """Give splats to what is rendered worst: in place of dead ones first, then new ones up to the cap."""
         image = self.rasteriser.forward(self.scene, rotation[None], centre[None], channels=self.channels)
         error = (view.rate - self.nuisances.factor(key) * image.values) * self.weights(view)

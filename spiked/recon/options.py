@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from spiked.calibration import Calibration
 from spiked.errors import ConfigurationError
 from spiked.trajectory import Trajectory
 
@@ -22,10 +23,12 @@ class MapOptions:
     rate_colours: float = 4e-3
     ssim: float = 0.2
     """Share of structural similarity in the loss of grey views, as in 3D Gaussian splatting."""
-    sub_frames: int = 1
-    """Moments at which a view is rendered, each pixel weighing them by when it gathered its charge."""
+    sub_frames: int | None = None
+    """Pieces of straight image motion that a view is rendered in; None follows the motion, 0: the camera stands still."""
     nuisances: bool = True
     """Estimate each pixel's gain and the brightness of each view (flicker, lamps)."""
+    background: float = 0.5
+    """Brightest background that is set behind the map while it is fitted, in units of white; 0 is black always."""
     floor: float = 0.03
     """Part of the scene's white added to the noise of each pixel: small values trust dark pixels more."""
 
@@ -46,6 +49,8 @@ class Options:
     """Views kept for mapping; beyond it every second of the older ones is let go."""
     poses: Trajectory | None = None
     """Known camera poses: the map is fitted to them and they are not changed."""
+    calibration: Calibration | None = None
+    """The camera's gains, dark rates and defects, from `spiked calibrate`."""
     refine_poses: bool = True
     """Whether the map corrects the trajectory."""
     mapping: MapOptions = field(default_factory=MapOptions)

@@ -14,8 +14,9 @@ from threadpoolctl import ThreadpoolController
 
 from spiked.errors import ConfigurationError
 from spiked.pose import Array, log_so3
+from spiked.recon.colour import contradicts
 from spiked.recon.depth import Shot, neighbours, sweep
-from spiked.recon.mapping import Mapper, fill_mosaic
+from spiked.recon.mapping import Mapper, Sight, fill_mosaic
 from spiked.recon.odometry import Odometry, State
 from spiked.recon.options import Options
 from spiked.recon.refine import align_spline
@@ -31,6 +32,9 @@ FIRST_WINDOW = 16
 WINDOWS = (8, 16, 32, 64)
 WINDOW_MOTION_PX = (0.25, 0.6)
 """A view gets twice as long when the image moves less than the first in it, and half as long above twice the second."""
+SUB_FRAME_PX = 2.0
+"""Image motion that one sub-frame of straight, blurred motion renders well."""
+MAX_SUB_FRAMES = 6
 SEED_VIEWS = 5
 """Views swept for depth when the map begins."""
 SWEEP_NEIGHBOURS = 5
@@ -99,7 +103,7 @@ class Reconstructor:
         self.options = options or Options()
         self.camera = Camera(sensor.intrinsics, sensor.width, sensor.height)
         length = self.options.window_frames or FIRST_WINDOW
-        self._windows = Windows(sensor, length, length)
+        self._windows = Windows(sensor, length, length, self.options.calibration)
         self._odometry = Odometry(sensor.intrinsics, self.options.seed)
         self._mapper = Mapper(sensor, self.camera, self.options.mapping, self.options.seed, self.options.threads)
         self._rng = np.random.default_rng(self.options.seed)
@@ -113,7 +117,10 @@ class Reconstructor:
         self._progress = 0.0
         self._refined: Spline | None = None
         self._unit = 1.0
+        self._depth = 1.0
         self._spent = {"tracking": 0.0, "mapping": 0.0, "refining": 0.0}
+        self.warnings: list[str] = []
+        """What a user should know about the recording, one sentence each."""
         self._curve: list[tuple[float, float]] = []
         # The matrices are small: on busy cores several BLAS threads made tracking three times slower than one.
         self._blas = ThreadpoolController()
@@ -139,6 +146,8 @@ class Reconstructor:
         white = float(np.percentile(grey, 99.5))
         posed = self._odometry.add(view.time, view.end - view.begin, picture(grey, max(white, 1e-6)), self._given(view))
         self._views.append(view)
+        if len(self._views) == 1:
+            self._check_colour(view)
         if self._stage == "waiting":
             self._stage = "tracking"
         if posed.rotation is not None:
@@ -147,6 +156,16 @@ class Reconstructor:
             self._follow_motion(posed.motion_px, view)
         if len(self._views) > self.options.max_views:
             self._thin()
+
+    def _check_colour(self, view: View) -> None:
+        """Say it when the mosaic cannot be what the sensor says."""
+        said = self.sensor.mosaic
+        likelier = None if said is None else contradicts(said, view.rate)
+        if likelier is not None:
+            self.warnings.append(
+                f"the colour mosaic is said to be {said}, but by the pixels green is where {likelier} has it: "
+                "colours and fine detail will be wrong; give --mosaic auto, or correct the sidecar's cfa"
+            )
 
     def _given(self, view: View) -> tuple[Array, Array] | None:
         poses = self.options.poses
@@ -229,6 +248,7 @@ class Reconstructor:
             if (depth > 0).sum() < 10:
                 continue
             low, high = np.percentile(1 / depth[depth > 0], [1, 99.5])
+            self._depth = float(np.median(depth[depth > 0]))
             view = self._views[number]
 
             def shot(row: int) -> Shot:
@@ -250,13 +270,37 @@ class Reconstructor:
         if not self._queue:
             self._queue = [int(i) for i in self._rng.permutation(self._mappable())]
         view = self._views[number := self._queue.pop()]
-        times, weights = view.exposure(self.options.mapping.sub_frames)
-        rotations, centres = spline.poses(np.clip(times, spline.begin, spline.end))
-        self._mapper.step(number, view, rotations, centres, weights, decay)
+        self._mapper.step(number, view, self._sight(view, spline), decay)
         if densify and self._mapper.steps % 100 == 0:
             rotation, centre = spline.poses([view.time])
             self._mapper.densify(number, view, rotation[0], centre[0])
         self._version += self._mapper.steps % 20 == 0
+
+    def _sight(self, view: View, spline: Spline) -> Sight:
+        """The camera's way during a view, in pieces over which the image moves little."""
+        parts = self.options.mapping.sub_frames
+        if parts == 0:
+            rotations, centres = spline.poses([view.time])
+            return Sight(rotations, centres, None)
+        if parts is None:
+            times, _ = view.exposure(1)
+            parts = int(np.clip(np.ceil(self._motion(spline, times) / SUB_FRAME_PX), 1, MAX_SUB_FRAMES))
+        times, windows = view.exposure(parts)
+        rotations, centres = spline.poses(np.clip(times, spline.begin, spline.end))
+        return Sight(rotations, centres, windows)
+
+    def _motion(self, spline: Spline, times: Array) -> float:
+        """How far the image moves between two times at a typical place, in pixels."""
+        rotations, centres = spline.poses(np.clip(times, spline.begin, spline.end))
+        k = self.camera.intrinsics
+        at = np.array([[x, y] for x in (0.15, 0.5, 0.85) for y in (0.15, 0.5, 0.85)]) * [
+            self.camera.width,
+            self.camera.height,
+        ]
+        rays = np.column_stack([(at - [k.cx, k.cy]) / [k.fx, k.fy], np.ones(len(at))])
+        there = (rays * self._depth @ rotations[0].T + centres[0] - centres[-1]) @ rotations[-1]
+        moved = there[:, :2] / np.maximum(there[:, 2:], 1e-3) * [k.fx, k.fy] + [k.cx, k.cy] - at
+        return float(np.percentile(np.linalg.norm(moved, axis=1), 75))
 
     def finish(
         self, progress: Callable[[Status], None] | None = None, cancelled: Callable[[], bool] = lambda: False
@@ -411,7 +455,10 @@ class Reconstructor:
             release = "unknown"
         rate = self.sensor.frame_rate_hz
         odometry = self._odometry
-        options = asdict(replace(self.options, poses=None)) | {"poses": self.options.poses is not None}
+        options = asdict(replace(self.options, poses=None, calibration=None)) | {
+            "poses": self.options.poses is not None,
+            "calibration": self.options.calibration is not None,
+        }
         return {
             "versions": {"spiked": release, "python": platform.python_version()}
             | {name: version(name) for name in ("numpy", "opencv-python-headless")},
@@ -421,6 +468,7 @@ class Reconstructor:
             "gaps": [{"first_frame": f, "frames": n} for f, n in self._gaps],
             "state": str(odometry.state),
             "reason": odometry.reason,
+            "warnings": list(self.warnings),
             "states": [{"time_s": t / rate, "state": str(s), "reason": r} for t, s, r in odometry.changes],
             "views": [
                 {

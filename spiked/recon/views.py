@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.blocks import Window, aligned_window
+from spiked.calibration import Calibration
 from spiked.sensor import Mosaic, Sensor
 
 Image = NDArray[np.float32]
@@ -40,27 +41,29 @@ class View:
         """The middle of the window in frames."""
         return 0.5 * (self.begin + self.end)
 
-    def exposure(self, parts: int) -> tuple[NDArray[np.float64], Image | None]:
-        """When each pixel looked: times [S] in frames and the share of a pixel's charge that came at each, [S, H, W].
+    def exposure(self, parts: int) -> tuple[NDArray[np.float64], Image]:
+        """When each pixel gathered its charge, for `Rasteriser.forward_moving` with `parts` sub-frames.
 
-        The times are the middles of `parts` equal pieces of the time in which most pixels gathered their charge.
+        Returns the times [parts + 1] in frames at which the camera's poses are wanted, evenly spaced over what most
+        pixels looked at, and the pixels' windows [2, H, W] in units of these.
         """
-        if parts == 1:
-            return np.array([self.time + float(np.median(self.delay))]), None
         half = 0.5 * self.duration.astype(np.float32)
         start, stop = self.delay - half, self.delay + half
-        edges = np.linspace(*np.percentile(start[::4, ::4], [10]), *np.percentile(stop[::4, ::4], [90]), parts + 1)
-        inner = [np.clip(edge, start, stop) for edge in edges[1:-1].astype(np.float32)]
-        bounds = np.stack([start, *inner, stop])
-        weights = np.diff(bounds, axis=0) / np.maximum(stop - start, 1e-3)
-        return self.time + 0.5 * (edges[1:] + edges[:-1]), np.ascontiguousarray(weights, np.float32)
+        first, last = np.percentile(start[::4, ::4], 2), np.percentile(stop[::4, ::4], 98)
+        scale = np.float32(parts / max(last - first, 1e-3))
+        windows = np.stack([(start - np.float32(first)) * scale, (stop - np.float32(first)) * scale])
+        np.clip(windows[0], 0, parts - 0.02, out=windows[0])
+        np.clip(windows[1], windows[0] + 0.02, parts, out=windows[1])
+        return self.time + np.linspace(first, last, parts + 1), windows.astype(np.float32)
 
 
-def make_view(window: Window, after_gap: bool) -> View:
-    """The view of a spike-aligned window."""
+def make_view(window: Window, after_gap: bool, calibration: Calibration | None = None) -> View:
+    """The view of a spike-aligned window, in light instead of spikes where the camera is calibrated."""
     rate = window.rate(fill=True)
     variance = np.nan_to_num(window.variance(jitter=1.2e-3), nan=0.0)
     deviation = np.where(window.valid, np.sqrt(variance), window.rate_bound()).astype(np.float32)
+    if calibration is not None:
+        rate, deviation = calibration.apply(rate, deviation)
     middle = 0.5 * (window.begin + window.end)
     delay = np.nan_to_num(window.centre() - middle, nan=0.0).astype(np.float16)
     duration = np.where(window.valid, window.duration(), window.end - window.begin).astype(np.float16)
@@ -70,8 +73,12 @@ def make_view(window: Window, after_gap: bool) -> View:
 class Windows:
     """Cuts a stream of frames into views of `length` frames, one every `hop` frames. Windows never span a gap."""
 
-    def __init__(self, sensor: Sensor, length: int, hop: int) -> None:
+    def __init__(self, sensor: Sensor, length: int, hop: int, calibration: Calibration | None = None) -> None:
+        """Raises CalibrationError when the calibration is of another sensor."""
         self.sensor, self.length, self.hop = sensor, length, hop
+        self._calibration = calibration
+        if calibration is not None:
+            calibration.check(sensor)
         self._frames = np.zeros((0, sensor.frame_bytes), np.uint8)
         self._first = 0
         self._next = 0
@@ -98,7 +105,7 @@ class Windows:
             low = max(self._first, begin - MARGIN)
             high = min(stop, end + MARGIN)
             part = self._frames[low - self._first : high - self._first]
-            view = make_view(aligned_window(part, self.sensor, low, begin, end), self._gap)
+            view = make_view(aligned_window(part, self.sensor, low, begin, end), self._gap, self._calibration)
             self._gap = False
             self._next += self.hop
             yield view

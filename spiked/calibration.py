@@ -74,7 +74,7 @@ class Calibration:
                 gain, dark, dead = (archive[name] for name in ("gain", "dark", "dead"))
         except OSError as error:
             raise CalibrationError(f"cannot read the calibration {path}: {error.strerror or error}") from error
-        except (KeyError, ValueError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+        except (KeyError, ValueError, AttributeError, TypeError, EOFError, zipfile.BadZipFile) as error:
             raise CalibrationError(
                 f"{path} is not a calibration: it must be an .npz of `spiked calibrate` with gain, dark and dead"
             ) from error
@@ -127,14 +127,14 @@ def around(image: Image, good: NDArray[np.bool_]) -> Image:
         out[fill] = total[fill] / count[fill]
         missing &= ~fill
         reach *= 2
-    return out
+    return np.asarray(out, np.float32)
 
 
 def _square_sum(image: Image, reach: int) -> Image:
     padded = np.pad(image.astype(np.float64), ((reach + 1, reach), (reach + 1, reach))).cumsum(0).cumsum(1)
     size = 2 * reach + 1
     out = padded[size:, size:] - padded[:-size, size:] - padded[size:, :-size] + padded[:-size, :-size]
-    return out.astype(np.float32)
+    return np.asarray(out, np.float32)
 
 
 def _typical(net: Image, sensor: Sensor) -> Image:

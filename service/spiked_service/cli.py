@@ -6,6 +6,7 @@ import typer
 
 from spiked.errors import SpikedError
 from spiked_service.commands.bench import bench
+from spiked_service.commands.calibrate import calibrate
 from spiked_service.commands.config import config
 from spiked_service.commands.convert import convert
 from spiked_service.commands.devices import devices
@@ -29,7 +30,7 @@ app = typer.Typer(
 )
 for _group, _commands in {
     "Live": (serve, devices),
-    "Files": (info, verify, convert, simulate),
+    "Files": (info, verify, convert, simulate, calibrate),
     "Scenes": (reconstruct, render, evaluate),
     "This program": (bench, version),
 }.items():

@@ -1,6 +1,7 @@
 """The options that say what a recording without a sidecar holds, for every command that opens one."""
 
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +23,22 @@ Flipped = Annotated[
 ]
 Colours = Annotated[
     Mosaic | None, typer.Option("--mosaic", help="Colour mosaic of the upright image.", rich_help_panel=_PANEL)
+]
+
+
+class MosaicChoice(StrEnum):
+    """A mosaic, or what the pixels tell."""
+
+    AUTO = "auto"
+    RGGB = "RGGB"
+    BGGR = "BGGR"
+    GRBG = "GRBG"
+    GBRG = "GBRG"
+
+
+ColoursOrAuto = Annotated[
+    MosaicChoice | None,
+    typer.Option("--mosaic", help="Colour mosaic of the upright image; auto: by the pixels.", rich_help_panel=_PANEL),
 ]
 Fov = Annotated[
     float | None, typer.Option("--fov", help="Horizontal field of view, degrees.", rich_help_panel="Optics")

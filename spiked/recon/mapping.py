@@ -24,6 +24,8 @@ SSIM_SCALE = 0.01
 
 NUISANCES_FROM = 300
 """Steps before they are estimated at all: first the map has to look like something."""
+GAINS_FROM = 1500
+"""Steps before the gains of pixels are: they would take on what the geometry has yet to explain."""
 NUISANCE_STEPS = 200
 """Steps between estimates of the pixels' gains."""
 
@@ -63,7 +65,8 @@ class Mapper:
     @property
     def cap(self) -> int:
         """Most splats that the map may hold."""
-        return int(self.options.splats_a_pixel * self.camera.width * self.camera.height)
+        share = self.options.splats_a_pixel * self.camera.width * self.camera.height
+        return min(int(share), self.options.most_splats)
 
     def weights(self, view: View) -> Image:
         """Weight of each pixel's squared error, 1 for a noiseless one."""
@@ -119,7 +122,7 @@ class Mapper:
         factor: Image | None = None
         if self.options.nuisances and self.steps >= NUISANCES_FROM:
             factor = self.nuisances.factor(key)
-            self.nuisances.observe(key, image.values, view.rate, view.deviation)
+            self.nuisances.observe(key, image.values, view.rate, view.deviation, self.steps >= GAINS_FROM)
             expected = expected * factor
             if self.steps % NUISANCE_STEPS == NUISANCE_STEPS - 1:
                 self.nuisances.update()

@@ -37,8 +37,11 @@ class Nuisances:
         """What multiplies the render of a view, [H, W]."""
         return np.asarray(self.gain * np.float32(self.level(key)), np.float32)
 
-    def observe(self, key: int, rendered: Image, observed: Image, deviation: Image) -> None:
-        """Take one view's render [H, W] (without nuisances), its rates and their deviations."""
+    def observe(self, key: int, rendered: Image, observed: Image, deviation: Image, gains: bool = True) -> None:
+        """Take one view's render [H, W] (without nuisances), its rates and their deviations.
+
+        Without `gains` only the view's level is learnt from it.
+        """
         expected = self.gain * rendered
         precision = 1 / (deviation * deviation + np.square(MODEL_ERROR * (expected + observed)) + 1e-12)
         # A ratio of means: a least-squares slope would come out low for as long as the map is rough, and drag it along.
@@ -46,6 +49,8 @@ class Nuisances:
         if total > 0:
             self._levels[key] = float((precision * observed).sum()) / total
             self._mean_level = float(np.mean(list(self._levels.values())))
+        if not gains:
+            return
         model = rendered * np.float32(self.level(key))
         self._xx += precision * model * model
         self._xy += precision * model * (observed - model)
@@ -53,7 +58,7 @@ class Nuisances:
 
     def update(self) -> None:
         """New gains from all that was observed."""
-        if not self._levels:
+        if not self._observed:
             return
         # A view seen again tells nothing new: the evidence is that of the distinct views.
         once = np.float32(min(1.0, len(self._levels) / self._observed))

@@ -13,8 +13,10 @@ class MapOptions:
 
     stride_px: float = 2.0
     """Spacing of the pixels that become the first splats."""
-    splats_a_pixel: float = 0.5
+    splats_a_pixel: float = 0.8
     """Cap of the number of splats, in splats for each sensor pixel."""
+    most_splats: int = 150_000
+    """Cap of the number of splats, however many pixels there are."""
     rate_means: float = 2e-3
     """Learning rates at the start, per step; those of the means and of colour are in units of depth and of white."""
     rate_quats: float = 8e-3
@@ -24,7 +26,7 @@ class MapOptions:
     ssim: float = 0.2
     """Share of structural similarity in the loss of grey views, as in 3D Gaussian splatting."""
     sub_frames: int | None = None
-    """Pieces of straight image motion that a view is rendered in; None follows the motion, 0: the camera stands still."""
+    """Pieces of straight motion that a view is rendered in; None follows the motion, 0 lets the camera stand still."""
     nuisances: bool = True
     """Estimate each pixel's gain and the brightness of each view (flicker, lamps)."""
     background: float = 0.5

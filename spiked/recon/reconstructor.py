@@ -30,7 +30,7 @@ from spiked.trajectory import Trajectory
 
 FIRST_WINDOW = 16
 WINDOWS = (8, 16, 32, 64)
-WINDOW_MOTION_PX = (0.25, 0.6)
+WINDOW_MOTION_PX = (0.12, 0.6)
 """A view gets twice as long when the image moves less than the first in it, and half as long above twice the second."""
 SUB_FRAME_PX = 2.0
 """Image motion that one sub-frame of straight, blurred motion renders well."""

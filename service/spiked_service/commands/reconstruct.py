@@ -5,6 +5,7 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -12,8 +13,13 @@ from typing import Annotated
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from spiked.calibration import Calibration
 from spiked.errors import ConfigurationError
 from spiked.recon import Options, Reconstructor, Status
+from spiked.recon.colour import detect
+from spiked.recon.views import Windows
+from spiked.recording import Recording
+from spiked.sensor import Mosaic, Sensor
 from spiked.trajectory import Trajectory
 from spiked_service import geometry as g
 from spiked_service.console import messages, output, report_warning
@@ -40,7 +46,10 @@ def reconstruct(
     layout: g.FrameLayout = None,
     bit_order: g.Bits = None,
     flipped: g.Flipped = None,
-    mosaic: g.Colours = None,
+    mosaic: g.ColoursOrAuto = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Of `spiked calibrate`: gains, dark rates, dead pixels.")
+    ] = None,
 ) -> None:
     """Reconstruct the camera's trajectory and a Gaussian scene from a recording.
 
@@ -56,12 +65,18 @@ def reconstruct(
 
     - `spiked reconstruct rec.dat -o out --poses known.tum`
     """
-    recording = g.Geometry(width, height, rate, layout, bit_order, flipped, mosaic).open(file)
+    colours = None if mosaic in (None, g.MosaicChoice.AUTO) else Mosaic(mosaic)
+    recording = g.Geometry(width, height, rate, layout, bit_order, flipped, colours).open(file)
     for warning in recording.warnings:
         report_warning(warning)
     sensor = g.with_optics(recording.sensor, fov, intrinsics)
+    if mosaic is g.MosaicChoice.AUTO:
+        sensor = _by_pixels(recording, sensor)
     known = None if poses is None else Trajectory.read_tum(poses)
-    reconstructor = Reconstructor(sensor, Options(seed=seed, steps=steps, threads=threads, poses=known))
+    measured = None if calibration is None else Calibration.read(calibration)
+    reconstructor = Reconstructor(
+        sensor, Options(seed=seed, steps=steps, threads=threads, poses=known, calibration=measured)
+    )
     _check_folder(out)
     total = recording.capture_index(recording.frames - 1) + 1
     with _interruptible() as interrupt, _Display(total) as display:
@@ -69,6 +84,8 @@ def reconstruct(
             recording, reconstructor, progress=display.show, cancelled=interrupt.is_set, budget_s=seconds
         )
     _write(reconstructor, out, file.name, display.curve)
+    for warning in reconstructor.warnings:
+        report_warning(warning)
     status = reconstructor.status()
     poses_found = len(reconstructor.trajectory())
     output.print(f"{out}: {poses_found} poses for {status.frames} frames, {status.splats} splats, {status.state}")
@@ -77,6 +94,17 @@ def reconstruct(
     if poses_found == 0:
         report_warning(f"no pose was found: {status.reason}")
         raise typer.Exit(1)
+
+
+def _by_pixels(recording: Recording, sensor: Sensor) -> Sensor:
+    """The sensor with the mosaic that the first frames show."""
+    frames = recording.read(0, min(recording.frames, 160))
+    windows = Windows(sensor, min(32, len(frames)), 32)
+    view = next(iter([*windows.feed(0, frames), *windows.flush()]))
+    found = detect(view.rate, sensor.mosaic)
+    if found is not sensor.mosaic:
+        report_warning(f"by its pixels the mosaic is {found}, not {sensor.mosaic}; red and blue may still be exchanged")
+    return replace(sensor, mosaic=found)
 
 
 class _Interrupt:

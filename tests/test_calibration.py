@@ -1,0 +1,97 @@
+"""Calibrations: what a flat and a dark recording say of each pixel, and what is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spiked.calibration import Calibration, around
+from spiked.errors import CalibrationError
+from spiked.recording import Recording, RecordingWriter, open_recording
+from spiked.sensor import Sensor
+from spiked.simulate import PixelMaps, SensorNoise
+from spiked.simulate.sensor import SpikeSensor
+
+SENSOR = Sensor(64, 48, 20000.0)
+NOISE = SensorNoise(dark=0.004, dark_spread=0.001, hot_share=0.01, dead_share=0.01)
+
+
+def record(path: Path, pixels: SpikeSensor, light: float, frames: int = 4000) -> Recording:
+    image = np.full((48, 64), light, np.float32)
+    with RecordingWriter(path, SENSOR) as writer:
+        writer.append(pixels.expose(image, image, np.zeros(frames, np.float32)))
+    return open_recording(path)
+
+
+def uneven() -> SpikeSensor:
+    falloff = 1 - 0.3 * np.hypot(*np.meshgrid(np.linspace(-1, 1, 64), np.linspace(-1, 1, 48))) ** 2 / 2
+    maps = PixelMaps(falloff.astype(np.float32), np.full((48, 64), 0.004, np.float32))
+    return SpikeSensor(SENSOR, 3, NOISE, maps=maps)
+
+
+def test_gain_dark_rate_and_defects_are_those_of_the_sensor(tmp_path: Path) -> None:
+    pixels = uneven()
+    measured = Calibration.measure(
+        record(tmp_path / "flat.dat", pixels, 0.2), record(tmp_path / "dark.dat", pixels, 0.0)
+    )
+    useless = (pixels.gain == 0) | (pixels.dark > 0.1)
+    assert useless.sum() > 20
+    np.testing.assert_array_equal(measured.dead, useless)
+    true = pixels.gain / pixels.threshold
+    true = true / np.exp(np.log(true[~useless]).mean())
+    error = measured.gain[~useless] / true[~useless] - 1
+    assert np.std(error) < 0.003 < np.std(true[~useless])
+    dark_error = measured.dark[~useless] - (pixels.dark / pixels.threshold)[~useless]
+    assert np.abs(dark_error).max() < 0.001
+
+
+def test_calibrated_light_is_even_and_leaves_dead_pixels_out(tmp_path: Path) -> None:
+    pixels = uneven()
+    flat = record(tmp_path / "flat.dat", pixels, 0.2)
+    measured = Calibration.measure(flat, record(tmp_path / "dark.dat", pixels, 0.0))
+    rate = (pixels.gain * 0.3 + pixels.dark) / pixels.threshold
+    light, deviation = measured.apply(rate.astype(np.float32), np.full(rate.shape, 0.01, np.float32))
+    assert np.std(rate) / np.mean(rate) > 0.05 > 0.005 > np.std(light) / np.mean(light)
+    assert (deviation[measured.dead] > 1).all() and (deviation[~measured.dead] < 0.1).all()
+
+
+def test_a_calibration_comes_back_from_its_file(tmp_path: Path) -> None:
+    measured = Calibration.measure(record(tmp_path / "flat.dat", uneven(), 0.2), None)
+    measured.write(tmp_path / "camera.npz")
+    again = Calibration.read(tmp_path / "camera.npz")
+    for name in ("gain", "dark", "dead"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(measured, name))
+    with pytest.raises(CalibrationError, match="64x48"):
+        again.check(Sensor(400, 250, 20000.0))
+
+
+@pytest.mark.parametrize(
+    ("light", "frames", "told"), [(0.001, 4000, "too dark"), (3.0, 4000, "saturated"), (0.2, 50, "50 frames")]
+)
+def test_unsuitable_recordings_are_refused(tmp_path: Path, light: float, frames: int, told: str) -> None:
+    pixels = SpikeSensor(SENSOR, 1, SensorNoise())
+    with pytest.raises(CalibrationError, match=told):
+        Calibration.measure(record(tmp_path / "flat.dat", pixels, light, frames), None)
+
+
+def test_a_bright_dark_recording_is_refused(tmp_path: Path) -> None:
+    pixels = SpikeSensor(SENSOR, 1, SensorNoise())
+    flat = record(tmp_path / "flat.dat", pixels, 0.2)
+    with pytest.raises(CalibrationError, match="not dark"):
+        Calibration.measure(flat, record(tmp_path / "dark.dat", pixels, 0.15))
+
+
+@pytest.mark.parametrize("content", [b"", b"not an archive", b"PK\x03\x04garbage"])
+def test_other_files_are_no_calibrations(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "camera.npz"
+    path.write_bytes(content)
+    with pytest.raises(CalibrationError, match=r"camera\.npz"):
+        Calibration.read(path)
+
+
+def test_a_missing_pixel_takes_the_mean_of_the_nearest_good_ones() -> None:
+    image = np.arange(25, dtype=np.float32).reshape(5, 5)
+    good = np.ones((5, 5), bool)
+    good[2, 2] = False
+    image[2, 2] = 1e6
+    np.testing.assert_allclose(around(image, good)[2, 2], 12.0)

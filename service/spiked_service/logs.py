@@ -76,7 +76,7 @@ def relay(line: Logged) -> None:
 
 
 class _ToBus(logging.Handler):
-    """Publishes lines as events. The bus itself never logs, so no line begets another."""
+    """Publishes lines as events, but none that sending an event can cause."""
 
     def __init__(self, bus: Bus, shared: list[structlog.typing.Processor]) -> None:
         super().__init__(logging.INFO)
@@ -84,6 +84,8 @@ class _ToBus(logging.Handler):
         self._shared = shared
 
     def emit(self, record: logging.LogRecord) -> None:
+        if record.name in _QUIET:
+            return  # words about connections, sent over connections, would beget more of them
         line = self._line(record)
         fields = {name: value for name, value in line.items() if not name.startswith("_")}
         capture_id, reconstruction_id = fields.pop("capture_id", None), fields.pop("reconstruction_id", None)

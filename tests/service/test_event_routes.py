@@ -4,6 +4,7 @@ import base64
 import json
 import os
 import socket
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -193,6 +194,20 @@ def test_a_client_that_is_stuck_is_left(service: Service, monkeypatch: pytest.Mo
         for number in range(4000):
             service.bus.publish(Topic.POSE, Note(number=number, filling="x" * 4000))
         wait_for(lambda: service.bus.subscribers() == 0 and service.gate.inside == 0)
+
+
+def test_clients_that_vanish_with_messages_on_their_way_cause_no_noise(
+    service: Service, caplog: pytest.LogCaptureFixture
+) -> None:
+    for _ in range(3):
+        gone = raw_client(service)
+        wait_for(lambda: service.bus.subscribers() == 1)
+        gone.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # a reset, not a farewell
+        gone.close()
+        for number in range(300):
+            service.bus.publish(Topic.POSE, Note(number=number))
+        wait_for(lambda: service.bus.subscribers() == 0 and service.gate.inside == 0)
+    assert not [record for record in caplog.records if record.name == "asyncio"]
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,8 @@ _STUCK_S = 30.0
 """A client that takes nothing for this long is left."""
 _HEARTBEAT_S = 15.0
 """A comment this often keeps proxies from closing a silent stream, and finds clients that are gone."""
-_TURN = 64
-"""Messages to one client before the others have their turn."""
+_TURN = 4
+"""Messages to one client before the others have their turn, and before a lost connection is noticed."""
 _ONLY_SENDS = 1003
 _STUCK = 1013
 

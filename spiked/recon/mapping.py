@@ -11,7 +11,7 @@ from spiked.recon.depth import Sweep
 from spiked.recon.nuisances import Nuisances
 from spiked.recon.options import MapOptions
 from spiked.recon.views import Image, View, luminance
-from spiked.render import Camera, Gradients, Rasteriser
+from spiked.render import Camera, Gradients, rasteriser_for
 from spiked.render.loss import dssim
 from spiked.render.optimiser import Adam
 from spiked.render.splats import Image as Rendered
@@ -55,7 +55,7 @@ class Mapper:
         self.channels = None if sensor.mosaic is None else sensor.mosaic.channels(sensor.height, sensor.width)
         self.scene = Scene.empty(self.colours)
         self.white = 1.0
-        self.rasteriser = Rasteriser(camera, threads)
+        self.rasteriser = rasteriser_for(camera, threads)
         self.adam = Adam(self.scene.arrays())
         self.nuisances = Nuisances(sensor.height, sensor.width)
         self.steps = 0

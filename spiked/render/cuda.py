@@ -85,13 +85,13 @@ class CudaRasteriser:
         background: float | Sequence[float] = 0.0,
     ) -> Image:
         """As `cpu.Rasteriser.forward`."""
-        rotations, centres = self._poses(rotations, centres, 1)
+        turned, places = self._poses(rotations, centres, 1)
         size = (self.camera.height, self.camera.width)
         if weights is None:
-            weights = np.full((len(rotations), 1, 1), 1 / len(rotations), np.float32)
-        elif weights.shape != (len(rotations), *size):
-            raise ConfigurationError(f"weights are {weights.shape}, expected {(len(rotations), *size)}")
-        return self._render(splats, rotations, centres, np.eye(len(rotations)), weights, channels, background)
+            weights = np.full((len(turned), 1, 1), 1 / len(turned), np.float32)
+        elif weights.shape != (len(turned), *size):
+            raise ConfigurationError(f"weights are {weights.shape}, expected {(len(turned), *size)}")
+        return self._render(splats, turned, places, np.eye(len(turned)), weights, channels, background)
 
     def forward_moving(
         self,
@@ -104,7 +104,7 @@ class CudaRasteriser:
         background: float | Sequence[float] = 0.0,
     ) -> Image:
         """As `cpu.Rasteriser.forward_moving`."""
-        rotations, centres = self._poses(rotations, centres, 2)
+        turned, places = self._poses(rotations, centres, 2)
         size = (self.camera.height, self.camera.width)
         windows = np.asarray(windows, np.float32)
         if windows.shape != (2, *size):
@@ -113,19 +113,19 @@ class CudaRasteriser:
             )
         if not np.isfinite(windows).all():
             raise ConfigurationError("a window is not finite: give a pixel that does not look an empty one, as 0, 0")
-        instants = (len(rotations) - 1) * INSTANTS
+        instants = (len(turned) - 1) * INSTANTS
         edges = (np.arange(instants + 1, dtype=np.float32) / INSTANTS)[:, None, None]
         start, stop = windows
         overlap = np.clip(np.minimum(stop, edges[1:]) - np.maximum(start, edges[:-1]), 0, None)
         weights = overlap / np.where(stop > start, stop - start, 1)
         # To first order in the small turn between two poses, an instant's perturbation is the mean of theirs.
-        blend = np.zeros((instants, len(rotations)))
-        turned = np.empty((instants, 3, 3))
+        blend = np.zeros((instants, len(turned)))
+        between = np.empty((instants, 3, 3))
         for i, time in enumerate((np.arange(instants) + 0.5) / INSTANTS):
             s, share = int(time), time - int(time)
             blend[i, s : s + 2] = 1 - share, share
-            turned[i] = exp_so3(share * log_so3(rotations[s + 1] @ rotations[s].T)) @ rotations[s]
-        return self._render(splats, turned, centres, blend, weights.astype(np.float32), channels, background)
+            between[i] = exp_so3(share * log_so3(turned[s + 1] @ turned[s].T)) @ turned[s]
+        return self._render(splats, between, places, blend, weights.astype(np.float32), channels, background)
 
     def backward(self, d_values: Floats) -> Gradients:
         """As `cpu.Rasteriser.backward`."""
@@ -161,7 +161,9 @@ class CudaRasteriser:
             last.radii.amax(0).cpu().numpy().astype(np.float32),
         )
 
-    def _poses(self, rotations: ArrayLike, centres: ArrayLike, least: int) -> tuple[NDArray[np.float64], Any]:
+    def _poses(
+        self, rotations: ArrayLike, centres: ArrayLike, least: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         turned, places = np.asarray(rotations, np.float64), np.asarray(centres, np.float64)
         if turned.ndim != 3 or turned.shape[1:] != (3, 3) or places.shape != (len(turned), 3):
             raise ConfigurationError(

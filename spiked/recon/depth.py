@@ -14,6 +14,9 @@ from spiked.pose import Array
 from spiked.recon.views import Image
 from spiked.sensor import Intrinsics
 
+SWEPT_PIXELS = 130_000
+"""Images of more pixels than about this are made smaller for the sweep: the first splats are coarser still."""
+
 
 @dataclass(frozen=True)
 class Shot:
@@ -51,8 +54,19 @@ def sweep(
     reference: Shot, others: list[Shot], intrinsics: Intrinsics, near_far: tuple[float, float], noise: Image
 ) -> Sweep:
     """Inverse depth of `reference` between `near_far` (inverse depths: largest, smallest). `noise` [H, W] is the
-    standard deviation of a difference between two images."""
+    standard deviation of a difference between two images. Large images are swept at a fraction of their size."""
     height, width = reference.image.shape
+    fraction = max(1, round(float(np.sqrt(height * width / SWEPT_PIXELS))))
+    if fraction > 1:
+        small = sweep(
+            _smaller(reference, fraction),
+            [_smaller(other, fraction) for other in others],
+            Intrinsics(*(v / fraction for v in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))),
+            near_far,
+            _shrunk(noise, fraction) / fraction,
+        )
+        size = (width, height)
+        return Sweep(*(cv2.resize(image, size).astype(np.float32) for image in (small.inverse_depth, small.confidence)))
     k = intrinsics.matrix()
     baseline = max(np.linalg.norm(o.centre - reference.centre) for o in others)
     largest, smallest = near_far
@@ -71,6 +85,17 @@ def sweep(
             cv2.boxFilter(total, -1, (3, 3)) + cv2.boxFilter(total, -1, (9, 9)) + cv2.boxFilter(total, -1, (21, 21))
         )
     return _winner(cost, inverse)
+
+
+def _smaller(shot: Shot, fraction: int) -> Shot:
+    return Shot(_shrunk(shot.image, fraction), shot.rotation, shot.centre)
+
+
+def _shrunk(image: Image, fraction: int) -> Image:
+    """Means of squares of pixels; what does not fill a square at the edges is left out of the last one."""
+    height, width = image.shape
+    shape = (round(width / fraction), round(height / fraction))
+    return np.asarray(cv2.resize(image, shape, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _through_plane(other: Shot, reference: Shot, k: Array, inverse_depth: float) -> Image:

@@ -22,6 +22,8 @@ SSIM_SCALE = 0.01
 """Brings 1 - SSIM to the size of the mean squared error."""
 
 
+SEED_SHARE = 0.6
+"""Part of all splats that one view may begin with."""
 NUISANCES_FROM = 300
 """Steps before they are estimated at all: first the map has to look like something."""
 GAINS_FROM = 1500
@@ -81,7 +83,8 @@ class Mapper:
         else:
             self.white = float(np.percentile(view.rate, 99.5))
             empty = np.ones((height, width), bool)
-        step = self.options.stride_px
+        # The first view leaves room for what others see; all of it gets splats, however few there may be.
+        step = max(self.options.stride_px, float(np.sqrt(height * width / (SEED_SHARE * self.cap))))
         v, u = (
             g.ravel().astype(int)
             for g in np.meshgrid(np.arange(step / 2, height, step), np.arange(step / 2, width, step), indexing="ij")

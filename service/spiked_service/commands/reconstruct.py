@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -25,6 +25,9 @@ from spiked_service import geometry as g
 from spiked_service.console import messages, output, report_warning
 from spiked_service.offline import reconstruct_recording
 
+if TYPE_CHECKING:
+    from spiked_service.watch import Watch
+
 INTERRUPTED = 130
 _FEED_SHARE = 0.3
 """Part of the progress bar for feeding; the refinement has the rest."""
@@ -38,6 +41,8 @@ def reconstruct(
     steps: Annotated[int, typer.Option(help="Gradient steps of the final refinement.", min=0)] = Options().steps,
     seed: Annotated[int, typer.Option(help="The same seed gives the same result.")] = 0,
     threads: Annotated[int | None, typer.Option(help="Threads of the rasteriser; all cores if not given.")] = None,
+    watch: Annotated[bool, typer.Option("--watch", help="Serve a page that shows it while it works.")] = False,
+    watch_port: Annotated[int, typer.Option(help="Its port on this machine; 0 takes a free one.", min=0)] = 8651,
     fov: g.Fov = None,
     intrinsics: g.IntrinsicsText = None,
     width: g.Width = None,
@@ -79,10 +84,17 @@ def reconstruct(
     )
     _check_folder(out)
     total = recording.capture_index(recording.frames - 1) + 1
+    page = _watched(file.name, watch_port) if watch else None
     with _interruptible() as interrupt, _Display(total) as display:
-        reconstruct_recording(
-            recording, reconstructor, progress=display.show, cancelled=interrupt.is_set, budget_s=seconds
-        )
+
+        def show(status: Status) -> None:
+            display.show(status)
+            if page is not None:
+                page.show(reconstructor, status)
+
+        reconstruct_recording(recording, reconstructor, progress=show, cancelled=interrupt.is_set, budget_s=seconds)
+    if page is not None:
+        page.close()
     _write(reconstructor, out, file.name, display.curve)
     for warning in reconstructor.warnings:
         report_warning(warning)
@@ -105,6 +117,14 @@ def _by_pixels(recording: Recording, sensor: Sensor) -> Sensor:
     if found is not sensor.mosaic:
         report_warning(f"by its pixels the mosaic is {found}, not {sensor.mosaic}; red and blue may still be exchanged")
     return replace(sensor, mosaic=found)
+
+
+def _watched(title: str, port: int) -> "Watch":
+    from spiked_service.watch import Watch  # a web server is not needed without it
+
+    page = Watch(title, port)
+    messages.print(f"watch it at {page.url}", markup=False)
+    return page
 
 
 class _Interrupt:

@@ -1,0 +1,71 @@
+"""`spiked calibrate`, and reconstructions with a calibration or a mosaic found by the pixels."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spiked.recording import RecordingWriter
+from spiked.sensor import Intrinsics, Mosaic, Sensor
+from spiked.simulate import MotionKind, SensorNoise, SimulatedCamera
+from spiked.simulate.sensor import SpikeSensor
+
+SENSOR = Sensor(160, 96, 20000.0, intrinsics=Intrinsics.from_fov(160, 96, 60))
+
+
+def spiked(*arguments: object) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "spiked_service", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def record(path: Path, sensor: Sensor, frames: "np.ndarray") -> Path:
+    with RecordingWriter(path, sensor) as writer:
+        writer.append(frames)
+    return path
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of the sensor that the recordings below are made with."""
+    folder = tmp_path_factory.mktemp("calibration")
+    pixels = SpikeSensor(SENSOR, 2, SensorNoise(dead_share=0.005))
+    for name, light in (("flat", 0.2), ("dark", 0.0)):
+        image = np.full((96, 160), light, np.float32)
+        record(folder / f"{name}.dat", SENSOR, pixels.expose(image, image, np.zeros(3000, np.float32)))
+    done = spiked("calibrate", folder / "flat.dat", "--dark", folder / "dark.dat", "-o", folder / "camera.npz")
+    assert done.returncode == 0, done.stderr
+    dead = int((pixels.gain == 0).sum())
+    assert f"{dead} of 15360 pixels dead or hot" in done.stdout
+    return folder / "camera.npz"
+
+
+def test_a_reconstruction_uses_a_calibration(calibration: Path, tmp_path: Path) -> None:
+    camera = SimulatedCamera(SENSOR, 2, MotionKind.ARC, noise=SensorNoise(dead_share=0.005), flow_px=0.25, parallax=0.5)
+    recording = record(tmp_path / "arc.dat", SENSOR, camera.next_frames(320))
+    done = spiked("reconstruct", recording, "-o", tmp_path / "out", "--steps", 60, "--calibration", calibration)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["options"]["calibration"] is True
+
+
+def test_a_calibration_of_another_camera_is_refused(calibration: Path, tmp_path: Path) -> None:
+    other = Sensor(64, 48, 20000.0, intrinsics=Intrinsics.from_fov(64, 48, 60))
+    recording = record(tmp_path / "other.dat", other, SimulatedCamera(other, 1).next_frames(64))
+    done = spiked("reconstruct", recording, "-o", tmp_path / "out", "--calibration", calibration)
+    assert done.returncode == 2 and "160x96" in done.stderr and "64x48" in done.stderr
+
+
+def test_a_wrong_mosaic_is_said_and_corrected_on_request(tmp_path: Path) -> None:
+    true = Sensor(160, 96, 20000.0, mosaic=Mosaic.GRBG, intrinsics=SENSOR.intrinsics)
+    said = Sensor(160, 96, 20000.0, mosaic=Mosaic.BGGR, intrinsics=SENSOR.intrinsics)
+    camera = SimulatedCamera(true, 2, MotionKind.ARC, flow_px=0.25, parallax=0.5)
+    recording = record(tmp_path / "rec.dat", said, camera.next_frames(320))
+    done = spiked("reconstruct", recording, "-o", tmp_path / "wrong", "--steps", 20)
+    assert "--mosaic auto" in done.stderr and "GRBG" in done.stderr
+    report = json.loads((tmp_path / "wrong" / "report.json").read_text())
+    assert any("mosaic" in warning for warning in report["warnings"])
+    done = spiked("reconstruct", recording, "-o", tmp_path / "right", "--steps", 20, "--mosaic", "auto")
+    assert "by its pixels the mosaic is GRBG" in " ".join(done.stderr.split())
+    assert json.loads((tmp_path / "right" / "report.json").read_text())["warnings"] == []

@@ -63,7 +63,7 @@ def sweep(
             [_smaller(other, fraction) for other in others],
             Intrinsics(*(v / fraction for v in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))),
             near_far,
-            _shrunk(noise, fraction) / fraction,
+            np.asarray(_shrunk(noise, fraction) / fraction, np.float32),
         )
         size = (width, height)
         return Sweep(*(cv2.resize(image, size).astype(np.float32) for image in (small.inverse_depth, small.confidence)))

@@ -1,6 +1,6 @@
 """The map: Gaussians fitted to views by gradient descent, added where it is empty or wrong, moved where dead."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from spiked.pose import Array
 from spiked.recon.depth import Sweep
+from spiked.recon.levels import Level, Target, levels
 from spiked.recon.nuisances import Nuisances
 from spiked.recon.options import MapOptions
 from spiked.recon.views import Image, View, luminance
-from spiked.render import Camera, Gradients, rasteriser_for
+from spiked.render import Camera, Gradients
 from spiked.render.loss import dssim
 from spiked.render.optimiser import Adam
 from spiked.render.splats import Image as Rendered
@@ -54,10 +55,11 @@ class Mapper:
         self.camera = camera
         self.sensor = sensor
         self.colours = 1 if sensor.mosaic is None else 3
-        self.channels = None if sensor.mosaic is None else sensor.mosaic.channels(sensor.height, sensor.width)
+        self.levels = levels(sensor, camera, threads)
+        self.channels = self.levels[0].channels
         self.scene = Scene.empty(self.colours)
         self.white = 1.0
-        self.rasteriser = rasteriser_for(camera, threads)
+        self.rasteriser = self.levels[0].rasteriser
         self.adam = Adam(self.scene.arrays())
         self.nuisances = Nuisances(sensor.height, sensor.width)
         self.steps = 0
@@ -117,27 +119,35 @@ class Mapper:
         self.scene = self.scene.join(fresh)
         self.adam.grow(n)
 
-    def step(self, key: int, view: View, sight: Sight, decay: float = 1.0) -> Gradients:
+    def level(self, coarse: float) -> Level:
+        """The size at which views are looked at: 0 is the full one, 1 the smallest."""
+        return self.levels[int(np.ceil(coarse * (len(self.levels) - 1)))]
+
+    def step(self, key: int, view: View, sight: Sight, decay: float, level: Level) -> Gradients:
         """One gradient step on a view; `decay` scales the rate of the means. Returns the gradients (for the poses)."""
+        target = level.target(view, sight.windows)
         # A background of any brightness: dark things have to be there, not to be holes.
-        image = self.look(sight, float(self._rng.uniform(0, self.options.background)) * self.white)
+        background = float(self._rng.uniform(0, self.options.background)) * self.white
+        image = _look(level, self.scene, replace(sight, windows=target.windows), background)
         expected = image.values
         factor: Image | None = None
-        if self.options.nuisances and self.steps >= NUISANCES_FROM:
+        if level.factor == 1 and self.options.nuisances and self.steps >= NUISANCES_FROM:
             factor = self.nuisances.factor(key)
             self.nuisances.observe(key, image.values, view.rate, view.deviation, self.steps >= GAINS_FROM)
             expected = expected * factor
             if self.steps % NUISANCE_STEPS == NUISANCE_STEPS - 1:
                 self.nuisances.update()
-        error = expected - view.rate
-        weight = self.weights(view)
+        error = expected - target.values
+        floor = np.float32((self.options.floor * self.white) ** 2)
+        weight = floor / (target.deviation**2 + floor)
         scale = np.float32(1 / (self.white**2 * error.size))
         slope = 2 * scale * weight * error
         if self.options.ssim > 0:
-            slope = (1 - self.options.ssim) * slope + self.options.ssim * SSIM_SCALE * self._structural(expected, view)
+            share, structural = self.options.ssim, self._structural(expected, target, level)
+            slope = (1 - share) * slope + share * SSIM_SCALE * structural
         if factor is not None:
             slope *= factor
-        gradients = self.rasteriser.backward(slope)
+        gradients = level.rasteriser.backward(slope)
         self._residuals[key] = float(np.mean(weight * error * error)) / self.white**2
         self.steps += 1
         o = self.options
@@ -146,11 +156,11 @@ class Mapper:
         self.adam.step(self.scene.arrays(), slopes, rates, gradients.radius_px > 0)
         return gradients
 
-    def _structural(self, expected: Image, view: View) -> Image:
+    def _structural(self, expected: Image, target: Target, level: Level) -> Image:
         """The slope of 1 - SSIM; a mosaic is compared in grey, where every colour has the same share everywhere."""
-        if self.channels is None:
-            return dssim(expected, view.rate, self.white)[1]
-        grey = luminance(expected, self.sensor.mosaic), luminance(view.rate, self.sensor.mosaic)
+        if level.channels is None:
+            return dssim(expected, target.values, self.white)[1]
+        grey = luminance(expected, self.sensor.mosaic), luminance(target.values, self.sensor.mosaic)
         # The mean over sites is symmetric, so that its transpose is itself.
         return luminance(dssim(*grey, self.white)[1], self.sensor.mosaic)
 
@@ -164,16 +174,15 @@ class Mapper:
         self._residuals.clear()
         self.nuisances.forget_views()
 
-    def look(self, sight: Sight, background: float = 0.0) -> Rendered:
-        """The map as a view saw it, before a background of that radiance."""
-        r, c, channels = sight.rotations, sight.centres, self.channels
-        if sight.windows is None:
-            return self.rasteriser.forward(self.scene, r, c, channels=channels, background=background)
-        return self.rasteriser.forward_moving(self.scene, r, c, sight.windows, channels=channels, background=background)
+    def look(self, sight: Sight) -> Rendered:
+        """The map as a view saw it."""
+        return _look(self.levels[0], self.scene, sight, 0.0)
 
-    def densify(self, key: int, view: View, rotation: Array, centre: Array, share: float = 0.06) -> None:
+    def densify(self, key: int, view: View, sight: Sight, share: float = 0.06) -> None:
         """Give splats to what is rendered worst: in place of dead ones first, then new ones up to the cap."""
-        image = self.rasteriser.forward(self.scene, rotation[None], centre[None], channels=self.channels)
+        image = self.look(sight)
+        middle = len(sight.centres) // 2
+        rotation, centre = sight.rotations[middle], sight.centres[middle]
         error = (view.rate - self.nuisances.factor(key) * image.values) * self.weights(view)
         badness = cv2.GaussianBlur(np.abs(cv2.GaussianBlur(error, (0, 0), 0.7)), (0, 0), 1.0)
         badness = np.maximum(badness - np.median(badness), 0)
@@ -198,6 +207,14 @@ class Mapper:
     def render(self, rotation: Array, centre: Array) -> Image:
         """What the map looks like from a pose, radiance [H, W] or [H, W, 3]."""
         return self.rasteriser.forward(self.scene, rotation[None], centre[None]).values
+
+
+def _look(level: Level, scene: Scene, sight: Sight, background: float) -> Rendered:
+    r, c = sight.rotations, sight.centres
+    render = level.rasteriser
+    if sight.windows is None:
+        return render.forward(scene, r, c, channels=level.channels, background=background)
+    return render.forward_moving(scene, r, c, sight.windows, channels=level.channels, background=background)
 
 
 def fill_mosaic(rate: Image, channels: NDArray[np.uint8] | None) -> Image:

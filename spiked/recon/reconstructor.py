@@ -32,9 +32,13 @@ FIRST_WINDOW = 16
 WINDOWS = (8, 16, 32, 64)
 WINDOW_MOTION_PX = (0.12, 0.6)
 """A view gets twice as long when the image moves less than the first in it, and half as long above twice the second."""
-SUB_FRAME_PX = 2.0
+SUB_FRAME_PX = 3.0
 """Image motion that one sub-frame of straight, blurred motion renders well."""
-MAX_SUB_FRAMES = 6
+MAX_SUB_FRAMES = 12
+COARSE_SHARE = 0.5
+"""Part of the refinement in which large images are looked at with fewer, larger pixels: a quarter of the work each."""
+YOUNG_STEPS = 800
+"""Steps that a map which grows with the frames is looked at coarsely."""
 SEED_VIEWS = 5
 """Views swept for depth when the map begins."""
 SWEEP_NEIGHBOURS = 5
@@ -213,7 +217,7 @@ class Reconstructor:
         if len(self._mapper.scene) == 0 or self._wants_seed():
             self._seed(self._newest_seed())
         while time.perf_counter() - begin < seconds:
-            self._step(1.0)
+            self._step(1.0, coarse=max(0.0, 1 - self._mapper.steps / YOUNG_STEPS))
         self._spent["mapping"] += time.perf_counter() - begin
         self._note()
 
@@ -263,28 +267,29 @@ class Reconstructor:
             self._seeded.append(view.time)
         self._version += 1
 
-    def _step(self, decay: float, densify: bool = True) -> None:
+    def _step(self, decay: float, densify: bool = True, coarse: float = 0.0) -> None:
         """One gradient step on the next view of a random order."""
         spline = self.spline
         assert spline is not None
         if not self._queue:
             self._queue = [int(i) for i in self._rng.permutation(self._mappable())]
         view = self._views[number := self._queue.pop()]
-        self._mapper.step(number, view, self._sight(view, spline), decay)
+        level = self._mapper.level(coarse)
+        sight = self._sight(view, spline, level.factor)
+        self._mapper.step(number, view, sight, decay, level)
         if densify and self._mapper.steps % 100 == 0:
-            rotation, centre = spline.poses([view.time])
-            self._mapper.densify(number, view, rotation[0], centre[0])
+            self._mapper.densify(number, view, sight)
         self._version += self._mapper.steps % 20 == 0
 
-    def _sight(self, view: View, spline: Spline) -> Sight:
-        """The camera's way during a view, in pieces over which the image moves little."""
+    def _sight(self, view: View, spline: Spline, pixel: int = 1) -> Sight:
+        """The camera's way during a view, in pieces over which the image moves little; pixels may be larger ones."""
         parts = self.options.mapping.sub_frames
         if parts == 0:
             rotations, centres = spline.poses([view.time])
             return Sight(rotations, centres, None)
         if parts is None:
             times, _ = view.exposure(1)
-            parts = int(np.clip(np.ceil(self._motion(spline, times) / SUB_FRAME_PX), 1, MAX_SUB_FRAMES))
+            parts = int(np.clip(np.ceil(self._motion(spline, times) / (SUB_FRAME_PX * pixel)), 1, MAX_SUB_FRAMES))
         times, windows = view.exposure(parts)
         rotations, centres = spline.poses(np.clip(times, spline.begin, spline.end))
         return Sight(rotations, centres, windows)
@@ -351,7 +356,8 @@ class Reconstructor:
         for done in range(steps):
             if cancelled():
                 break
-            self._step(10 ** (-done / steps), densify=done < 0.7 * steps)
+            coarse = max(0.0, 1 - done / (COARSE_SHARE * steps))
+            self._step(10 ** (-done / steps), densify=done < 0.7 * steps, coarse=coarse)
             if self._aligns(done, steps):
                 self._align()
             if done % 50 == 49:
@@ -368,8 +374,8 @@ class Reconstructor:
     def _align(self) -> None:
         spline = self.spline
         assert spline is not None
-        views = [self._views[i] for i in self._mappable()]
-        self._refined = align_spline(spline, views, self._mapper)
+        numbered = [(i, self._views[i]) for i in self._mappable()]
+        self._refined = align_spline(spline, numbered, self._mapper, lambda view: self._sight(view, spline))
 
     def _note(self, running_s: float = 0.0) -> None:
         """Add the loss to the curve over seconds of work; `running_s` are not counted as spent yet."""

@@ -4,24 +4,35 @@ Each view is rendered with its depth; the image gradient of the render gives how
 (the forward-additive direct method). Basis weights carry the 6x6 blocks of the views to the knots.
 """
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 
 from spiked.pose import Array, hat
-from spiked.recon.mapping import Mapper
+from spiked.recon.mapping import Mapper, Sight
 from spiked.recon.views import View, luminance
 from spiked.spline import Spline
 
 
-def align_spline(spline: Spline, views: list[View], mapper: Mapper, prior: float = 0.02) -> Spline:
-    """The spline moved so that the map agrees better with the views. `prior` damps, relative to the diagonal."""
-    times = np.array([v.time for v in views])
+def align_spline(
+    spline: Spline,
+    views: list[tuple[int, View]],
+    mapper: Mapper,
+    sight_of: Callable[[View], Sight],
+    prior: float = 0.02,
+) -> Spline:
+    """The spline moved so that the map agrees better with the numbered views, each seen as `sight_of` says.
+
+    `prior` damps, relative to the diagonal.
+    """
+    times = np.array([v.time for _, v in views])
     blend = spline.basis_matrix(times)
     rotations, centres = spline.poses(times)
     knots = blend.shape[1]
     hessian, gradient = np.zeros((knots, 6, knots, 6)), np.zeros((knots, 6))
-    for view, rotation, centre, row in zip(views, rotations, centres, blend, strict=True):
-        h, g = _normal_equations(view, rotation, centre, mapper)
+    for (key, view), rotation, centre, row in zip(views, rotations, centres, blend, strict=True):
+        h, g = _normal_equations(key, view, sight_of(view), rotation, centre, mapper)
         used = np.flatnonzero(row)
         hessian[np.ix_(used, np.arange(6), used, np.arange(6))] += np.einsum("a,ij,b->aibj", row[used], h, row[used])
         gradient[used] += row[used, None] * g
@@ -32,12 +43,15 @@ def align_spline(spline: Spline, views: list[View], mapper: Mapper, prior: float
     return spline.move(step[:, :3], step[:, 3:])
 
 
-def _normal_equations(view: View, rotation: Array, centre: Array, mapper: Mapper) -> tuple[Array, Array]:
+def _normal_equations(
+    key: int, view: View, sight: Sight, rotation: Array, centre: Array, mapper: Mapper
+) -> tuple[Array, Array]:
     """Hessian [6, 6] and gradient [6] of the view's weighted squared error, for (phi, centre) perturbed on the left."""
-    image = mapper.rasteriser.forward(mapper.scene, rotation[None], centre[None], channels=mapper.channels)
-    error = (image.values - view.rate) / mapper.white
+    image = mapper.look(sight)
+    expected = np.asarray(image.values * mapper.nuisances.factor(key), np.float32)
+    error = (expected - view.rate) / mapper.white
     k = mapper.camera.intrinsics
-    smooth = luminance(image.values, None) / mapper.white
+    smooth = luminance(expected, None) / mapper.white
     du = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 32)
     dv = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 32)
     edge = 2

@@ -1,0 +1,91 @@
+"""Views at full size and smaller: what is fitted first, quickly, before every pixel is looked at."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.recon.views import Image, View
+from spiked.render import Camera, rasteriser_for
+from spiked.sensor import Intrinsics, Mosaic, Sensor
+
+SMALLEST_PIXELS = 50_000
+"""No level has fewer pixels."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A view as a level sees it."""
+
+    values: Image
+    """Rates [H, W], or [H, W, 3] where a mosaic's tiles have become pixels."""
+    deviation: Image
+    """Their standard deviation, of the same shape."""
+    windows: Image | None
+    """[2, H, W] as in `Sight`."""
+
+
+class Level:
+    """The sensor with pixels `factor` times as large; a mosaic's tiles then are pixels of three colours."""
+
+    def __init__(self, sensor: Sensor, camera: Camera, factor: int, threads: int | None) -> None:
+        self.factor = factor
+        self._mosaic = sensor.mosaic
+        k = camera.intrinsics
+        small = Intrinsics(k.fx / factor, k.fy / factor, k.cx / factor, k.cy / factor)
+        self.camera = Camera(small, camera.width // factor, camera.height // factor)
+        self.rasteriser = rasteriser_for(self.camera, threads)
+        self.channels: NDArray[np.uint8] | None = None
+        if sensor.mosaic is not None and factor == 1:
+            self.channels = sensor.mosaic.channels(sensor.height, sensor.width)
+
+    def target(self, view: View, windows: Image | None) -> Target:
+        """A view at this size; what does not fill a large pixel at the right and lower edges is left out."""
+        if self.factor == 1:
+            return Target(view.rate, view.deviation, windows)
+        small = None if windows is None else np.ascontiguousarray(np.stack([self._mean(w) for w in windows]))
+        if self._mosaic is None:
+            return Target(self._mean(view.rate), self._mean(view.deviation) / np.float32(self.factor), small)
+        values = _tiles(view.rate, self._mosaic)
+        deviation = np.sqrt(_tiles(view.deviation**2, self._mosaic)) * _GREEN_SHARE
+        rest = self.factor // 2
+        return Target(
+            np.stack([_mean(values[..., c], rest) for c in range(3)], -1),
+            np.stack([_mean(deviation[..., c], rest) / np.float32(rest) for c in range(3)], -1),
+            small,
+        )
+
+    def _mean(self, image: Image) -> Image:
+        return _mean(image, self.factor)
+
+
+def levels(sensor: Sensor, camera: Camera, threads: int | None) -> list[Level]:
+    """From the full size down, each half of the one before."""
+    out = [Level(sensor, camera, 1, threads)]
+    while camera.width * camera.height / (2 * out[-1].factor) ** 2 >= SMALLEST_PIXELS:
+        out.append(Level(sensor, camera, 2 * out[-1].factor, threads))
+    return out
+
+
+_GREEN_SHARE = np.array([1, np.sqrt(0.5), 1], np.float32)
+"""Green is the mean of two sites."""
+
+
+def _mean(image: Image, factor: int) -> Image:
+    """Means of squares of pixels."""
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    squares = image[: height * factor, : width * factor].reshape(height, factor, width, factor)
+    return np.ascontiguousarray(squares.mean((1, 3), dtype=np.float32))
+
+
+def _tiles(image: Image, mosaic: Mosaic) -> Image:
+    """[H / 2, W / 2, 3] from a mosaic's sites [H, W]."""
+    height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
+    tile = mosaic.channels(2, 2)
+    out = np.zeros((height // 2, width // 2, 3), np.float32)
+    for r in range(2):
+        for c in range(2):
+            colour = tile[r, c]
+            share = 0.5 if colour == 1 else 1.0
+            out[..., colour] += np.float32(share) * image[r:height:2, c:width:2]
+    return out

@@ -25,7 +25,7 @@ SSIM_SCALE = 0.01
 
 SEED_SHARE = 0.6
 """Part of all splats that one view may begin with."""
-NUISANCES_FROM = 300
+NUISANCES_FROM = 50
 """Steps before they are estimated at all: first the map has to look like something."""
 GAINS_FROM = 1500
 """Steps before the gains of pixels are: they would take on what the geometry has yet to explain."""

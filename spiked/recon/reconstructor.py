@@ -436,6 +436,13 @@ class Reconstructor:
         values = self._mapper.render(rotation, centre / self._unit)
         return values[..., None] if values.ndim == 2 else values
 
+    def level(self, time_s: float) -> float:
+        """The brightness of the image at a time, relative to the map's: flicker and lamps. 1 before any map."""
+        if not self._views:
+            return 1.0
+        times = np.array([view.time for view in self._views]) / self.sensor.frame_rate_hz
+        return self._mapper.nuisances.level(int(np.argmin(np.abs(times - time_s))))
+
     def samples(self, count: int = 4) -> list[Sample]:
         """Observed and rendered images at some times over the recording; empty before there is a map."""
         usable = self._mappable()

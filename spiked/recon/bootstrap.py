@@ -19,6 +19,15 @@ from spiked.sensor import Intrinsics
 SCALE_PX = 0.3
 """Scale of the Cauchy loss: tracks on spike-aligned rates are good to about 0.05 px."""
 INLIER_PX = 1.0
+LEAST_INLIERS = 0.6
+PARALLAX_NOISES = 10.0
+"""Parallax, in standard deviations of a place on a track, that a first map needs: with less, depths are noise."""
+SAME = 0.8
+"""Correlation of inverse depths above which two outcomes are one scene."""
+WORSE_RATIO = 1.1
+CLEAR_T = 5.0
+CLEAR_RATIO = 1.02
+"""A rival is worse when its cost is by the first ratio, or by the last with this t value over the tracks."""
 
 
 class Guess(StrEnum):
@@ -57,6 +66,15 @@ class Hypothesis:
     parallax_px: float
     """Median over tracks of the largest motion that rotation alone cannot explain."""
 
+    def noise_px(self) -> float:
+        """Standard deviation of a track's place in one view and one direction, from the median residual."""
+        return float(np.median(np.linalg.norm(self.bundle.residuals(), axis=1))) / 1.1774
+
+    def track_costs(self) -> Array:
+        """Mean robust cost of each track, [P]."""
+        square = np.minimum((self.bundle.residuals() / SCALE_PX) ** 2, 1e6).sum(1)
+        return np.asarray(np.log1p(square).reshape(-1, len(self.bundle.points)).mean(0))
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -65,10 +83,13 @@ class Verdict:
     winner: Hypothesis | None
     reason: str
     tried: list[Hypothesis]
+    wanted_parallax_px: float = 0.0
+    """Parallax that would do, where there was too little for the noise that was seen."""
 
 
 def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = 0.8) -> Verdict:
-    """Try all guesses on `views`. Accepts when inliers > 60 % and the depth-reversed rival is worse."""
+    """Try all guesses on `views`. Accepts when there is enough parallax for the noise of the tracks, inliers > 60 % and
+    every different outcome, the depth-reversed one above all, is clearly worse."""
     if len(views.ids) < 30:
         return Verdict(None, f"only {len(views.ids)} tracks span the views; more texture or light is needed", [])
     rotation_only = _rotation_residual(views)
@@ -83,11 +104,16 @@ def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = 0.8) -> Verd
         Guess.RANDOM: lambda: _from_depth(views, 1 / rng.uniform(0.5, 1.5, count)),
         Guess.FIVE_POINT: lambda: _from_five_point(views),
     }
-    tried = []
+    tried: list[Hypothesis] = []
     for guess, start in starts.items():
         bundle = start()
-        if bundle is not None:
-            tried.append(_converge(guess, bundle, rotation_only))
+        if bundle is None:
+            continue
+        tried.append(_converge(guess, bundle, rotation_only))
+        wanted = PARALLAX_NOISES * tried[0].noise_px()
+        if rotation_only < wanted and tried[0].inliers > LEAST_INLIERS:
+            reason = f"parallax {rotation_only:.1f} px is below {wanted:.1f} for tracks this noisy: move sideways"
+            return Verdict(None, reason, tried, wanted)
     best = min(tried, key=lambda h: h.cost)
     rival = _converge(Guess.MIRROR, _mirrored(views, best.bundle), rotation_only)
     tried.append(rival)
@@ -97,20 +123,31 @@ def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = 0.8) -> Verd
 
 
 def _judge(best: Hypothesis, tried: list[Hypothesis]) -> Verdict:
-    if best.inliers < 0.6:
+    if best.inliers < LEAST_INLIERS:
         return Verdict(None, f"only {best.inliers:.0%} of the tracks agree with one rigid scene", tried)
-    different = [h for h in tried if h is not best and _reversed_depth(h, best)]
-    if different and min(h.cost for h in different) < 1.1 * best.cost:
-        return Verdict(
-            None, "the scene and its depth-reversed twin explain the tracks equally well: more motion is needed", tried
-        )
+    for rival in tried:
+        if rival is not best and _likeness(rival, best) < SAME and not _clearly_worse(rival, best):
+            name = "its depth-reversed twin" if _likeness(rival, best) < 0 else "another one"
+            reason = f"the scene and {name} explain the tracks equally well: more motion is needed"
+            return Verdict(None, reason, tried)
     return Verdict(best, "accepted", tried)
 
 
-def _reversed_depth(a: Hypothesis, b: Hypothesis) -> bool:
-    """Whether the two disagree about which points are near."""
-    za, zb = a.bundle.points[:, 2], b.bundle.points[:, 2]
-    return bool(np.corrcoef(1 / np.maximum(za, 1e-3), 1 / np.maximum(zb, 1e-3))[0, 1] < 0.5)
+def _likeness(a: Hypothesis, b: Hypothesis) -> float:
+    """Correlation of the inverse depths: 1 for the same scene, about -1 where near and far are exchanged."""
+    inverse = [1 / np.maximum(h.bundle.points[:, 2], 1e-3) for h in (a, b)]
+    near, far = (np.clip(q, 0.1 * np.median(q), 10 * np.median(q)) for q in inverse)
+    return float(np.corrcoef(near, far)[0, 1])
+
+
+def _clearly_worse(rival: Hypothesis, best: Hypothesis) -> bool:
+    """Whether the cost says so at once, or the tracks do, each with one voice (errors along a track are not
+    independent): a paired t-test."""
+    if rival.cost > WORSE_RATIO * best.cost:
+        return True
+    more = rival.track_costs() - best.track_costs()
+    t = more.mean() / max(more.std() / np.sqrt(len(more)), 1e-9)
+    return bool(t > CLEAR_T and rival.cost > CLEAR_RATIO * best.cost)
 
 
 def _converge(guess: Guess, bundle: Bundle, parallax: float) -> Hypothesis:

@@ -103,6 +103,10 @@ class Bundle:
                 break
         return spline, current
 
+    def pose_hessians(self, scale_px: float) -> Array:
+        """How firmly each pose is held by the points where they are: [C, 6, 6] of (rotation, centre), in 1/px^2."""
+        return self._linearise(scale_px, np.ones(len(self.centres), bool)).pose_hessian
+
     def _stepped(self, poses: Array, points: Array, free: NDArray[np.bool_]) -> "Bundle":
         rotations, centres = self.rotations.copy(), self.centres.copy()
         rotations[free] = exp_so3(poses[:, :3]) @ rotations[free]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from spiked.pose import Array, exp_so3, hat, log_so3, mean_rotation
 from spiked.recon.bootstrap import INLIER_PX, SCALE_PX, Views, bootstrap
 from spiked.recon.bundle import Bundle
+from spiked.recon.smooth import coarsest
 from spiked.recon.tracks import Picture, Tracks, search
 from spiked.sensor import Intrinsics
 from spiked.spline import Spline
@@ -62,10 +63,6 @@ KEY_EVERY = 8
 """Every eighth posed view is kept for relocalisation."""
 GLOBAL_VIEWS = 100
 """At most so many views enter the adjustment of the whole path."""
-KNOT_SPACINGS = (128, 64, 32, 16, 8)
-"""Frames between knots, tried from the coarsest."""
-KNOT_ERROR_PX = 0.12
-"""A spline that departs from the free poses by less than this is fine enough."""
 
 
 @dataclass
@@ -87,6 +84,8 @@ class Odometry:
         self._tracks = Tracks()
         self._boot_start = 0
         self._boot_parallax = MIN_PARALLAX_PX
+        self._boot_views = 0
+        self._noise_px = 0.0
         self._next_global = 0
         self._keys: dict[int, Picture] = {}
 
@@ -132,8 +131,9 @@ class Odometry:
             self._boot_start += 1
             start = self.views[self._boot_start]
             common = np.intersect1d(start.ids, newest.ids)
+            self._boot_views = 0
         count = len(self.views) - self._boot_start
-        if count < BOOT_VIEWS or (count % 3 and not final):
+        if count < BOOT_VIEWS or ((count % 3 or count < self._boot_views) and not final):
             return
         chosen = self._equal_flow()
         for k in chosen[1:-1]:
@@ -141,11 +141,12 @@ class Odometry:
         pixels = np.stack([_pick(self.views[k], common) for k in chosen])
         verdict = bootstrap(Views(pixels, common, self.intrinsics), self.seed, self._boot_parallax)
         if verdict.winner is None:
-            if verdict.tried:
-                self._boot_parallax = 1.3 * max(self._boot_parallax, verdict.tried[0].parallax_px)
+            if verdict.tried:  # that took long: wait until there is clearly more to go by
+                self._boot_parallax = max(MIN_PARALLAX_PX, 0.8 * verdict.wanted_parallax_px)
+                self._boot_views = int(1.2 * count) + 1
             self._become(State.BOOT, verdict.reason)
             return
-        bundle = verdict.winner.bundle
+        bundle, self._noise_px = verdict.winner.bundle, verdict.winner.noise_px()
         error = np.linalg.norm(bundle.residuals().reshape(len(chosen), -1, 2), axis=2)
         good = np.median(error, 0) < INLIER_PX
         self.points[common[good]] = bundle.points[good]
@@ -267,7 +268,7 @@ class Odometry:
         seen = np.bincount(row)
         # The smallest eigenvalue is the sum of squared sines of the angles between the rays and their mean direction.
         spread = np.sqrt(np.maximum(np.linalg.eigvalsh(lhs)[:, 0], 0) / np.maximum(seen, 1)) * self.intrinsics.fx
-        wide = (seen >= 5) & (spread > 0.5)
+        wide = (seen >= 5) & (spread > max(0.5, 3 * self._noise_px))
         position = np.linalg.solve(lhs + 1e-12 * np.eye(3), rhs[..., None])[..., 0]
         local = np.einsum("mji,mj->mi", rotations, position[row] - centres)
         k = self.intrinsics
@@ -406,26 +407,10 @@ class Odometry:
         return Spline(spline.first, spline.spacing, rotation @ spline.rotations, carry(spline.centres), spline.degree)
 
     def _coarsest(self, times: Array, bundle: Bundle) -> Spline:
-        depth = _median_depth(bundle)
-        spline = None
         margin = 0.5 * max(v.length for v in self.views)
         span = (self.views[0].time - margin, self.views[-1].time + margin)
-        for spacing in KNOT_SPACINGS:
-            spline = Spline.fit(times, bundle.rotations, bundle.centres, spacing, span=span)
-            rotations, centres = spline.poses(times)
-            turned = np.linalg.norm(log_so3(rotations @ bundle.rotations.swapaxes(1, 2)), axis=1)
-            moved = np.linalg.norm(centres - bundle.centres, axis=1) / depth
-            error = self.intrinsics.fx * np.hypot(turned, moved)
-            if np.sqrt(np.mean(error**2)) < KNOT_ERROR_PX:
-                break
-        assert spline is not None
-        return spline
-
-
-def _median_depth(bundle: Bundle) -> float:
-    ray = bundle.points[bundle.point] - bundle.centres[bundle.camera]
-    z = np.einsum("mj,mj->m", bundle.rotations[bundle.camera][:, :, 2], ray)
-    return float(np.median(z))
+        hessians = bundle.pose_hessians(SCALE_PX)
+        return coarsest(times, bundle.rotations, bundle.centres, hessians, len(bundle.camera), span)
 
 
 def _kind(reason: str) -> str:

@@ -28,10 +28,6 @@ from spiked.sensor import Sensor
 from spiked.spline import Spline
 from spiked.trajectory import Trajectory
 
-FIRST_WINDOW = 16
-WINDOWS = (8, 16, 32, 64)
-WINDOW_MOTION_PX = (0.12, 0.6)
-"""A view gets twice as long when the image moves less than the first in it, and half as long above twice the second."""
 SUB_FRAME_PX = 3.0
 """Image motion that one sub-frame of straight, blurred motion renders well."""
 MAX_SUB_FRAMES = 12
@@ -106,8 +102,7 @@ class Reconstructor:
         self.sensor = sensor
         self.options = options or Options()
         self.camera = Camera(sensor.intrinsics, sensor.width, sensor.height)
-        length = self.options.window_frames or FIRST_WINDOW
-        self._windows = Windows(sensor, length, length, self.options.calibration)
+        self._windows = Windows(sensor, self.options.window_frames, self.options.calibration)
         self._odometry = Odometry(sensor.intrinsics, self.options.seed)
         self._mapper = Mapper(sensor, self.camera, self.options.mapping, self.options.seed, self.options.threads)
         self._rng = np.random.default_rng(self.options.seed)
@@ -146,7 +141,7 @@ class Reconstructor:
         self._gaps.append((first_frame, count))
 
     def _add(self, view: View) -> None:
-        grey = luminance(view.rate, self.sensor.mosaic)
+        grey = luminance(view.rate, self.sensor.mosaic) if view.sharp is None else view.sharp
         white = float(np.percentile(grey, 99.5))
         posed = self._odometry.add(view.time, view.end - view.begin, picture(grey, max(white, 1e-6)), self._given(view))
         self._views.append(view)
@@ -156,8 +151,8 @@ class Reconstructor:
             self._stage = "tracking"
         if posed.rotation is not None:
             self._version += 1
-        if self.options.window_frames is None:
-            self._follow_motion(posed.motion_px, view)
+        if len(self._views) > 1:
+            self._windows.follow(posed.motion_px, view.time - self._views[-2].time)
         if len(self._views) > self.options.max_views:
             self._thin()
 
@@ -181,20 +176,6 @@ class Reconstructor:
         spline = Spline.fit(frames[around], poses.rotations[around], poses.centres[around], 1e9, degree=1)
         rotation, centre = spline.poses([view.time])
         return rotation[0], centre[0]
-
-    def _follow_motion(self, motion_px: float, view: View) -> None:
-        """Views as long as the motion allows: long ones are less noisy, short ones less blurred."""
-        if len(self._views) < 2 or motion_px == 0:
-            return
-        elapsed = view.time - self._views[-2].time
-        length = self._windows.length
-        in_window = motion_px / elapsed * length
-        index = WINDOWS.index(length)
-        if in_window > 2 * WINDOW_MOTION_PX[1] and index > 0:
-            length = WINDOWS[index - 1]
-        elif in_window < WINDOW_MOTION_PX[0] and index < len(WINDOWS) - 1:
-            length = WINDOWS[index + 1]
-        self._windows.length = self._windows.hop = length
 
     def _thin(self) -> None:
         """Let go of every second of the older half of the views."""

@@ -62,11 +62,11 @@ class Tracks:
 
     def _follow(self, image: Picture) -> float:
         before = self.pictures[self.newest]
-        moved, good = _flow(before, image, self.at, self.at, self.reach_px, levels=4)
+        moved, good = flow(before, image, self.at, self.at, self.reach_px, levels=4)
         motion = float(np.median(np.linalg.norm(moved - self.at, axis=1)[good])) if good.any() else 0.0
         for window in np.unique(self.born[good]):
             rows = np.flatnonzero(good & (self.born == window))
-            refined, ok = _flow(
+            refined, ok = flow(
                 self.pictures[window], image, self.birthplace[rows], moved[rows], self.reach_px, levels=0
             )
             near = np.linalg.norm(refined - moved[rows], axis=1) < 1.5
@@ -95,7 +95,7 @@ class Tracks:
         self.birthplace = np.concatenate([self.birthplace, fresh])
 
 
-def _flow(
+def flow(
     a: Picture, b: Picture, start: Array, guess: Array, reach_px: float, levels: int
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Positions in `b` of the points `start` of `a`, and which came back to where they started."""
@@ -122,7 +122,7 @@ def search(a: Picture, b: Picture, points: Array) -> tuple[Array, NDArray[np.boo
     shift, _ = cv2.phaseCorrelate(small[0], small[1], cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F))
     best = points, np.zeros(len(points), bool)
     for guess in (4.0 * np.array(shift), np.zeros(2)):
-        at, good = _flow(a, b, points, points + guess, 0.6, levels=4)
+        at, good = flow(a, b, points, points + guess, 0.6, levels=4)
         good &= (at > 4).all(1) & (at < np.array(b.shape[::-1]) - 4).all(1)
         if good.sum() > best[1].sum():
             best = at, good

@@ -9,12 +9,24 @@ from numpy.typing import NDArray
 
 from spiked.blocks import Window, aligned_window
 from spiked.calibration import Calibration
+from spiked.recon.motion import Sharpener, speed
 from spiked.sensor import Mosaic, Sensor
 
 Image = NDArray[np.float32]
 
 MARGIN = 24
 """Frames looked at on both sides of a window for the spikes nearest to its edges."""
+PROBE = 32
+"""Frames that the motion is first judged from."""
+WINDOWS = (4, 8, 16, 32, 64)
+FIRST_WINDOW = 16
+WINDOW_MOTION_PX = (0.12, 0.6)
+"""A view gets twice as long when the image moves less than the first in it, and half as long above twice the second."""
+FAST_PX = (0.35, 0.5)
+"""Motion a frame above the second is taken out of the pictures (until it falls below the first). Up to there windows of
+8 frames, smeared as they are, give better tracks: charge between spikes is far less noisy than carried spikes."""
+FASTEST_PX = (0.45, 0.6)
+"""Motion a frame above the second is looked at every 4 frames instead of 8 (until it falls below the first)."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +47,9 @@ class View:
     """Mean plain count."""
     after_gap: bool = False
     """Frames are missing between the view before and this one."""
+    sharp: Image | None = None
+    """Mean spikes a frame at the middle of the window, of frames around it carried along the image motion, all colours
+    mixed; None where the motion is slow or not known."""
 
     @property
     def time(self) -> float:
@@ -57,7 +72,9 @@ class View:
         return self.time + np.linspace(first, last, parts + 1), windows.astype(np.float32)
 
 
-def make_view(window: Window, after_gap: bool, calibration: Calibration | None = None) -> View:
+def make_view(
+    window: Window, after_gap: bool, calibration: Calibration | None = None, sharp: Image | None = None
+) -> View:
     """The view of a spike-aligned window, in light instead of spikes where the camera is calibrated."""
     rate = window.rate(fill=True)
     variance = np.nan_to_num(window.variance(jitter=1.2e-3), nan=0.0)
@@ -67,15 +84,19 @@ def make_view(window: Window, after_gap: bool, calibration: Calibration | None =
     middle = 0.5 * (window.begin + window.end)
     delay = np.nan_to_num(window.centre() - middle, nan=0.0).astype(np.float16)
     duration = np.where(window.valid, window.duration(), window.end - window.begin).astype(np.float16)
-    return View(window.begin, window.end, rate, deviation, delay, duration, float(window.count.mean()), after_gap)
+    count = float(window.count.mean())
+    return View(window.begin, window.end, rate, deviation, delay, duration, count, after_gap, sharp)
 
 
 class Windows:
-    """Cuts a stream of frames into views of `length` frames, one every `hop` frames. Windows never span a gap."""
+    """Cuts a stream of frames into views of `length` frames, one after the other. Windows never span a gap.
 
-    def __init__(self, sensor: Sensor, length: int, hop: int, calibration: Calibration | None = None) -> None:
+    Without a `length` it follows the motion: see `follow`. Fast motion is taken out of each view's `sharp` picture."""
+
+    def __init__(self, sensor: Sensor, length: int | None, calibration: Calibration | None = None) -> None:
         """Raises CalibrationError when the calibration is of another sensor."""
-        self.sensor, self.length, self.hop = sensor, length, hop
+        self.sensor, self.length, self.sharpen = sensor, length or FIRST_WINDOW, False
+        self._follows, self._probed = length is None, length is not None
         self._calibration = calibration
         if calibration is not None:
             calibration.check(sensor)
@@ -83,6 +104,7 @@ class Windows:
         self._first = 0
         self._next = 0
         self._gap = False
+        self._sharpener: Sharpener | None = None
 
     def feed(self, first_frame: int, frames: NDArray[np.uint8]) -> Iterator[View]:
         """Take frames uint8 [n, frame_bytes] in stored layout and yield the views that they complete."""
@@ -91,6 +113,7 @@ class Windows:
             yield from self._cut(final=True)
             self._gap = self._gap or expected > 0
             self._frames, self._first, self._next = self._frames[:0], first_frame, first_frame
+            self._sharpener = None
         self._frames = np.concatenate([self._frames, frames]) if len(self._frames) else frames
         yield from self._cut(final=False)
 
@@ -98,19 +121,60 @@ class Windows:
         """The last views, whose right margin never came."""
         yield from self._cut(final=True)
 
+    def follow(self, motion_px: float, frames: float) -> None:
+        """Choose the length of the views to come: the image moved by `motion_px` in so many frames. Long views are less
+        noisy, short ones less smeared."""
+        if not self._follows or motion_px == 0:
+            return
+        speed_px = motion_px / frames
+        self.sharpen = speed_px > FAST_PX[not self.sharpen]
+        if self.sharpen:
+            self.length = WINDOWS[0] if speed_px > FASTEST_PX[self.length > WINDOWS[0]] else WINDOWS[1]
+            return
+        index = max(WINDOWS.index(self.length), 1)
+        in_window = speed_px * self.length
+        if in_window > 2 * WINDOW_MOTION_PX[1]:
+            index = max(index - 1, 1)
+        elif in_window < WINDOW_MOTION_PX[0]:
+            index = min(index + 1, len(WINDOWS) - 1)
+        self.length = WINDOWS[index]
+
+    def _probe(self) -> None:
+        """Only fast motion changes how the first views are cut."""
+        speed_px = speed(self._frames[:PROBE], self.sensor)
+        if speed_px > FAST_PX[1]:
+            self.follow(speed_px, 1.0)
+        self._probed = True
+
     def _cut(self, final: bool) -> Iterator[View]:
         stop = self._first + len(self._frames)
+        if not self._probed and (len(self._frames) >= PROBE or final):
+            self._probe()
+        if not self._probed:
+            return
         while self._next + self.length + (0 if final else MARGIN) <= stop:
             begin, end = self._next, self._next + self.length
             low = max(self._first, begin - MARGIN)
             high = min(stop, end + MARGIN)
             part = self._frames[low - self._first : high - self._first]
-            view = make_view(aligned_window(part, self.sensor, low, begin, end), self._gap, self._calibration)
+            window = aligned_window(part, self.sensor, low, begin, end)
+            sharp = self._sharp(0.5 * (begin + end), high)
+            self._next = end
+            if sharp is None and self.sharpen and final:
+                continue  # what comes after the last frame is not known, and a smeared view would be worse than none
+            yield make_view(window, self._gap, self._calibration, sharp)
             self._gap = False
-            self._next += self.hop
-            yield view
         keep = max(self._first, min(self._next - MARGIN, stop))
         self._frames, self._first = self._frames[keep - self._first :].copy(), keep
+
+    def _sharp(self, time: float, stop: int) -> Image | None:
+        if not self.sharpen:
+            self._sharpener = None
+            return None
+        if self._sharpener is None or self._sharpener.interval != self.length:
+            self._sharpener = Sharpener(self.sensor, self.length)
+        self._sharpener.look(self._frames[: stop - self._first], self._first, time)
+        return self._sharpener.sharp(self._frames, self._first, time)
 
 
 def luminance(rate: Image, mosaic: Mosaic | None) -> Image:

@@ -11,7 +11,7 @@ from spiked.simulate import MotionKind, SimulatedCamera
 def seen(mosaic: Mosaic | None) -> Image:
     sensor = Sensor(240, 160, 20000.0, intrinsics=Intrinsics.from_fov(240, 160, 60), mosaic=mosaic)
     camera = SimulatedCamera(sensor, seed=2, motion=MotionKind.ARC, flow_px=0.3)
-    return next(iter(Windows(sensor, 32, 32).feed(0, camera.next_frames(64)))).rate
+    return next(iter(Windows(sensor, 32).feed(0, camera.next_frames(64)))).rate
 
 
 @pytest.mark.parametrize("mosaic", list(Mosaic))

@@ -111,7 +111,7 @@ def reconstruct(
 def _by_pixels(recording: Recording, sensor: Sensor) -> Sensor:
     """The sensor with the mosaic that the first frames show."""
     frames = recording.read(0, min(recording.frames, 160))
-    windows = Windows(sensor, min(32, len(frames)), 32)
+    windows = Windows(sensor, min(32, len(frames)))
     view = next(iter([*windows.feed(0, frames), *windows.flush()]))
     found = detect(view.rate, sensor.mosaic)
     if found is not sensor.mosaic:

@@ -1,0 +1,255 @@
+"""Sharp pictures of a moving scene: spikes carried along the image motion to one moment before they are added up.
+
+A window of the length that little light needs is smeared by fast motion. Its frames, though, show the same scene from
+known places once the motion between neighbouring views is roughly known: a homography (rotation, planes) and a smooth
+rest (parallax). A spike that an integrating pixel fires tells of the radiance at that very frame, whatever the length
+of the interval (phases of neighbouring pixels are independent), so carried spikes give an unbiased picture; on a
+mosaic, motion brings every colour to every place.
+"""
+
+from dataclasses import dataclass
+from dataclasses import field as dataclass_field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import spiked.native._motion as _motion
+from spiked.blocks import aligned_window
+from spiked.pose import Array
+from spiked.recon.tracks import Picture, flow, picture
+from spiked.sensor import BitOrder, Sensor
+
+Image = NDArray[np.float32]
+
+CELL_PX = 16
+"""Spacing of the nodes of a motion field."""
+SMOOTH_PX = 32.0
+"""Reach of one track's motion beyond what the homography says."""
+COARSE_FRAMES = 8
+"""Frames in a smeared window that the motion is first seen in."""
+REACH_FRAMES = 12
+"""Frames on either side of a moment that are carried to it."""
+
+Field = NDArray[np.float64]
+"""Displacements [rows, columns, 2] in px at nodes `CELL_PX` apart, beginning at the corner of the image."""
+
+
+def nodes(width: int, height: int) -> Array:
+    """Places of a field's nodes, [rows, columns, 2] px."""
+    columns, rows = -(-width // CELL_PX) + 1, -(-height // CELL_PX) + 1
+    x, y = np.meshgrid(CELL_PX * np.arange(columns), CELL_PX * np.arange(rows))
+    return np.stack([x, y], 2).astype(float)
+
+
+def fit_field(start: Array, end: Array, width: int, height: int) -> Field | None:
+    """The motion field through tracks from `start` [n, 2] to `end` [n, 2]; None where they do not agree on any."""
+    if len(start) < 12:
+        return None
+    homography, inlier = cv2.findHomography(start, end, cv2.RANSAC, 3.0)
+    if homography is None or inlier.mean() < 0.3:
+        return None
+    places = nodes(width, height)
+    rest = end - _through(homography, start)
+    size = np.linalg.norm(rest, axis=1)
+    keep = size < 4.0 * max(float(np.median(size)), 0.5)
+    distance = ((places[:, :, None] - start[keep]) ** 2).sum(3)
+    weight = np.exp(-0.5 * distance / SMOOTH_PX**2)
+    moved = np.einsum("rcn,nd->rcd", weight, rest[keep]) / (weight.sum(2, keepdims=True) + 0.5)
+    return np.asarray(_through(homography, places.reshape(-1, 2)).reshape(places.shape) - places + moved)
+
+
+def _through(homography: Array, points: Array) -> Array:
+    mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
+    return np.asarray(mapped[:, :2] / mapped[:, 2:])
+
+
+def at(field: Field, points: Array) -> Array:
+    """The field at points [..., 2] px, bilinear; constant outside."""
+    rows, columns, _ = field.shape
+    xy = points / CELL_PX
+    i = np.clip(np.floor(xy).astype(int), 0, [columns - 2, rows - 2])
+    u = np.clip(xy - i, 0, 1)
+    x, y, a, b = i[..., 0], i[..., 1], u[..., :1], u[..., 1:]
+    top = (1 - a) * field[y, x] + a * field[y, x + 1]
+    low = (1 - a) * field[y + 1, x] + a * field[y + 1, x + 1]
+    return np.asarray((1 - b) * top + b * low)
+
+
+def carried(frames: NDArray[np.uint8], sensor: Sensor, grids: NDArray[np.float32]) -> Image:
+    """Mean spikes a frame [H, W] of stored frames [n, frame_bytes], each moved by its grid [n, rows, columns, 2] px.
+
+    On a mosaic every place mixes the colours of the sites that passed it. Places that nothing passed hold the mean.
+    """
+    spikes = np.zeros((sensor.height, sensor.width), np.float32)
+    weight = np.zeros((-(-sensor.height // 4), -(-sensor.width // 4)), np.float32)
+    _motion.carry(
+        frames,
+        sensor.width,
+        sensor.height,
+        sensor.row_stride,
+        sensor.flipped,
+        sensor.bit_order is BitOrder.MSB,
+        grids,
+        CELL_PX,
+        spikes,
+        weight,
+    )
+    full = cv2.resize(weight, None, fx=4, fy=4, interpolation=cv2.INTER_LINEAR)[: sensor.height, : sensor.width]
+    row = np.array([0.25, 0.5, 0.25], np.float32)
+    spikes = cv2.sepFilter2D(spikes, cv2.CV_32F, row, row, borderType=cv2.BORDER_REFLECT_101)
+    seen = full > 0.25 * len(grids)
+    mean = float(spikes[seen].sum() / max(full[seen].sum(), 1e-9))
+    return np.asarray(np.where(seen, spikes / np.maximum(full, 1e-6), mean), np.float32)
+
+
+@dataclass
+class Motions:
+    """Motion fields between moments: `fields[k]` leads from `times[k]` to `times[k + 1]` (frames), None if unknown."""
+
+    width: int
+    height: int
+    margin: float
+    """Frames before the first and after the last moment over which their motion is taken to go on."""
+    times: list[float] = dataclass_field(default_factory=list)
+    fields: list[Field | None] = dataclass_field(default_factory=list)
+
+    def reach(self, reference: int, frames: float) -> tuple[float, float]:
+        """The span around `times[reference]`, at most `frames` long to either side, over which motion is known."""
+        moment = self.times[reference]
+        low, high = self.times[0] - self.margin, self.times[-1] + self.margin
+        for k in range(reference, len(self.fields)):
+            if self.fields[k] is None:
+                high = self.times[k]
+                break
+        for k in range(reference - 1, -1, -1):
+            if self.fields[k] is None:
+                low = self.times[k + 1]
+                break
+        # Errors of the motion cancel between the two sides, so neither reaches much farther than the other.
+        shorter = min(moment - low, high - moment)
+        reach = min(frames, shorter + 2 * self.margin)
+        return max(low, moment - reach), min(high, moment + reach)
+
+    def forget(self, before: float) -> None:
+        """Let go of moments more than one interval before a time."""
+        while len(self.times) > 2 and self.times[1] < before:
+            del self.times[0], self.fields[0]
+
+    def grids(self, reference: int, frames: Array) -> NDArray[np.float32]:
+        """For each frame time [n] the displacements of its places to where they are at `times[reference]`."""
+        places = nodes(self.width, self.height)
+        moments = np.array(self.times)
+        first = max(int(np.searchsorted(moments, frames.min(), "right")) - 1, 0)
+        last = min(int(np.searchsorted(moments, frames.max())), len(moments) - 1)
+        moved = {reference: np.zeros_like(places)}  # displacement of the reference's places at each moment
+        for k in range(reference, last):
+            moved[k + 1] = moved[k] + at(self._known(k), places + moved[k])
+        for k in range(reference - 1, first - 1, -1):
+            moved[k] = moved[k + 1] + back(self._known(k), places + moved[k + 1])
+        low = np.clip(np.searchsorted(moments, frames, "right") - 1, first, max(last - 1, first))
+        high = np.minimum(low + 1, last)
+        share = (frames - moments[low]) / np.maximum(moments[high] - moments[low], 1e-9)
+        table = np.stack([moved[k] for k in range(first, last + 1)])
+        blend = share[:, None, None, None]
+        return -inverted((1 - blend) * table[low - first] + blend * table[high - first], places).astype(np.float32)
+
+    def _known(self, interval: int) -> Field:
+        field = self.fields[interval]
+        assert field is not None, "frames beyond `reach`"
+        return field
+
+
+class Sharpener:
+    """Follows the image motion ahead of the views, and makes their sharp pictures."""
+
+    def __init__(self, sensor: Sensor, interval: int) -> None:
+        self.sensor, self.interval = sensor, interval
+        self._motions = Motions(sensor.width, sensor.height, 0.5 * interval)
+        self._last: Picture | None = None
+
+    def look(self, frames: NDArray[np.uint8], first: int, begin: float) -> None:
+        """Follow the motion through stored `frames` [n, frame_bytes], the first of absolute index `first`, at moments
+        `interval` frames apart from `begin` on."""
+        motions = self._motions
+        stop = first + len(frames)
+        half = max(COARSE_FRAMES, self.interval) // 2
+        while (time := motions.times[-1] + self.interval if motions.times else begin) + half <= stop:
+            low = max(int(time) - half, first)
+            window = aligned_window(
+                frames[low - first : int(time) + half - first], self.sensor, low, low, int(time) + half
+            )
+            small = _small(window.count)
+            if self._last is not None:
+                motions.fields.append(_coarse_motion(self._last, small, self.sensor))
+            motions.times.append(time)
+            self._last = small
+
+    def sharp(self, frames: NDArray[np.uint8], first: int, time: float) -> Image | None:
+        """The picture at a moment, in mean spikes a frame [H, W]; None where the motion around it is not known."""
+        motions = self._motions
+        if time not in motions.times:
+            return None
+        reference = motions.times.index(time)
+        low, high = motions.reach(reference, REACH_FRAMES)
+        begin, end = max(round(low), first), min(round(high), first + len(frames))
+        if len(motions.times) < 2 or end - begin < self.interval:
+            return None
+        grids = motions.grids(reference, np.arange(begin, end, dtype=float) + 0.5)
+        motions.forget(time - REACH_FRAMES)
+        return carried(frames[begin - first : end - first], self.sensor, grids)
+
+
+def speed(frames: NDArray[np.uint8], sensor: Sensor) -> float:
+    """Median image motion in px a frame over stored frames [n, frame_bytes]; 0 where nothing can be followed."""
+    if len(frames) <= 2 * COARSE_FRAMES:
+        return 0.0
+    ends = []
+    for begin in (0, len(frames) - COARSE_FRAMES):
+        part = frames[begin : begin + COARSE_FRAMES]
+        ends.append(_small(aligned_window(part, sensor, 0, 0, COARSE_FRAMES).count))
+    field = _coarse_motion(ends[0], ends[1], sensor)
+    if field is None:
+        return 0.0
+    return float(np.median(np.linalg.norm(field, axis=2))) / (len(frames) - COARSE_FRAMES)
+
+
+def _small(count: NDArray[np.uint16]) -> Picture:
+    """Counts at half the size, every second pixel the mean of a whole cell of a mosaic, as an even 8-bit picture."""
+    height, width = count.shape
+    even = count[: height // 2 * 2, : width // 2 * 2].astype(np.float32)
+    half = cv2.resize(even, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+    return picture(half, max(float(np.percentile(half, 99.5)), 1e-6))
+
+
+def _coarse_motion(a: Picture, b: Picture, sensor: Sensor) -> Field | None:
+    corners = cv2.goodFeaturesToTrack(cv2.GaussianBlur(a, (0, 0), 1.5), 300, 0.003, 6, blockSize=7)
+    if corners is None:
+        return None
+    start = corners[:, 0].astype(float) + 0.5
+    end, good = flow(a, b, start, start, reach_px=0.75, levels=3)
+    return fit_field(2 * start[good], 2 * end[good], sensor.width, sensor.height)
+
+
+def back(field: Field, points: Array) -> Array:
+    """The displacement that leads back from points [..., 2] to where the field brought them from."""
+    out = -at(field, points)
+    for _ in range(2):
+        out = -at(field, points + out)
+    return out
+
+
+def inverted(fields: Array, places: Array) -> Array:
+    """Fields [n, rows, columns, 2] as seen from where they lead: the displacement that ended at each node."""
+    out = fields
+    rows, columns, _ = places.shape
+    number = np.arange(len(fields))[:, None, None]
+    for _ in range(3):
+        xy = (places - out) / CELL_PX
+        i = np.clip(xy.astype(int), 0, [columns - 2, rows - 2])
+        u = np.clip(xy - i, 0, 1)
+        x, y, a, b = i[..., 0], i[..., 1], u[..., :1], u[..., 1:]
+        top = (1 - a) * fields[number, y, x] + a * fields[number, y, x + 1]
+        bottom = (1 - a) * fields[number, y + 1, x] + a * fields[number, y + 1, x + 1]
+        out = (1 - b) * top + b * bottom
+    return np.asarray(out)

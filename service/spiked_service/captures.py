@@ -3,7 +3,6 @@
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import urlencode
@@ -49,27 +48,30 @@ class Captures:
         self._pictures: OrderedDict[str, PreviewTaken] = OrderedDict()
         self._ended: OrderedDict[str, CaptureRow] = OrderedDict()
         self._closing = threading.Event()
+        # Looked for before this service can have captures of its own.
+        over = (str(CaptureState.COMPLETE), str(CaptureState.FAILED))
+        self._interrupted = catalogue.captures.where("state NOT IN (?, ?)", over)
+        self._orphans = folder.contents()[0] - {row.id for row in catalogue.captures.where()}
         self._ticker = threading.Thread(target=self._tick, name="counters", daemon=True)
         self._ticker.start()
 
     def recover(self) -> None:
-        """Make whole what an earlier service left unfinished: to be called once, before anything is started."""
-        over = (str(CaptureState.COMPLETE), str(CaptureState.FAILED))
-        for row in self._catalogue.captures.where("state NOT IN (?, ?)", over):
+        """Make whole what an earlier service left unfinished; to be called once, while others may start captures."""
+        while self._interrupted:
+            row = self._interrupted[0]
             self._announce.log("warning", "the service ended during this capture", row.id)
             recording, verdict = self._salvaged(row)
-            self._catalogue.captures.put(
-                replace(
-                    row,
-                    state=CaptureState.FAILED,
-                    reason=row.reason or "the service ended during the capture",
-                    recording=recording,
-                    verdict=verdict,
-                    ended_at=datetime.now(UTC),
-                )
+            self._catalogue.captures.set(
+                row.id,
+                state=CaptureState.FAILED,
+                reason=row.reason or "the service ended during the capture",
+                recording=recording,
+                verdict=verdict,
+                ended_at=datetime.now(UTC),
             )
-        known = {row.id for row in self._catalogue.captures.where()}
-        for capture_id in self._folder.contents()[0] - known:
+            self._interrupted.pop(0)
+            self._announce.capture(self.get(row.id))
+        for capture_id in self._orphans:
             self._folder.remove(self._folder.capture(capture_id))
 
     def start(self, plan: Plan) -> Snapshot:

@@ -79,9 +79,15 @@ class Reconstructions:
         self._on_live_end: dict[str, Callable[[ReconstructionRow], None]] = {}
         self._closing = False
         self._thread: threading.Thread | None = None
+        self._take_up()
 
     def start(self) -> None:
-        """Take up what an earlier service left: what ran begins again from its recording, what waited waits on."""
+        """Begin to work off the queue: to be called once, when interrupted recordings are whole again."""
+        self._thread = threading.Thread(target=self._run_queue, name="queue", daemon=True)
+        self._thread.start()
+
+    def _take_up(self) -> None:
+        """What an earlier service left running begins again from its recording; what waited waits on."""
         for row in self._catalogue.reconstructions.where("state = ?", (str(JobState.RUNNING),)):
             if row.attempts >= _MOST_ATTEMPTS:
                 told = f"given up after {row.attempts} attempts, the last of which the end of the service cut off"
@@ -89,8 +95,6 @@ class Reconstructions:
                 continue
             told = "begun again from the recording, because the service ended while it ran"
             self._save(replace(row, live=False, state=JobState.QUEUED, stage=Stage.WAITING, progress=0.0, reason=told))
-        self._thread = threading.Thread(target=self._run_queue, name="queue", daemon=True)
-        self._thread.start()
 
     def begin_live(
         self,

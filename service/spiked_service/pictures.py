@@ -24,6 +24,10 @@ _HOT_RATE = 0.3
 _HOT_MOST = 64
 
 
+class FrameNotRecordedError(RecordingError):
+    """There is no such frame in the recording."""
+
+
 class PictureKind(StrEnum):
     """What a picture shows."""
 
@@ -91,7 +95,7 @@ class Statistics:
 def shot_at(recording: Recording, frame: int | None, first_frame: int = 0) -> Shot:
     """The frames around the one with this absolute index, or those in the middle if None.
 
-    `first_frame` is the absolute index of the recording's first one. Raises RecordingError for a frame not recorded.
+    `first_frame` is the absolute index of the recording's first one. Raises FrameNotRecordedError.
     """
     if frame is None:
         return Shot(recording, recording.frames // 2, first_frame)
@@ -106,7 +110,9 @@ def shot_at(recording: Recording, frame: int | None, first_frame: int = 0) -> Sh
         row -= gap.count
     if not 0 <= row < recording.frames:
         last = first_frame + recording.capture_index(recording.frames - 1)
-        raise RecordingError(f"frame {frame} is not in the recording, which holds frames {first_frame} to {last}")
+        raise FrameNotRecordedError(
+            f"frame {frame} is not in the recording, which holds frames {first_frame} to {last}"
+        )
     return Shot(recording, row, first_frame)
 
 

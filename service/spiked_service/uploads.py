@@ -3,23 +3,28 @@
 import json
 import os
 import threading
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from fastapi.concurrency import run_in_threadpool
 
-from spiked.errors import SpikedError
+from spiked.errors import RecordingError, SpikedError
+from spiked.recording.sidecar import Sidecar
+from spiked_service.captures import Captures
+from spiked_service.child import Child
 from spiked_service.ids import new_id
+from spiked_service.messages import News, Refused, StatedGeometry, UploadChecked, UploadOrder
 from spiked_service.store.catalogue import Catalogue, StoreError
 from spiked_service.store.folder import DataFolder
-from spiked_service.store.rows import UploadRow
+from spiked_service.store.rows import Grade, Judgement, Recorded, UploadRow
 
 _RESERVE_BYTES = 256 << 20
 """What an upload leaves free on the disk for captures."""
 _WRITE_BYTES = 1 << 20
+_CHECK_S = 3600.0
 
 
 class UploadError(SpikedError):
@@ -96,10 +101,11 @@ class Uploads:
                 row = await run_in_threadpool(self._reached, upload_id, end)
         return row
 
-    def complete(self, upload_id: str, adopt: Callable[[UploadRow], str]) -> UploadRow:
-        """Hand a whole upload on; `adopt` checks it and gives the id of the capture that it becomes.
+    def complete(self, upload_id: str, captures: Captures) -> UploadRow:
+        """Check a whole upload in a worker and make a capture of it; one that was completed stays as it is.
 
-        Raises UnknownIdError, UploadError while bytes are missing, UploadBusyError, and what `adopt` raises.
+        Raises UnknownIdError, UploadError while bytes are missing, UploadBusyError, StoreError, and RecordingError for
+        what is no recording: the upload stays, and can be completed with another geometry.
         """
         self.get(upload_id)
         with self._alone(upload_id):
@@ -108,8 +114,12 @@ class Uploads:
                 return row
             if row.offset_bytes != row.bytes:
                 raise UploadError(f"{row.offset_bytes} of {row.bytes} bytes have come; send the rest first")
-            capture_id = adopt(row)
-            return self._catalogue.uploads.change(upload_id, lambda now: replace(now, capture_id=capture_id))
+            said = json.loads(row.geometry or "{}")
+            checked = _checked(self._folder.upload(upload_id), row, said.get("geometry"))
+            recorded = Recorded(checked.frames, checked.bytes, lost=checked.lost, sha256=checked.sha256)
+            verdict = Judgement(Grade(checked.grade), checked.reasons)
+            captures.adopt(row, checked.sensor, recorded, verdict, said.get("notes", ""))
+            return self.get(upload_id)
 
     def remove(self, upload_id: str) -> None:
         """Forget an upload and what has come of it; the capture that it became stays. Raises UnknownIdError."""
@@ -165,6 +175,45 @@ class _Tail:
             with suppress(OSError):
                 os.close(self._file)
         return self._offset
+
+
+def _checked(path: Path, row: UploadRow, geometry: dict[str, Any] | None) -> UploadChecked:
+    """What a worker finds; in the service nobody looks into a file from elsewhere."""
+    order = UploadOrder(
+        path=path,
+        sha256=row.sha256,
+        sidecar=None if row.sidecar is None else Sidecar.model_validate_json(row.sidecar),
+        geometry=StatedGeometry.model_validate(geometry or {}),
+    )
+    found: list[UploadChecked] = []
+    refused: list[str] = []
+    trouble: list[str | None] = []
+    over = threading.Event()
+
+    def hear(news: News) -> None:
+        match news:
+            case UploadChecked():
+                found.append(news)
+            case Refused():
+                refused.append(news.reason)
+
+    def ended(what: str | None) -> None:
+        trouble.append(what)
+        over.set()
+
+    log = path.with_suffix(".log")
+    child = Child(order, log, hear, ended)
+    try:
+        if not over.wait(_CHECK_S):
+            child.dismiss()
+            raise UploadError(f"the check of upload {row.id} took more than {_CHECK_S:.0f} s")
+    finally:
+        child.kill_after(1.0)
+        log.unlink(missing_ok=True)
+    if not found:
+        why = (refused or [trouble[0] or "its worker left no word"])[0].replace(str(path), row.name)
+        raise RecordingError(f"upload {row.id} cannot be used as a recording: {why}")
+    return found[0]
 
 
 @contextmanager

@@ -12,7 +12,9 @@ from starlette.exceptions import HTTPException
 from spiked.errors import SpikedError
 from spiked_service.errors import BusyError
 from spiked_service.limits import OverloadedError
+from spiked_service.pictures import FrameNotRecordedError
 from spiked_service.store.catalogue import StoreError, UnknownIdError
+from spiked_service.uploads import UploadBusyError, UploadError, UploadOffsetError
 
 MEDIA_TYPE = "application/problem+json"
 _RETRY_S = 1
@@ -57,6 +59,10 @@ class ConflictError(SpikedError):
     """The request does not fit the state that things are in."""
 
 
+class UnsupportedTypeError(SpikedError):
+    """A body of a type that is not taken."""
+
+
 class KeyReusedError(SpikedError):
     """An idempotency key came with another request than before."""
 
@@ -65,7 +71,12 @@ _STATUS: dict[type[SpikedError], HTTPStatus] = {
     UnknownIdError: HTTPStatus.NOT_FOUND,
     NotReadyError: HTTPStatus.NOT_FOUND,
     GoneError: HTTPStatus.NOT_FOUND,
+    FrameNotRecordedError: HTTPStatus.NOT_FOUND,
     BusyError: HTTPStatus.CONFLICT,
+    UploadBusyError: HTTPStatus.CONFLICT,
+    UploadOffsetError: HTTPStatus.CONFLICT,
+    UploadError: HTTPStatus.CONFLICT,
+    UnsupportedTypeError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
     ConflictError: HTTPStatus.CONFLICT,
     OverloadedError: HTTPStatus.SERVICE_UNAVAILABLE,
     StoreError: HTTPStatus.INSUFFICIENT_STORAGE,
@@ -74,6 +85,7 @@ _STATUS: dict[type[SpikedError], HTTPStatus] = {
 _KINDS: dict[type[SpikedError], str] = {
     NotReadyError: "not-ready",
     GoneError: "gone",
+    FrameNotRecordedError: "not-recorded",
     BusyError: "busy",
     KeyReusedError: "idempotency-key-reused",
 }
@@ -98,6 +110,7 @@ _WHAT_TO_DO: dict[int, str] = {
 _MORE: dict[str, str] = {
     "not-ready": "ask again in a moment, or wait for the event that tells of it",
     "gone": "ask for a newer version; GET versions lists those that are kept",
+    "not-recorded": "ask for a frame that the detail names",
     "idempotency-key-reused": "use a new key for a new request",
 }
 
@@ -128,7 +141,9 @@ def problem(
 def problem_of(error: SpikedError, request: Request) -> JSONResponse:
     """The response to one of our own errors."""
     status = next((_STATUS[kind] for kind in type(error).__mro__ if kind in _STATUS), HTTPStatus.UNPROCESSABLE_ENTITY)
-    headers = {"Retry-After": str(_RETRY_S)} if status is HTTPStatus.SERVICE_UNAVAILABLE else None
+    headers = {"Retry-After": str(_RETRY_S)} if status is HTTPStatus.SERVICE_UNAVAILABLE else {}
+    if isinstance(error, UploadOffsetError):
+        headers["Upload-Offset"] = str(error.offset_bytes)
     return problem(status, str(error), headers, kind=_KINDS.get(type(error)), instance=request.url.path)
 
 

@@ -20,7 +20,10 @@ from spiked_service.api.schemas.base import (
     example,
     examples,
 )
+from spiked_service.messages import PreviewTaken
+from spiked_service.pictures import Statistics
 from spiked_service.reconstruction_options import ReconstructionOptions
+from spiked_service.snapshot import Snapshot
 from spiked_service.store.rows import CaptureRow, CaptureState, Counters, Grade, Judgement, Origin, Recorded
 
 
@@ -264,6 +267,11 @@ class CaptureOut(Out):
     sensor: SensorOut | None = Field(description="Null until the source is open.")
 
     @classmethod
+    def of_snapshot(cls, snapshot: Snapshot) -> "CaptureOut":
+        """All that is known."""
+        return cls.of(snapshot.row, snapshot.counters, [row.id for row in snapshot.reconstructions])
+
+    @classmethod
     def of(cls, row: CaptureRow, counters: Counters | None, reconstruction_ids: list[str]) -> "CaptureOut":
         """A row with what is known beyond it."""
         return cls(
@@ -311,3 +319,13 @@ class StatsOut(Out):
     rate_histogram: RateHistogram
     hot_pixels: list[tuple[int, int]] = Field(description="x, y in the upright image.")
     mean_rate: float = Field(description="Spikes a pixel and frame.")
+
+    @classmethod
+    def of(cls, found: Statistics | PreviewTaken) -> "StatsOut":
+        """As it is shown."""
+        return cls(
+            frame=found.frame,
+            rate_histogram=RateHistogram.of(found.rate_histogram),
+            hot_pixels=found.hot_pixels,
+            mean_rate=found.mean_rate,
+        )

@@ -1,0 +1,40 @@
+"""A client of the daemon: `Spiked("http://127.0.0.1:8650")`. It needs nothing of the service but its address."""
+
+from spiked.client.client import Spiked
+from spiked.client.connection import ApiError, ServiceUnreachableError
+from spiked.client.events import Event
+from spiked.client.models import (
+    CaptureOut,
+    CaptureState,
+    GeometryModel,
+    ImageFormat,
+    IntrinsicsModel,
+    JobState,
+    Output,
+    Problem,
+    ReconstructionOptions,
+    ReconstructionOut,
+    SceneFormat,
+    TrajectoryFormat,
+    TrajectoryOut,
+)
+
+__all__ = [
+    "ApiError",
+    "CaptureOut",
+    "CaptureState",
+    "Event",
+    "GeometryModel",
+    "ImageFormat",
+    "IntrinsicsModel",
+    "JobState",
+    "Output",
+    "Problem",
+    "ReconstructionOptions",
+    "ReconstructionOut",
+    "SceneFormat",
+    "ServiceUnreachableError",
+    "Spiked",
+    "TrajectoryFormat",
+    "TrajectoryOut",
+]

@@ -1,0 +1,362 @@
+"""The service as an object: devices, captures, reconstructions, what they give, uploads, events."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from http import HTTPStatus
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import httpx
+
+from spiked.client.connection import ApiError, Connection
+from spiked.client.events import Event, events_in
+from spiked.client.models import (
+    CaptureOut,
+    CapturePage,
+    CaptureState,
+    DeviceOut,
+    DevicesOut,
+    GeometryModel,
+    ImageFormat,
+    IntrinsicsModel,
+    JobState,
+    Output,
+    ReconstructionOptions,
+    ReconstructionOut,
+    ReconstructionPage,
+    SceneFormat,
+    SystemOut,
+    TimelineOut,
+    TrajectoryFormat,
+    TrajectoryOut,
+    UploadOut,
+    VersionOut,
+    VersionsOut,
+)
+from spiked.errors import SpikedError
+
+_CHUNK_BYTES = 8 << 20
+_HASH_BYTES = 1 << 20
+_POLL_S = 0.2
+_T = TypeVar("_T")
+_OVER = (JobState.complete, JobState.cancelled, JobState.failed)
+
+
+class Spiked:
+    """A client of one service. Usable from any thread, and as a context manager.
+
+    Every method raises ApiError when the service refuses, and ServiceUnreachableError when it does not answer.
+    """
+
+    def __init__(
+        self, address: str = "http://127.0.0.1:8650", *, token: str | None = None, timeout_s: float = 60.0
+    ) -> None:
+        self._connection = Connection(address, token, timeout_s)
+
+    def close(self) -> None:
+        """Let go of the connections."""
+        self._connection.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def system(self) -> SystemOut:
+        """Version, uptime, disk and memory of the service."""
+        return self._connection.get("system", SystemOut)
+
+    def devices(self) -> list[DeviceOut]:
+        """What captures can be started from."""
+        return self._connection.get("devices", DevicesOut).items
+
+    def options(self) -> dict[str, Any]:
+        """JSON Schema of the options of a reconstruction."""
+        return dict(self._connection.request("GET", "options").json())
+
+    def start_capture(
+        self,
+        source: str,
+        *,
+        frames: int | None = None,
+        seconds: float | None = None,
+        pretrigger_s: float = 0.0,
+        name: str = "",
+        notes: str = "",
+        record: bool = True,
+        reconstruct: bool = True,
+        options: ReconstructionOptions | None = None,
+        intrinsics: IntrinsicsModel | None = None,
+    ) -> CaptureOut:
+        """Start a capture of so many frames or seconds, or until it is stopped."""
+        body = {
+            "source": source,
+            "frames": frames,
+            "seconds": seconds,
+            "pretrigger_s": pretrigger_s,
+            "name": name,
+            "notes": notes,
+            "record": record,
+            "reconstruct": reconstruct,
+            "options": _plain(options or ReconstructionOptions()),
+            "intrinsics": _plain(intrinsics),
+        }
+        return self._connection.post("captures", body, CaptureOut)
+
+    def captures(
+        self, *, query: str | None = None, state: CaptureState | None = None, deleted: bool = False
+    ) -> Iterator[CaptureOut]:
+        """All captures, newest first; pages are fetched as they are needed."""
+        cursor = None
+        while True:
+            page = self._connection.get(
+                "captures", CapturePage, q=query, state=state, deleted=deleted or None, cursor=cursor
+            )
+            yield from page.items
+            cursor = page.next_cursor
+            if cursor is None:
+                return
+
+    def capture(self, capture_id: str) -> CaptureOut:
+        """One capture."""
+        return self._connection.get(f"captures/{capture_id}", CaptureOut)
+
+    def stop_capture(self, capture_id: str) -> CaptureOut:
+        """End the acquisition; asked again, the refinement too."""
+        return self._connection.post(f"captures/{capture_id}:stop", None, CaptureOut)
+
+    def change_capture(
+        self, capture_id: str, *, name: str | None = None, notes: str | None = None, keep: bool | None = None
+    ) -> CaptureOut:
+        """Change what is given."""
+        given = {"name": name, "notes": notes, "keep": keep}
+        body = {key: value for key, value in given.items() if value is not None}
+        answer = self._connection.request("PATCH", f"captures/{capture_id}", json=body)
+        return CaptureOut.model_validate_json(answer.content)
+
+    def remove_capture(self, capture_id: str) -> None:
+        """Remove it; `restore_capture` brings it back for some days."""
+        self._connection.request("DELETE", f"captures/{capture_id}")
+
+    def restore_capture(self, capture_id: str) -> CaptureOut:
+        """Undo its removal."""
+        return self._connection.post(f"captures/{capture_id}:restore", None, CaptureOut)
+
+    def wait_for_capture(self, capture_id: str, timeout_s: float = 600.0) -> CaptureOut:
+        """The capture when it is over. Raises SpikedError if it is not in time."""
+        over = (CaptureState.complete, CaptureState.failed)
+        return _wait(lambda: self.capture(capture_id), lambda one: one.state in over, timeout_s)
+
+    def save_recording(self, capture_id: str, path: Path | str) -> Path:
+        """Write the `.dat` and its sidecar; a download that broke off goes on where it ended."""
+        path = Path(path)
+        part = path.with_name(f"{path.name}.{capture_id}.part")
+        done = part.stat().st_size if part.exists() else 0
+        recording = self.capture(capture_id).recording
+        if recording is None or done < recording.bytes:
+            headers = {"Range": f"bytes={done}-"} if done else {}
+            with self._connection.stream(f"captures/{capture_id}/recording", headers) as answer:
+                _append(part, answer)
+        sidecar = self._connection.request("GET", f"captures/{capture_id}/recording/sidecar")
+        path.with_suffix(".json").write_bytes(sidecar.content)
+        return part.replace(path)
+
+    def start_reconstruction(
+        self, capture_id: str, *, options: ReconstructionOptions | None = None, priority: int = 0
+    ) -> ReconstructionOut:
+        """Reconstruct a recording; it may wait in line."""
+        options = options or ReconstructionOptions()
+        body = {"capture_id": capture_id, "options": _plain(options), "priority": priority}
+        return self._connection.post("reconstructions", body, ReconstructionOut)
+
+    def reconstructions(
+        self, *, capture_id: str | None = None, state: JobState | None = None
+    ) -> Iterator[ReconstructionOut]:
+        """All reconstructions, newest first."""
+        cursor = None
+        while True:
+            page = self._connection.get(
+                "reconstructions", ReconstructionPage, capture_id=capture_id, state=state, cursor=cursor
+            )
+            yield from page.items
+            cursor = page.next_cursor
+            if cursor is None:
+                return
+
+    def reconstruction(self, reconstruction_id: str) -> ReconstructionOut:
+        """One reconstruction."""
+        return self._connection.get(f"reconstructions/{reconstruction_id}", ReconstructionOut)
+
+    def cancel_reconstruction(self, reconstruction_id: str) -> ReconstructionOut:
+        """End it; what it has published stays."""
+        return self._connection.post(f"reconstructions/{reconstruction_id}:cancel", None, ReconstructionOut)
+
+    def restart_reconstruction(
+        self, reconstruction_id: str, options: ReconstructionOptions | None = None
+    ) -> ReconstructionOut:
+        """Begin anew from the recording."""
+        body = {"options": _plain(options)}
+        return self._connection.post(f"reconstructions/{reconstruction_id}:restart", body, ReconstructionOut)
+
+    def remove_reconstruction(self, reconstruction_id: str) -> None:
+        """Remove it for good."""
+        self._connection.request("DELETE", f"reconstructions/{reconstruction_id}")
+
+    def wait_for_reconstruction(self, reconstruction_id: str, timeout_s: float = 3600.0) -> ReconstructionOut:
+        """The reconstruction when it is over. Raises SpikedError if it is not in time."""
+        return _wait(lambda: self.reconstruction(reconstruction_id), lambda one: one.state in _OVER, timeout_s)
+
+    def versions(self, reconstruction_id: str) -> list[VersionOut]:
+        """The versions that are kept, oldest first."""
+        return self._connection.get(f"reconstructions/{reconstruction_id}/versions", VersionsOut).items
+
+    def timeline(self, reconstruction_id: str) -> TimelineOut:
+        """How it went."""
+        return self._connection.get(f"reconstructions/{reconstruction_id}/timeline", TimelineOut)
+
+    def trajectory(
+        self,
+        reconstruction_id: str,
+        *,
+        version: int | None = None,
+        from_s: float | None = None,
+        to_s: float | None = None,
+        step: int | None = None,
+    ) -> TrajectoryOut:
+        """Poses of a version, the newest if none is given; from_s <= time < to_s, every step-th."""
+        path = f"reconstructions/{reconstruction_id}/trajectory"
+        return self._connection.get(path, TrajectoryOut, version=version, from_s=from_s, to_s=to_s, step=step)
+
+    def trajectory_file(
+        self, reconstruction_id: str, kind: TrajectoryFormat = TrajectoryFormat.tum, *, version: int | None = None
+    ) -> bytes:
+        """The trajectory as a file; COLMAP's is a ZIP."""
+        query = {"format": kind, "version": version}
+        return self._connection.request("GET", f"reconstructions/{reconstruction_id}/trajectory", query=query).content
+
+    def scene(
+        self,
+        reconstruction_id: str,
+        kind: SceneFormat = SceneFormat.ply,
+        *,
+        version: int | None = None,
+        max_splats: int | None = None,
+    ) -> bytes:
+        """The scene as a file; a fixed sample of it with max_splats."""
+        query = {"format": kind, "version": version, "max_splats": max_splats}
+        return self._connection.request("GET", f"reconstructions/{reconstruction_id}/scene", query=query).content
+
+    def view(
+        self,
+        reconstruction_id: str,
+        *,
+        frame: int | None = None,
+        position: Sequence[float] | None = None,
+        quaternion_wxyz: Sequence[float] | None = None,
+        c2w: Sequence[Sequence[float]] | None = None,
+        size: tuple[int, int] | None = None,
+        intrinsics: IntrinsicsModel | None = None,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        output: Output = Output.color,
+        white: float | None = None,
+        kind: ImageFormat = ImageFormat.png,
+        version: int | None = None,
+    ) -> bytes:
+        """An encoded picture from a pose: that of a frame, or position and quaternion_wxyz, or a 4x4 matrix."""
+        pose = {"frame": frame, "position": position, "quaternion_wxyz": quaternion_wxyz, "c2w": c2w}
+        body = {
+            "camera": {key: value for key, value in pose.items() if value is not None},
+            "intrinsics": _plain(intrinsics),
+            "background": background,
+            "output": output,
+            "white": white,
+        }
+        if size is not None:
+            body |= {"width": size[0], "height": size[1]}
+        path, query = f"reconstructions/{reconstruction_id}/views", {"format": kind, "version": version}
+        return self._connection.request("POST", path, query=query, json=body).content
+
+    def upload(
+        self,
+        path: Path | str,
+        *,
+        name: str | None = None,
+        notes: str = "",
+        geometry: GeometryModel | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> CaptureOut:
+        """Send a recording, with the sidecar beside it if there is one; it becomes a capture.
+
+        `progress` is told of bytes sent and bytes in all. A connection that breaks is taken up where it broke.
+        """
+        path = Path(path)
+        beside = path.with_suffix(".json")
+        size = path.stat().st_size
+        body = {
+            "name": name or path.name,
+            "notes": notes,
+            "bytes": size,
+            "sidecar": json.loads(beside.read_bytes()) if beside.exists() else None,
+            "geometry": _plain(geometry),
+            "sha256": _sha256(path),
+        }
+        upload = self._connection.post("uploads", body, UploadOut)
+        with path.open("rb") as file:
+            while upload.offset_bytes < size:
+                upload = self._send(upload, file.seek(upload.offset_bytes), file.read(_CHUNK_BYTES))
+                if progress is not None:
+                    progress(upload.offset_bytes, size)
+        return self._connection.post(f"uploads/{upload.id}:complete", None, CaptureOut)
+
+    def events(self, *, topics: Sequence[str] | None = None, since: int | None = None) -> Iterator[Event]:
+        """Messages from now on, or after the number `since`, for as long as they are taken."""
+        wanted = ",".join(topics) if topics else None
+        with self._connection.stream("events", topics=wanted, since=since) as answer:
+            yield from events_in(answer.iter_lines())
+
+    def _send(self, upload: UploadOut, offset: int, chunk: bytes) -> UploadOut:
+        headers = {"Upload-Offset": str(offset), "Content-Type": "application/octet-stream"}
+        try:
+            answer = self._connection.request("PATCH", f"uploads/{upload.id}", content=chunk, headers=headers)
+        except ApiError as error:
+            if error.status != HTTPStatus.CONFLICT:
+                raise
+            # A chunk whose answer was lost had come all the same.
+            now = self._connection.get(f"uploads/{upload.id}", UploadOut)
+            if now.offset_bytes == offset:
+                raise
+            return now
+        return UploadOut.model_validate_json(answer.content)
+
+
+def _append(part: Path, answer: httpx.Response) -> None:
+    with part.open("ab" if answer.status_code == HTTPStatus.PARTIAL_CONTENT else "wb") as file:
+        for chunk in answer.iter_bytes(_HASH_BYTES):
+            file.write(chunk)
+
+
+def _plain(model: Any) -> Mapping[str, Any] | None:
+    return None if model is None else model.model_dump(mode="json", exclude_none=True)
+
+
+def _wait(ask: Callable[[], _T], over: Callable[[_T], bool], timeout_s: float) -> _T:
+    deadline = time.monotonic() + timeout_s
+    while not over(one := ask()):
+        if time.monotonic() > deadline:
+            raise SpikedError(f"still not over after {timeout_s:g} s: {one}")
+        time.sleep(_POLL_S)
+    return one
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(_HASH_BYTES):
+            digest.update(block)
+    return digest.hexdigest()

@@ -1,0 +1,1018 @@
+"""What goes over HTTP: made from the OpenAPI description, see tests/client."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Any
+
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
+
+
+class ArmRequest(BaseModel):
+    """
+    Keep a device's newest frames at hand.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    pretrigger_s: Annotated[
+        float,
+        Field(description="How far back a capture shall be able to begin, seconds."),
+    ] = 1.0
+
+
+class BitOrder(StrEnum):
+    """
+    Which bit of a byte is the leftmost of its eight pixels.
+    """
+
+    lsb = "lsb"
+    msb = "msb"
+
+
+class CameraModel(BaseModel):
+    """
+    Where a camera is, camera to world, OpenCV axes: c2w, or position and quaternion_wxyz, or frame.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    c2w: Annotated[list[list[float]] | None, Field(description="4x4, rows.")] = None
+    position: list[float] | None = None
+    quaternion_wxyz: Annotated[list[float] | None, Field(description="Of any length but zero.")] = None
+    frame: Annotated[int | None, Field(description="As the reconstructed camera was at this frame.")] = None
+
+
+class CapabilityOut(BaseModel):
+    """
+    Something that cameras differ in.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    supported: bool
+    value: Any
+
+
+class CaptureChange(BaseModel):
+    """
+    What can be changed of a capture; fields that are not given stay.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    name: str | None = None
+    notes: str | None = None
+    keep: Annotated[bool | None, Field(description="Retention leaves it alone.")] = None
+
+
+class CaptureState(StrEnum):
+    """
+    Where a capture stands.
+    """
+
+    starting = "starting"
+    streaming = "streaming"
+    finishing = "finishing"
+    complete = "complete"
+    failed = "failed"
+
+
+class ClockPair(BaseModel):
+    """
+    The host's clock when a frame arrived.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    frame: int
+    unix_ns: int
+
+
+class DeviceState(StrEnum):
+    """
+    Where the camera of a capture stands: absent -> idle -> armed -> streaming -> lost -> absent.
+    """
+
+    absent = "absent"
+    idle = "idle"
+    armed = "armed"
+    streaming = "streaming"
+    lost = "lost"
+
+
+class DiskOut(BaseModel):
+    """
+    The disk below the data folder.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    free_bytes: int
+    total_bytes: int
+
+
+class Gap(BaseModel):
+    """
+    Frames of the capture that are missing from the file.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    first: int
+    count: int
+    cause: str
+
+
+class GapOut(BaseModel):
+    """
+    Frames that are missing.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    first: int
+    count: int
+    cause: str
+
+
+class Grade(StrEnum):
+    """
+    What a recording is good for, as `spiked verify` says it.
+    """
+
+    good = "good"
+    degraded = "degraded"
+    bad = "bad"
+
+
+class ImageFormat(StrEnum):
+    """
+    What a picture is encoded as: 8 bits a channel, a value divided by the white given and clipped, or floats.
+    """
+
+    png = "png"
+    webp = "webp"
+    jpeg = "jpeg"
+    exr = "exr"
+
+
+class IntrinsicsModel(BaseModel):
+    """
+    A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5).
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+class IntrinsicsOption(BaseModel):
+    """
+    A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5).
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+class JobState(StrEnum):
+    """
+    Where a reconstruction stands.
+    """
+
+    queued = "queued"
+    running = "running"
+    complete = "complete"
+    cancelled = "cancelled"
+    failed = "failed"
+
+
+class Layout(StrEnum):
+    """
+    How one frame's bits are stored.
+    """
+
+    compact = "compact"
+    row_tagged = "row_tagged"
+
+
+class Mosaic(StrEnum):
+    """
+    Colour of the sites (0,0) (0,1) (1,0) (1,1) of the upright image, row-major.
+    """
+
+    RGGB = "RGGB"
+    BGGR = "BGGR"
+    GRBG = "GRBG"
+    GBRG = "GBRG"
+
+
+class Output(StrEnum):
+    """
+    What a view shows.
+    """
+
+    color = "color"
+    depth = "depth"
+    alpha = "alpha"
+
+
+class PathModel(BaseModel):
+    """
+    Cameras along the reconstructed path, evenly in time.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    count: int
+    from_s: Annotated[float | None, Field(description="From its beginning if not given.")] = None
+    to_s: Annotated[float | None, Field(description="To its end if not given.")] = None
+
+
+class PictureKind(StrEnum):
+    """
+    What a picture shows.
+    """
+
+    interval = "interval"
+    rate = "rate"
+    accumulation = "accumulation"
+    render = "render"
+
+
+class Pinhole(BaseModel):
+    """
+    Intrinsics as sidecars say them, in pixels.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+class Policy(StrEnum):
+    """
+    What a consumer that falls behind wants. The writer waits for none of them.
+    """
+
+    lossless = "lossless"
+    priority = "priority"
+    latest = "latest"
+
+
+class Problem(BaseModel):
+    """
+    RFC 9457 problem details.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    type: Annotated[str, Field(description="urn:spiked:problem: and the kind of problem.")]
+    title: str
+    status: int
+    detail: Annotated[str, Field(description="What is wrong, in one sentence or a few.")]
+    instance: Annotated[str | None, Field(description="Path of the request.")]
+    what_to_do: Annotated[str | None, Field(description="What will help, where something will.")]
+
+
+class RateHistogram(BaseModel):
+    """
+    How many pixels fire how often.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    edges: Annotated[list[float], Field(description="Spikes a frame; one more than counts.")]
+    counts: list[int]
+
+
+class ReconstructionOptions(BaseModel):
+    """
+    A reconstruction's options; the defaults suit a hand-held camera.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    steps: Annotated[int, Field(description="Gradient steps of the refinement after the last frame.")] = 4000
+    seed: Annotated[int, Field(description="Same input, options and seed: same result.")] = 0
+    window_frames: Annotated[
+        int | None,
+        Field(description="Frames of a view; follows the motion (8 to 64) if not given."),
+    ] = None
+    threads: Annotated[
+        int | None,
+        Field(description="Threads of the rasteriser; all cores if not given."),
+    ] = None
+    max_views: Annotated[int, Field(description="Views kept for mapping; beyond it older ones thin out.")] = 400
+    refine_poses: Annotated[bool, Field(description="Whether the map corrects the trajectory.")] = True
+    intrinsics: Annotated[
+        IntrinsicsOption | None,
+        Field(description="Optics, where neither the capture nor its recording says them, or to overrule them."),
+    ] = None
+
+
+class ReconstructionRequest(BaseModel):
+    """
+    A recording to reconstruct.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    capture_id: str
+    options: ReconstructionOptions | None = None
+    priority: Annotated[int, Field(description="Higher ones run earlier; live captures go before all.")] = 0
+
+
+class RecordingOut(BaseModel):
+    """
+    What lies on disk of a capture.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    bytes: int
+    frames: int
+    first_frame: Annotated[int, Field(description="Index in the capture of the first frame recorded.")]
+    lost: Annotated[int, Field(description="Frames missing between its first and its last.")]
+    sha256: str | None
+
+
+class ReloadedOut(BaseModel):
+    """
+    What has come of a reload.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    changed: Annotated[list[str], Field(description="In effect now.")]
+    needs_restart: Annotated[
+        list[str],
+        Field(description="Different in file or environment, but in effect after a restart."),
+    ]
+
+
+class RestartRequest(BaseModel):
+    """
+    Begin a reconstruction anew, with other options if they are given.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    options: ReconstructionOptions | None = None
+
+
+class SceneFormat(StrEnum):
+    """
+    How a scene is written.
+    """
+
+    ply = "ply"
+    spz = "spz"
+
+
+class SensorOut(BaseModel):
+    """
+    The camera of a capture.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    width: int
+    height: int
+    frame_rate_hz: float
+    intrinsics: IntrinsicsModel | None
+    mosaic: Annotated[
+        Mosaic | None,
+        Field(description="Colour pattern of the upright image; null for a grey camera."),
+    ]
+
+
+class Stage(StrEnum):
+    """
+    What a reconstruction is at.
+    """
+
+    waiting = "waiting"
+    tracking = "tracking"
+    mapping = "mapping"
+    refining = "refining"
+    done = "done"
+
+
+class State(StrEnum):
+    """
+    What the tracker knows.
+    """
+
+    boot = "boot"
+    track = "track"
+    degraded = "degraded"
+    lost = "lost"
+    reloc = "reloc"
+
+
+class StatsOut(BaseModel):
+    """
+    Statistics of a few frames.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    frame: Annotated[int, Field(description="Absolute index of the middle one.")]
+    rate_histogram: RateHistogram
+    hot_pixels: Annotated[list[list[int]], Field(description="x, y in the upright image.")]
+    mean_rate: Annotated[float, Field(description="Spikes a pixel and frame.")]
+
+
+class SystemOut(BaseModel):
+    """
+    The running service.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    version: str
+    started_at: AwareDatetime
+    uptime_s: float
+    data_folder: str
+    disk: DiskOut
+    memory_bytes: Annotated[
+        int,
+        Field(description="Resident memory of the service itself, without its workers."),
+    ]
+    pid: int
+    events_seq: Annotated[int, Field(description="Number of the newest event.")]
+
+
+class TimelineOut(BaseModel):
+    """
+    How a reconstruction went, arrays of the same length; null where a value is not known.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    time_s: Annotated[list[float], Field(description="Since the start of the capture.")]
+    frame: list[int]
+    state: list[State]
+    chi2: list[float | None]
+    sigma_px: list[float | None]
+    rate: Annotated[list[float | None], Field(description="Mean spikes a pixel and frame.")]
+    loss: list[float | None]
+    psnr_db: list[float | None]
+    splats: list[int | None]
+    gaps: list[GapOut]
+
+
+class TokenOut(BaseModel):
+    """
+    A token, without what would open anything.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    name: str
+    created_at: AwareDatetime
+    expires_at: AwareDatetime | None
+
+
+class TokensOut(BaseModel):
+    """
+    All tokens, oldest first.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    items: list[TokenOut]
+
+
+class TrajectoryFormat(StrEnum):
+    """
+    How a trajectory is written.
+    """
+
+    json = "json"
+    tum = "tum"
+    kitti = "kitti"
+    colmap = "colmap"
+    nerfstudio = "nerfstudio"
+
+
+class TrajectoryOut(BaseModel):
+    """
+    Camera-to-world poses, OpenCV axes; one for each frame that has one, arrays of the same length.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    version: int
+    frames: Annotated[list[int], Field(description="Absolute frame indices.")]
+    times_s: Annotated[
+        list[float],
+        Field(description="Middle of each frame, seconds since the start of the capture."),
+    ]
+    positions: Annotated[list[list[float]], Field(description="[n, 3], length unit of the scene.")]
+    quaternions_wxyz: Annotated[list[list[float]], Field(description="[n, 4]")]
+    states: Annotated[
+        list[State | None],
+        Field(description="State of the tracking then; null where it is not known."),
+    ]
+
+
+class UploadOut(BaseModel):
+    """
+    How far an upload is.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    id: Annotated[str, Field(description="UUID version 7: ids sort by time.")]
+    name: str
+    bytes: Annotated[int, Field(description="What it will be.")]
+    offset_bytes: Annotated[int, Field(description="What has come; the next chunk begins here.")]
+    created_at: AwareDatetime
+    capture_id: Annotated[str | None, Field(description="What it became.")]
+
+
+class UploadSidecar(BaseModel):
+    """
+    A recording's sidecar, as `spiked record` writes it beside the `.dat`.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    format: Layout
+    width: int
+    height: int
+    frame_rate: float
+    frames: int | None
+    bit_order: BitOrder
+    flipped: bool
+    cfa: Mosaic | None = None
+    intrinsics: Pinhole | None = None
+    pixel_centre: float = 0.5
+    note: str = ""
+    first_frame: int = 0
+    gaps: Annotated[list[Gap], Field(validate_default=True)] = []
+    clock: Annotated[list[ClockPair], Field(validate_default=True)] = []
+    calibration: str | None = None
+    device: dict[str, Any] | None = None
+
+
+class UploadsOut(BaseModel):
+    """
+    Uploads that have not become captures, newest first.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    items: list[UploadOut]
+
+
+class Verdict(StrEnum):
+    """
+    How a check ended.
+    """
+
+    ok = "ok"
+    warning = "warning"
+    failed = "failed"
+
+
+class VerdictOut(BaseModel):
+    """
+    What a recording is good for.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    grade: Grade
+    reasons: Annotated[list[str], Field(description="Why it is not good, the worst first.")]
+
+
+class VersionOut(BaseModel):
+    """
+    A published version of a scene and its trajectory.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    version: int
+    at: AwareDatetime
+    splats: int
+    poses: int
+    white: float
+    scene_bytes: Annotated[int, Field(description="Size of the PLY file.")]
+    psnr_db: float | None
+
+
+class VersionsOut(BaseModel):
+    """
+    The versions that are kept, oldest first.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    items: list[VersionOut]
+
+
+class ViewRequest(BaseModel):
+    """
+    One camera gives a picture; several, or a path, give a ZIP of pictures.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    camera: CameraModel | None = None
+    cameras: list[CameraModel] | None = None
+    path: PathModel | None = None
+    width: Annotated[int | None, Field(description="Pixels; the sensor's own if not given.")] = None
+    height: int | None = None
+    intrinsics: Annotated[
+        IntrinsicsModel | None,
+        Field(
+            description="Optics of the pictures; if not given the capture's own, scaled to the width, the height taken from or added to the middle."
+        ),
+    ] = None
+    background: list[float] | None = None
+    output: Annotated[
+        Output,
+        Field(
+            description="color; depth along the camera's axis in the scene's unit of length, 0 where nothing is; alpha, 0 to 1."
+        ),
+    ] = Output.color
+    white: Annotated[
+        float | None,
+        Field(
+            description="Value shown as white in all formats but EXR. If not given: for color the scene's own, for alpha 1, for depth the largest of the picture. The header X-White says what was used."
+        ),
+    ] = None
+
+
+class SpikedServiceConfigOrigin(StrEnum):
+    """
+    Where a value comes from; later ones prevail.
+    """
+
+    default = "default"
+    file = "file"
+    environment = "environment"
+    flag = "flag"
+
+
+class SpikedServiceStoreRowsOrigin(StrEnum):
+    """
+    Where a recording comes from.
+    """
+
+    live = "live"
+    upload = "upload"
+
+
+class CaptureRequest(BaseModel):
+    """
+    A capture to start.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    source: Annotated[
+        str | None,
+        Field(
+            description="usb0, pcie0, sim: or replay:FILE, with options after a question mark. A file or simulation without `pace` waits for its readers."
+        ),
+    ] = None
+    device: Annotated[
+        str | None,
+        Field(description="Id of a device, instead of a source; `GET devices`."),
+    ] = None
+    frames: Annotated[
+        int | None,
+        Field(description="Length; until the source ends or is stopped if not given."),
+    ] = None
+    seconds: Annotated[
+        float | None,
+        Field(description="Length in seconds of the camera, instead of frames."),
+    ] = None
+    pretrigger_s: Annotated[float, Field(description="Begin so much earlier, from an armed device's ring.")] = 0.0
+    name: str = ""
+    notes: str = ""
+    record: Annotated[bool, Field(description="Keep the frames in the data folder.")] = True
+    reconstruct: Annotated[bool, Field(description="Reconstruct while it runs.")] = True
+    options: ReconstructionOptions | None = None
+    intrinsics: Annotated[
+        IntrinsicsModel | None,
+        Field(description="If the source does not know its own."),
+    ] = None
+
+
+class ConsumerOut(BaseModel):
+    """
+    One reader of the ring.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    name: str
+    policy: Annotated[
+        Policy,
+        Field(description="latest skips frames by intention; the others want them all."),
+    ]
+    received: int
+    lost: int
+    lag_frames: int
+    fill: Annotated[
+        float,
+        Field(description="Its lag as a part of what it may lag; at 1 it loses frames."),
+    ]
+    lagging: bool
+
+
+class CountersOut(BaseModel):
+    """
+    Frames of a capture; received + lost is the index of the next frame.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    device: DeviceState
+    device_reason: str
+    received: int
+    lost: Annotated[dict[str, int], Field(description="By cause: device, usb, ring, disk.")]
+    next_frame: int
+    consumers: list[ConsumerOut]
+
+
+class DeviceOut(BaseModel):
+    """
+    Something to capture from.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    id: Annotated[str, Field(description="Its name here; the same after a restart.")]
+    kind: Annotated[str, Field(description="usb, pcie, replay or sim.")]
+    source: Annotated[str, Field(description="To be given as `source` of a capture.")]
+    description: str
+    state: DeviceState
+    reason: Annotated[str, Field(description="Why it is absent or lost.")]
+    serial: str | None
+    port: str | None
+    speed: str | None
+    firmware: str | None
+    capabilities: dict[str, CapabilityOut]
+    counters: CountersOut | None
+    capture_id: Annotated[str | None, Field(description="The capture that uses it now.")]
+
+
+class DevicesOut(BaseModel):
+    """
+    All devices.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    items: list[DeviceOut]
+
+
+class FindingOut(BaseModel):
+    """
+    What one check found.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    name: str
+    verdict: Verdict
+    finding: str
+
+
+class GeometryModel(BaseModel):
+    """
+    What the recording holds, where there is no sidecar.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    width: int | None = None
+    height: int | None = None
+    frame_rate_hz: float | None = None
+    layout: Layout | None = None
+    bit_order: BitOrder | None = None
+    flipped: Annotated[bool | None, Field(description="Rows are stored bottom-up.")] = None
+    mosaic: Annotated[Mosaic | None, Field(description="Colour pattern of the upright image.")] = None
+    intrinsics: IntrinsicsModel | None = None
+
+
+class HealthOut(BaseModel):
+    """
+    How the service is.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    status: Annotated[Verdict, Field(description="The worst of the checks.")]
+    checks: list[FindingOut]
+
+
+class ReconstructionOut(BaseModel):
+    """
+    A reconstruction, live from a capture or from its recording.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    id: Annotated[str, Field(description="UUID version 7: ids sort by time.")]
+    capture_id: str
+    live: bool
+    state: JobState
+    stage: Stage
+    progress: Annotated[float, Field(description="0 to 1.")]
+    tracking_state: State
+    reason: Annotated[
+        str,
+        Field(description="Why it failed, waits or tracks badly; empty while all is well."),
+    ]
+    priority: int
+    options: ReconstructionOptions
+    created_at: AwareDatetime
+    started_at: AwareDatetime | None
+    ended_at: AwareDatetime | None
+    frames: Annotated[int, Field(description="Frames taken so far.")]
+    poses: Annotated[int, Field(description="Frames that have a pose in the published trajectory.")]
+    splats: int
+    loss: Annotated[
+        float | None,
+        Field(description="Mean squared error of the views, in units of white squared."),
+    ]
+    psnr_db: float | None
+    version: Annotated[
+        int,
+        Field(description="Number of the newest published scene and trajectory; 0: none yet."),
+    ]
+    white: Annotated[
+        float | None,
+        Field(description="Radiance shown as white in that version, spikes a frame."),
+    ]
+    eta_s: float | None
+
+
+class ReconstructionPage(BaseModel):
+    """
+    Reconstructions, newest first.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    items: list[ReconstructionOut]
+    next_cursor: Annotated[
+        str | None,
+        Field(description="To be given as `cursor` for those that follow; null: there are no more."),
+    ]
+
+
+class SettingOut(BaseModel):
+    """
+    One setting; secrets are masked.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    key: str
+    value: Any
+    origin: SpikedServiceConfigOrigin
+    reloadable: Annotated[
+        bool,
+        Field(description="Whether `configuration:reload` brings a new value into effect."),
+    ]
+    doc: str
+
+
+class SettingsOut(BaseModel):
+    """
+    All settings in effect.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    items: list[SettingOut]
+
+
+class UploadRequest(BaseModel):
+    """
+    A recording that is about to come.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    name: Annotated[str, Field(description="What the capture will be called.")]
+    notes: str = ""
+    bytes: Annotated[int, Field(description="Size of the whole `.dat`.")]
+    sidecar: UploadSidecar | None = None
+    geometry: Annotated[GeometryModel | None, Field(description="Wins over the sidecar.")] = None
+    sha256: Annotated[str | None, Field(description="Of the whole file, in hex; checked at the end.")] = None
+
+
+class CaptureOut(BaseModel):
+    """
+    A capture: frames of a camera from here or elsewhere, recorded, reconstructed, or both.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    id: Annotated[str, Field(description="UUID version 7: ids sort by time.")]
+    name: str
+    notes: str
+    keep: Annotated[bool, Field(description="Retention leaves it alone.")]
+    origin: Annotated[
+        SpikedServiceStoreRowsOrigin,
+        Field(description="live: captured here; upload: a recording from elsewhere."),
+    ]
+    source: str
+    state: CaptureState
+    reason: Annotated[str, Field(description="Why, if the capture has failed or is about to.")]
+    warnings: list[str]
+    verdict: Annotated[VerdictOut | None, Field(description="Null until the recording is closed.")]
+    started_at: AwareDatetime
+    ended_at: AwareDatetime | None
+    deleted_at: Annotated[
+        AwareDatetime | None,
+        Field(description="Not null: removed; `:restore` brings it back."),
+    ]
+    frames_planned: Annotated[int | None, Field(description="Length of the capture if it is known.")]
+    recording: RecordingOut | None
+    reconstruction_ids: Annotated[list[str], Field(description="Oldest first.")]
+    counters: CountersOut | None
+    sensor: Annotated[SensorOut | None, Field(description="Null until the source is open.")]
+
+
+class CapturePage(BaseModel):
+    """
+    Captures, newest first.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    items: list[CaptureOut]
+    next_cursor: Annotated[
+        str | None,
+        Field(description="To be given as `cursor` for those that follow; null: there are no more."),
+    ]

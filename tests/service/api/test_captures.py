@@ -1,0 +1,255 @@
+"""Captures over HTTP: start, name, remove, and what was recorded."""
+
+import hashlib
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+
+from spiked.client import ApiError, CaptureOut
+from spiked.recording import open_recording
+
+FRAMES = 512
+
+
+def picture(answer: httpx.Response) -> np.ndarray:
+    assert answer.status_code == 200, answer.text
+    decoded = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert decoded is not None
+    return np.asarray(decoded)
+
+
+def test_a_capture_tells_what_it_was(done: CaptureOut) -> None:
+    assert (done.name, done.notes, done.keep, done.origin) == ("by hand", "a first one", False, "live")
+    assert done.recording is not None and done.recording.frames == FRAMES
+    assert done.verdict is not None and done.verdict.grade in ("good", "degraded")
+    assert done.ended_at is not None and done.ended_at > done.started_at
+    assert done.sensor is not None and (done.sensor.width, done.sensor.height) == (160, 100)
+    assert done.counters is not None and done.counters.received == FRAMES
+
+
+def test_the_recording_comes_whole_in_ranges_and_only_if_changed(service: Any, done: CaptureOut) -> None:
+    url = f"captures/{done.id}/recording"
+    whole = service.http.get(url)
+    assert whole.headers["accept-ranges"] == "bytes"
+    assert len(whole.content) == done.recording.bytes == int(whole.headers["content-length"])
+    ranges = {
+        "bytes=0-99": (0, 100),
+        "bytes=100-": (100, len(whole.content)),
+        "bytes=-50": (len(whole.content) - 50, len(whole.content)),
+        f"bytes=10-{10**15}": (10, len(whole.content)),
+    }
+    for asked, (first, stop) in ranges.items():
+        part = service.http.get(url, headers={"Range": asked})
+        assert part.status_code == 206
+        assert part.content == whole.content[first:stop]
+        assert part.headers["content-range"] == f"bytes {first}-{stop - 1}/{len(whole.content)}"
+    for odd in ("bytes=5-2", "lines=1-2", "bytes=a-b", "bytes=0-1,4-5", "bytes=-"):
+        assert service.http.get(url, headers={"Range": odd}).status_code == 200
+    beyond = service.http.get(url, headers={"Range": f"bytes={len(whole.content)}-"})
+    assert beyond.status_code == 416
+    assert beyond.headers["content-range"] == f"bytes */{len(whole.content)}"
+    assert beyond.headers["content-type"] == "application/problem+json"
+    tag = whole.headers["etag"]
+    part = {"Range": "bytes=0-9"}
+    assert service.http.get(url, headers={**part, "If-Range": tag}).status_code == 206
+    assert service.http.get(url, headers={**part, "If-Range": '"other"'}).status_code == 200
+    assert service.http.get(url, headers={"If-None-Match": tag}).status_code == 304
+    head = service.http.head(url)
+    assert (head.status_code, head.content, head.headers["etag"]) == (200, b"", tag)
+
+
+def test_the_recording_opens_with_its_sidecar(service: Any, done: CaptureOut, tmp_path: Path) -> None:
+    service.client.save_recording(done.id, tmp_path / "rec.dat")
+    recording = open_recording(tmp_path / "rec.dat")
+    assert recording.frames == FRAMES
+    assert recording.sensor.frame_rate_hz == done.sensor.frame_rate_hz
+    assert recording.sensor.intrinsics is not None
+
+
+def test_a_download_that_broke_off_goes_on(service: Any, done: CaptureOut, tmp_path: Path) -> None:
+    whole = service.http.get(f"captures/{done.id}/recording").content
+    part = tmp_path / f"rec.dat.{done.id}.part"
+    for length in (100, len(whole)):
+        part.write_bytes(whole[:length])
+        assert service.client.save_recording(done.id, tmp_path / "rec.dat").read_bytes() == whole
+
+
+@pytest.mark.parametrize("kind", ["interval", "rate", "accumulation", "render"])
+def test_pictures_of_recorded_frames(service: Any, done: CaptureOut, kind: str) -> None:
+    answer = service.http.get(f"captures/{done.id}/preview", params={"kind": kind, "frame": 300, "format": "png"})
+    image = picture(answer)
+    assert image.shape[:2] == (100, 160)
+    assert image.std() > 5
+    brighter = {"kind": kind, "frame": 300, "format": "png", "white": float(answer.headers["x-white"]), "gain": 2}
+    assert picture(service.http.get(f"captures/{done.id}/preview", params=brighter)).mean() > image.mean()
+
+
+def test_a_frame_that_was_not_recorded_has_no_picture(service: Any, done: CaptureOut) -> None:
+    answer = service.http.get(f"captures/{done.id}/preview", params={"frame": FRAMES})
+    assert answer.status_code == 404
+    assert f"0 to {FRAMES - 1}" in answer.json()["detail"]
+
+
+def test_a_thumbnail_and_statistics(service: Any, done: CaptureOut) -> None:
+    assert service.http.get(f"captures/{done.id}/thumbnail").content[8:12] == b"WEBP"
+    stats = service.http.get(f"captures/{done.id}/stats", params={"frame": 200}).json()
+    histogram = stats["rate_histogram"]
+    assert sum(histogram["counts"]) == 160 * 100
+    assert len(histogram["edges"]) == len(histogram["counts"]) + 1
+    assert 0 < stats["mean_rate"] < 1
+    assert abs(stats["frame"] - 200) <= 1
+
+
+def test_names_notes_and_keeping(service: Any, done: CaptureOut) -> None:
+    changed = service.client.change_capture(done.id, name="renamed", keep=True)
+    assert (changed.name, changed.notes, changed.keep) == ("renamed", done.notes, True)
+    service.client.change_capture(done.id, name=done.name, keep=False)
+    for body in ({"name": "a\nb"}, {"name": "x" * 201}, {"nmae": "x"}, {"keep": "perhaps"}):
+        assert service.http.patch(f"captures/{done.id}", json=body).status_code == 422
+
+
+def test_removal_can_be_undone(service: Any) -> None:
+    capture = service.capture(reconstruct=False, name="to be removed")
+    service.client.remove_capture(capture.id)
+    assert capture.id not in [one.id for one in service.client.captures()]
+    assert capture.id in [one.id for one in service.client.captures(deleted=True)]
+    assert service.client.restore_capture(capture.id).deleted_at is None
+    assert capture.id in [one.id for one in service.client.captures(query="TO BE rem")]
+
+
+def test_lists_come_in_pages(service: Any, done: CaptureOut) -> None:
+    for _ in range(3):
+        service.capture(reconstruct=False)
+    ids = [one.id for one in service.client.captures()]
+    assert ids == sorted(ids, reverse=True)
+    paged, cursor = [], None
+    while True:
+        page = service.http.get("captures", params={"limit": 2, **({"cursor": cursor} if cursor else {})}).json()
+        assert len(page["items"]) <= 2
+        paged += [one["id"] for one in page["items"]]
+        cursor = page["next_cursor"]
+        if cursor is None:
+            break
+    assert paged == ids
+    assert service.http.get("captures", params={"limit": 0}).status_code == 422
+
+
+def test_a_key_makes_a_post_happen_once(service: Any) -> None:
+    body = {"source": "sim:?width=96&height=64", "frames": 64, "reconstruct": False}
+    key = {"Idempotency-Key": f"start-{time.monotonic_ns()}"}
+    first = service.http.post("captures", json=body, headers=key)
+    again = service.http.post("captures", json=body, headers=key)
+    assert (first.status_code, again.status_code) == (201, 201)
+    assert again.json() == first.json()
+    assert again.headers["location"] == first.headers["location"]
+    assert "idempotency-replayed" not in first.headers and again.headers["idempotency-replayed"] == "true"
+    other = service.http.post("captures", json={**body, "frames": 65}, headers=key)
+    assert other.status_code == 422
+    assert other.json()["type"] == "urn:spiked:problem:idempotency-key-reused"
+    assert service.http.post("captures", json=body, headers={"Idempotency-Key": "x" * 256}).status_code == 422
+    service.client.wait_for_capture(first.json()["id"])
+
+
+def test_a_post_that_failed_may_be_tried_again_with_its_key(service: Any) -> None:
+    key = {"Idempotency-Key": f"failed-{time.monotonic_ns()}"}
+    refused = service.http.post("captures", json={"source": "sim:?bogus=1"}, headers=key)
+    assert refused.status_code == 422
+    assert service.http.post("captures", json={"source": "sim:?bogus=1"}, headers=key).status_code == 422
+
+
+def test_one_capture_a_device(service: Any) -> None:
+    running = service.client.start_capture("sim:?width=96&height=64&seed=7", record=False)
+    try:
+        with pytest.raises(ApiError) as refused:
+            service.client.start_capture("sim:?width=96&height=64&seed=7")
+        assert refused.value.status == 409
+        answer = service.http.get(f"captures/{running.id}/recording")
+        assert answer.status_code == 409
+        assert service.http.delete(f"captures/{running.id}").status_code == 409
+        live = picture(poll(service, f"captures/{running.id}/preview"))
+        assert live.shape[:2] == (64, 96)
+    finally:
+        service.client.stop_capture(running.id)
+        service.client.stop_capture(running.id)
+        service.client.wait_for_capture(running.id)
+
+
+def poll(service: Any, path: str) -> httpx.Response:
+    """What will be there in a moment."""
+    deadline = time.monotonic() + 30
+    while True:
+        answer: httpx.Response = service.http.get(path)
+        if answer.status_code != 404 or time.monotonic() > deadline:
+            return answer
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../../../etc/passwd", "/etc/../etc/passwd?width=8&height=8", "a\0b"])
+def test_no_file_outside_the_open_folders_is_touched(service: Any, name: str) -> None:
+    answer = service.http.post("captures", json={"source": f"replay:{name}"})
+    assert answer.status_code == 422
+    assert "source_folders" in answer.json()["detail"]
+
+
+def test_links_out_of_the_open_folders_lead_nowhere(service: Any, tmp_path: Path) -> None:
+    (tmp_path / "link.dat").symlink_to("/etc/passwd")
+    answer = service.http.post("captures", json={"source": f"replay:{tmp_path / 'link.dat'}"})
+    assert answer.status_code == 422
+    assert "source_folders" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize("capture_id", ["no-such", "..%2F..%2Fetc", "%00", "01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10"])
+def test_ids_that_are_none(service: Any, capture_id: str) -> None:
+    for ending in ("", "/recording", "/thumbnail", "/trajectory", "/preview?frame=1", "/recording/verdict"):
+        answer = service.http.get(f"captures/{capture_id}{ending}")
+        assert answer.status_code == 404
+        assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_every_refusal_says_what_to_do(service: Any) -> None:
+    answers = {
+        404: service.http.get("nowhere"),
+        405: service.http.put("captures"),
+        422: service.http.post("captures", json={"source": "sim:", "frames": 5, "seconds": 1}),
+    }
+    for status, answer in answers.items():
+        assert answer.status_code == status
+        body = answer.json()
+        assert body["status"] == status and body["instance"].startswith("/api/v1/")
+        assert body["what_to_do"] and body["detail"] and body["type"].startswith("urn:spiked:problem:")
+    malformed = service.http.post("captures", content=b"{", headers={"Content-Type": "application/json"})
+    assert malformed.status_code == 422
+    assert "HTTPValidationError" not in httpx.get(f"{service.daemon.address}openapi.json").text
+
+
+def test_devices_say_what_they_do(service: Any) -> None:
+    sim = next(one for one in service.client.devices() if one.source == "sim:")
+    assert (sim.state, sim.capture_id) == ("idle", None)
+    assert service.http.get("devices/sim:").json()["id"] == "sim:"
+    assert service.http.get("devices/replay:no%2Fsuch").status_code == 404
+
+
+def test_a_capture_can_begin_before_it_was_asked_for(service: Any) -> None:
+    assert service.http.post("devices/sim::arm", json={"pretrigger_s": 0.02}).status_code == 202
+    assert service.http.get("devices/sim:").json()["state"] == "armed"
+    assert service.http.post("devices/sim::arm", json={"pretrigger_s": 0.02}).status_code == 409
+    assert service.http.post("devices/sim::disarm").status_code == 202
+    assert service.http.get("devices/sim:").json()["state"] == "idle"
+
+
+def test_options_describe_themselves(service: Any) -> None:
+    schema = service.client.options()
+    for name, option in schema["properties"].items():
+        assert option["description"], name
+        assert "default" in option, name
+
+
+def test_the_hash_of_a_recording(service: Any, done: CaptureOut) -> None:
+    if done.recording.sha256 is not None:
+        whole = service.http.get(f"captures/{done.id}/recording").content
+        assert hashlib.sha256(whole).hexdigest() == done.recording.sha256

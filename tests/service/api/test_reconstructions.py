@@ -1,0 +1,237 @@
+"""Reconstructions over HTTP: jobs, trajectories, scenes, views."""
+
+import io
+import json
+import time
+import zipfile
+from typing import Any
+
+import cv2
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from spiked.client import ApiError, CaptureOut, ReconstructionOptions
+from spiked.pose import quaternion, rotation_of
+from spiked.scene import Scene
+from spiked.spz import decode
+from spiked.trajectory import Trajectory
+
+
+def decoded(content: bytes) -> np.ndarray:
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    return np.asarray(image)
+
+
+def view(service: Any, job: str, body: dict[str, Any], kind: str = "png") -> Any:
+    answer = service.http.post(f"reconstructions/{job}/views", json=body, params={"format": kind})
+    assert answer.status_code == 200, answer.text
+    return answer
+
+
+def exr(content: bytes, tmp_path: Any) -> np.ndarray:
+    (tmp_path / "view.exr").write_bytes(content)
+    return np.asarray(oiio.ImageBuf(str(tmp_path / "view.exr")).get_pixels(oiio.FLOAT))
+
+
+def test_five_formats_hold_the_same_poses(service: Any, job: str, tmp_path: Any) -> None:
+    client = service.client
+    listed = client.trajectory(job)
+    (tmp_path / "t.tum").write_bytes(client.trajectory_file(job, "tum"))
+    tum = Trajectory.read_tum(tmp_path / "t.tum")
+    assert len(tum) == len(listed.frames) > 100
+    np.testing.assert_allclose(listed.positions, tum.centres, atol=1e-8)
+    np.testing.assert_allclose(np.array(listed.frames) + 0.5, tum.times_s * 20_000, atol=1e-3)
+    assert "track" in listed.states
+    kitti = np.loadtxt(io.BytesIO(client.trajectory_file(job, "kitti"))).reshape(-1, 3, 4)
+    np.testing.assert_allclose(kitti, tum.matrices()[:, :3], atol=1e-7)
+    frames = json.loads(client.trajectory_file(job, "nerfstudio"))["frames"]
+    np.testing.assert_allclose([np.array(f["transform_matrix"])[:3, 3] for f in frames], tum.centres, atol=1e-7)
+    with zipfile.ZipFile(io.BytesIO(client.trajectory_file(job, "colmap"))) as archive:
+        camera = archive.read("cameras.txt").decode().splitlines()[1].split()
+        assert camera[:4] == ["1", "PINHOLE", "160", "100"]
+        lines = [line for line in archive.read("images.txt").decode().splitlines()[1:] if line]
+    pose = np.array([float(word) for word in lines[0].split()[1:8]])
+    np.testing.assert_allclose(-rotation_of(pose[:4]).T @ pose[4:], tum.centres[0], atol=1e-6)
+
+
+def test_a_part_of_a_trajectory(service: Any, job: str) -> None:
+    whole = service.client.trajectory(job)
+    begin, end = whole.times_s[50], whole.times_s[100]
+    part = service.client.trajectory(job, from_s=begin, to_s=end, step=10)
+    assert part.frames == whole.frames[50:100:10]
+    nothing = service.http.get(f"reconstructions/{job}/trajectory", params={"from_s": 1000})
+    assert nothing.status_code == 404
+    assert "there are poses from" in nothing.json()["detail"]
+
+
+def test_versions_have_validators(service: Any, job: str) -> None:
+    versions = service.client.versions(job)
+    newest = service.client.reconstruction(job).version
+    assert versions[-1].version == newest
+    for kind in ("scene", "trajectory"):
+        answer = service.http.get(f"reconstructions/{job}/{kind}")
+        assert answer.headers["x-scene-version"] == str(newest)
+        known = {"If-None-Match": answer.headers["etag"]}
+        assert service.http.get(f"reconstructions/{job}/{kind}", headers=known).status_code == 304
+        other = service.http.get(f"reconstructions/{job}/{kind}", params={"version": newest + 7})
+        assert other.status_code == 404
+
+
+def test_spz_and_a_sample_are_the_scene(service: Any, job: str, tmp_path: Any) -> None:
+    (tmp_path / "s.ply").write_bytes(service.client.scene(job))
+    scene = Scene.read_ply(tmp_path / "s.ply")
+    white = float(service.http.get(f"reconstructions/{job}/scene").headers["x-white"])
+    packed = decode(service.client.scene(job, "spz"), white)
+    assert len(packed) == len(scene) > 100
+    np.testing.assert_allclose(packed.means, scene.means, atol=1e-3 * float(np.abs(scene.means).max()))
+    (tmp_path / "s.ply").write_bytes(service.client.scene(job, "ply", max_splats=100))
+    np.testing.assert_array_equal(Scene.read_ply(tmp_path / "s.ply").means, scene.sample(100).means)
+    part = service.http.get(f"reconstructions/{job}/scene", headers={"Range": "bytes=0-2"})
+    assert (part.status_code, part.content) == (206, b"ply")
+
+
+@pytest.mark.parametrize(("kind", "magic"), [("png", b"\x89PNG"), ("webp", b"RIFF"), ("jpeg", b"\xff\xd8\xff")])
+def test_a_view_in_formats_for_people(service: Any, job: str, kind: str, magic: bytes) -> None:
+    answer = view(service, job, {"camera": {"frame": 300}}, kind)
+    assert answer.headers["content-type"] == f"image/{kind}"
+    assert answer.content.startswith(magic)
+    assert decoded(answer.content).shape[:2] == (100, 160)
+    by_header = service.http.post(
+        f"reconstructions/{job}/views", json={"camera": {"frame": 300}}, headers={"Accept": f"image/{kind}"}
+    )
+    assert by_header.content == answer.content
+
+
+def test_the_three_ways_to_say_a_pose_agree(service: Any, job: str) -> None:
+    trajectory = service.client.trajectory(job)
+    row = 200
+    position, turn = trajectory.positions[row], trajectory.quaternions_wxyz[row]
+    c2w = np.eye(4)
+    c2w[:3, :3], c2w[:3, 3] = rotation_of(np.array(turn)), position
+    np.testing.assert_allclose(np.abs(quaternion(c2w[:3, :3]) @ np.array(turn)), 1, atol=1e-6)
+    pictures = [
+        decoded(view(service, job, {"camera": camera}).content).astype(int)
+        for camera in (
+            {"frame": trajectory.frames[row]},
+            {"position": position, "quaternion_wxyz": turn},
+            {"c2w": c2w.tolist()},
+        )
+    ]
+    for other in pictures[1:]:
+        assert np.abs(other - pictures[0]).max() <= 1
+
+
+def test_depth_alpha_and_background(service: Any, job: str, tmp_path: Any) -> None:
+    away = {"c2w": [[1, 0, 0, 1e6], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
+    here = {"frame": 300}
+    alpha = exr(view(service, job, {"camera": here, "output": "alpha"}, "exr").content, tmp_path)
+    assert 0.5 < alpha.mean() <= 1
+    depth = exr(view(service, job, {"camera": here, "output": "depth"}, "exr").content, tmp_path)
+    assert 0.1 < np.median(depth) < 100
+    seen = exr(view(service, job, {"camera": here}, "exr").content, tmp_path)
+    behind = exr(view(service, job, {"camera": here, "background": [1, 1, 1]}, "exr").content, tmp_path)
+    white = service.client.reconstruction(job).white
+    np.testing.assert_allclose(behind, seen + (1 - alpha) * white, atol=1e-5)
+    red = decoded(view(service, job, {"camera": away, "background": [1, 0, 0]}).content)
+    assert red[0, 0].tolist() == [0, 0, 255]  # OpenCV reads blue first
+
+
+def test_another_size_shows_the_same(service: Any, job: str) -> None:
+    small = decoded(view(service, job, {"camera": {"frame": 300}}).content)
+    large = decoded(view(service, job, {"camera": {"frame": 300}, "width": 320, "height": 200}).content)
+    shrunk = cv2.resize(large, (160, 100), interpolation=cv2.INTER_AREA)
+    assert np.abs(shrunk.astype(float) - small).mean() < 6
+
+
+def test_several_views_are_a_zip(service: Any, job: str) -> None:
+    for body, count in (
+        ({"cameras": [{"frame": 100}, {"frame": 200}, {"frame": 300}]}, 3),
+        ({"path": {"count": 5}, "width": 80, "height": 50}, 5),
+        ({"path": {"count": 2, "from_s": 0.005, "to_s": 0.01}}, 2),
+    ):
+        answer = view(service, job, body, "jpeg")
+        assert answer.headers["content-type"] == "application/zip"
+        with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+            about = json.loads(archive.read("views.json"))
+            assert [entry["file"] for entry in about["views"]] == [f"{i:03d}.jpeg" for i in range(count)]
+            pictures = [decoded(archive.read(entry["file"])) for entry in about["views"]]
+        assert not np.array_equal(pictures[0], pictures[1])
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {},
+        {"camera": {"frame": 1}, "path": {"count": 1}},
+        {"camera": {}},
+        {"camera": {"position": [0, 0, 0]}},
+        {"camera": {"position": [0, 0, 0], "quaternion_wxyz": [0, 0, 0, 0]}},
+        {"camera": {"c2w": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}},
+        {"camera": {"c2w": [[1e300, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}},
+        {"camera": {"frame": 100}, "width": 10},
+        {"camera": {"frame": 100}, "width": 5000, "height": 10},
+        {"path": {"count": 100}, "width": 4000, "height": 4000},
+        {"camera": {"frame": 100}, "white": 0},
+        {"camera": {"frame": 100}, "background": [-1, 0, 0]},
+    ],
+)
+def test_views_that_cannot_be(service: Any, job: str, body: dict[str, Any]) -> None:
+    answer = service.http.post(f"reconstructions/{job}/views", json=body)
+    assert answer.status_code == 422, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_not_a_number_is_refused(service: Any, job: str) -> None:
+    body = b'{"camera": {"position": [NaN, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}}'
+    answer = service.http.post(
+        f"reconstructions/{job}/views", content=body, headers={"Content-Type": "application/json"}
+    )
+    assert answer.status_code == 422
+
+
+def test_a_timeline_and_a_log(service: Any, job: str) -> None:
+    timeline = service.client.timeline(job)
+    lengths = {len(values) for name, values in timeline.model_dump().items() if name != "gaps"}
+    assert lengths == {len(timeline.frame)} and len(timeline.frame) > 5
+    assert timeline.frame == sorted(timeline.frame)
+    assert service.http.get(f"reconstructions/{job}/log").status_code == 200
+
+
+def test_a_recording_is_reconstructed_again_with_other_options(service: Any, done: CaptureOut) -> None:
+    client = service.client
+    started = client.start_reconstruction(done.id, options=ReconstructionOptions(steps=5, seed=3), priority=2)
+    assert (started.live, started.priority, started.options.seed) == (False, 2, 3)
+    assert started.state in ("queued", "running")
+    over = client.wait_for_reconstruction(started.id, 120)
+    assert over.state == "complete", over.reason
+    assert over.frames == done.recording.frames
+    assert started.id in [one.id for one in client.reconstructions(capture_id=done.id)]
+    with pytest.raises(ApiError):
+        client.start_reconstruction("01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10")
+    client.remove_reconstruction(started.id)
+    with pytest.raises(ApiError) as gone:
+        client.reconstruction(started.id)
+    assert gone.value.status == 404
+
+
+def test_cancel_and_restart(service: Any, done: CaptureOut) -> None:
+    client = service.client
+    started = client.start_reconstruction(done.id, options=ReconstructionOptions(steps=100_000))
+    deadline = time.monotonic() + 60
+    while client.reconstruction(started.id).state == "queued":
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    client.cancel_reconstruction(started.id)
+    assert client.wait_for_reconstruction(started.id, 60).state == "cancelled"
+    client.restart_reconstruction(started.id, ReconstructionOptions(steps=5))
+    assert client.wait_for_reconstruction(started.id, 120).state == "complete"
+    client.remove_reconstruction(started.id)
+
+
+def test_options_out_of_range_are_refused(service: Any, done: CaptureOut) -> None:
+    for options in ({"steps": -1}, {"sttps": 1}, {"threads": 0}, {"seed": "x"}):
+        answer = service.http.post("reconstructions", json={"capture_id": done.id, "options": options})
+        assert answer.status_code == 422
+        assert next(iter(options)) in answer.json()["detail"]

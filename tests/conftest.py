@@ -29,6 +29,7 @@ class Daemon:
     ) -> None:
         command = [sys.executable, "-m", "spiked_service", "serve", "--port", "0"]
         command += ["--runtime", str(folder / "runtime"), "--data", str(folder / "data")]
+        command += ["--set", f"source_folders={folder.parent}"]
         self.process = subprocess.Popen(
             [*command, *arguments], stdout=subprocess.PIPE, text=True, env=seen and seen.environment
         )
@@ -58,6 +59,12 @@ class Daemon:
             self.process.terminate()
         self.process.wait(START_S)
         self.output.close()
+
+
+@pytest.fixture(scope="session")
+def daemon_class() -> type[Daemon]:
+    """For fixtures that keep a daemon for more than one test."""
+    return Daemon
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from spiked_service.commands.convert import convert
 from spiked_service.commands.devices import devices
 from spiked_service.commands.evaluate import evaluate
 from spiked_service.commands.info import info
+from spiked_service.commands.openapi import openapi
 from spiked_service.commands.reconstruct import reconstruct
 from spiked_service.commands.render import render
 from spiked_service.commands.serve import serve
@@ -32,7 +33,7 @@ for _group, _commands in {
     "Live": (serve, devices),
     "Files": (info, verify, convert, simulate, calibrate),
     "Scenes": (reconstruct, render, evaluate),
-    "This program": (bench, version),
+    "This program": (bench, openapi, version),
 }.items():
     for _command in _commands:
         app.command(rich_help_panel=_group)(_command)

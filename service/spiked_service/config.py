@@ -69,6 +69,12 @@ class Settings(BaseSettings):
     allowed_hosts: Words = Field(
         [], description="Names by which browsers may call the service, besides its address and localhost."
     )
+    source_folders: Words = Field(
+        [],
+        description="Folders whose files requests may name as replay: or pcie: sources; where the service was started, "
+        "if none.",
+        json_schema_extra=_LIVE,
+    )
     zmq: bool = Field(True, description="Whether events also go out over ZeroMQ, on loopback only.")
     zmq_port: int | None = Field(
         None, ge=0, le=65533, description="First of three ports; the three after `port` if not set, 0 takes free ones."
@@ -126,7 +132,7 @@ class Settings(BaseSettings):
         return (init_settings,)
 
 
-class Origin(StrEnum):
+class SettingOrigin(StrEnum):
     """Where a value comes from; later ones prevail."""
 
     DEFAULT = "default"
@@ -140,7 +146,7 @@ class Configuration:
     """Settings with the origin of each, and the file that was read."""
 
     settings: Settings
-    origins: Mapping[str, Origin]
+    origins: Mapping[str, SettingOrigin]
     file: Path | None
 
     def shown(self) -> dict[str, object]:
@@ -173,12 +179,12 @@ def load_settings(flags: Mapping[str, object] | None = None, file: Path | None =
     """
     path = settings_file(file)
     layers = {
-        Origin.FILE: _from_file(path) if path else {},
-        Origin.ENVIRONMENT: _from_environment(),
-        Origin.FLAG: {name: value for name, value in (flags or {}).items() if value is not None},
+        SettingOrigin.FILE: _from_file(path) if path else {},
+        SettingOrigin.ENVIRONMENT: _from_environment(),
+        SettingOrigin.FLAG: {name: value for name, value in (flags or {}).items() if value is not None},
     }
     values: dict[str, Any] = {}
-    origins = dict.fromkeys(Settings.model_fields, Origin.DEFAULT)
+    origins = dict.fromkeys(Settings.model_fields, SettingOrigin.DEFAULT)
     for origin, layer in layers.items():
         for name, value in layer.items():
             if name not in Settings.model_fields:
@@ -220,15 +226,15 @@ def _from_environment() -> dict[str, Any]:
         raise ConfigurationError(f"the environment: {error}") from error
 
 
-def _place(name: str, origin: Origin, path: Path | None) -> str:
+def _place(name: str, origin: SettingOrigin, path: Path | None) -> str:
     match origin:
-        case Origin.FILE:
+        case SettingOrigin.FILE:
             return f"{name} in {path}"
-        case Origin.ENVIRONMENT:
+        case SettingOrigin.ENVIRONMENT:
             return f"{_PREFIX}{name.upper()}"
-        case Origin.FLAG:
+        case SettingOrigin.FLAG:
             return f"--{name.replace('_', '-')}"
-        case Origin.DEFAULT:
+        case SettingOrigin.DEFAULT:
             return name
 
 
@@ -237,7 +243,7 @@ def _nearest(name: str, prefix: str = "") -> str:
     return f"; did you mean {prefix}{found[0].upper() if prefix else found[0]}?" if found else ""
 
 
-def _wrong(error: ValidationError, origins: Mapping[str, Origin], path: Path | None) -> str:
+def _wrong(error: ValidationError, origins: Mapping[str, SettingOrigin], path: Path | None) -> str:
     told = []
     for one in error.errors(include_url=False):
         name = str(one["loc"][0])

@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, Field, TypeAdapter
 
 from spiked.recon import State
-from spiked.sensor import Intrinsics, Sensor
+from spiked.recording.sidecar import Sidecar
+from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
 from spiked_service.payloads import PosePayload
 from spiked_service.reconstruction_options import ReconstructionOptions
 
@@ -19,6 +20,7 @@ class Role(StrEnum):
     RECORDER = "recorder"
     RECONSTRUCTION = "reconstruction"
     PREVIEW = "preview"
+    UPLOAD = "upload"
 
 
 class _Order(BaseModel):
@@ -85,7 +87,33 @@ class PreviewOrder(_Order):
     """Where to leave one of them."""
 
 
-Order = Annotated[AcquisitionOrder | RecorderOrder | ReconstructionOrder | PreviewOrder, Field(discriminator="role")]
+class StatedGeometry(BaseModel):
+    """What somebody said of a recording; None: nothing."""
+
+    width: int | None = None
+    height: int | None = None
+    frame_rate_hz: float | None = None
+    layout: Layout | None = None
+    bit_order: BitOrder | None = None
+    flipped: bool | None = None
+    mosaic: Mosaic | None = None
+    intrinsics: Intrinsics | None = None
+
+
+class UploadOrder(_Order):
+    """Look at every byte of a recording from elsewhere, and leave its sidecar beside it."""
+
+    role: Literal[Role.UPLOAD] = Role.UPLOAD
+    path: Path
+    sha256: str | None
+    sidecar: Sidecar | None
+    geometry: StatedGeometry
+
+
+Order = Annotated[
+    AcquisitionOrder | RecorderOrder | ReconstructionOrder | PreviewOrder | UploadOrder,
+    Field(discriminator="role"),
+]
 STOP = "stop\n"
 """The order line that asks a worker to end in good order; the end of its stdin asks it to go at once."""
 
@@ -208,6 +236,21 @@ class Logged(BaseModel):
     """Role, and whose work it is."""
 
 
+class UploadChecked(BaseModel):
+    """What a recording from elsewhere is."""
+
+    news: Literal["upload_checked"] = "upload_checked"
+    sensor: Sensor
+    frames: int
+    bytes: int
+    lost: int
+    """Frames in the gaps that its sidecar tells of."""
+    sha256: str
+    grade: str
+    """As `spiked verify` judges it."""
+    reasons: tuple[str, ...]
+
+
 class Refused(BaseModel):
     """A worker cannot do what it was ordered, for a reason that is the user's to mend."""
 
@@ -216,7 +259,15 @@ class Refused(BaseModel):
 
 
 News = Annotated[
-    RingOpened | RecordingEnded | ReconstructionStatus | Posed | VersionPublished | PreviewTaken | Logged | Refused,
+    RingOpened
+    | RecordingEnded
+    | ReconstructionStatus
+    | Posed
+    | VersionPublished
+    | PreviewTaken
+    | Logged
+    | UploadChecked
+    | Refused,
     Field(discriminator="news"),
 ]
 orders: TypeAdapter[Order] = TypeAdapter(Order)

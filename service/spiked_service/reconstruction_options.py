@@ -1,6 +1,6 @@
 """What can be chosen about a reconstruction, as it goes over HTTP and into workers; its JSON schema describes it."""
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, StrictBool
 
 from spiked.recon import Options
 from spiked.sensor import Intrinsics
@@ -39,7 +39,7 @@ class ReconstructionOptions(BaseModel):
     max_views: int = Field(
         default=400, ge=20, le=5000, description="Views kept for mapping; beyond it older ones thin out."
     )
-    refine_poses: bool = Field(default=True, description="Whether the map corrects the trajectory.")
+    refine_poses: StrictBool = Field(default=True, description="Whether the map corrects the trajectory.")
 
     intrinsics: IntrinsicsOption | None = Field(
         default=None, description="Optics, where neither the capture nor its recording says them, or to overrule them."

@@ -225,6 +225,15 @@ class Mosaic(StrEnum):
     GBRG = "GBRG"
 
 
+class Origin(StrEnum):
+    """
+    Where a recording comes from.
+    """
+
+    live = "live"
+    upload = "upload"
+
+
 class Output(StrEnum):
     """
     What a view shows.
@@ -418,6 +427,46 @@ class SensorOut(BaseModel):
     ]
 
 
+class SettingOrigin(StrEnum):
+    """
+    Where a value comes from; later ones prevail.
+    """
+
+    default = "default"
+    file = "file"
+    environment = "environment"
+    flag = "flag"
+
+
+class SettingOut(BaseModel):
+    """
+    One setting; secrets are masked.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    key: str
+    value: Any
+    origin: SettingOrigin
+    reloadable: Annotated[
+        bool,
+        Field(description="Whether `configuration:reload` brings a new value into effect."),
+    ]
+    doc: str
+
+
+class SettingsOut(BaseModel):
+    """
+    All settings in effect.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    items: list[SettingOut]
+
+
 class Stage(StrEnum):
     """
     What a reconstruction is at.
@@ -454,27 +503,6 @@ class StatsOut(BaseModel):
     rate_histogram: RateHistogram
     hot_pixels: Annotated[list[list[int]], Field(description="x, y in the upright image.")]
     mean_rate: Annotated[float, Field(description="Spikes a pixel and frame.")]
-
-
-class SystemOut(BaseModel):
-    """
-    The running service.
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    version: str
-    started_at: AwareDatetime
-    uptime_s: float
-    data_folder: str
-    disk: DiskOut
-    memory_bytes: Annotated[
-        int,
-        Field(description="Resident memory of the service itself, without its workers."),
-    ]
-    pid: int
-    events_seq: Annotated[int, Field(description="Number of the newest event.")]
 
 
 class TimelineOut(BaseModel):
@@ -692,24 +720,20 @@ class ViewRequest(BaseModel):
     ] = None
 
 
-class SpikedServiceConfigOrigin(StrEnum):
+class ZmqOut(BaseModel):
     """
-    Where a value comes from; later ones prevail.
-    """
-
-    default = "default"
-    file = "file"
-    environment = "environment"
-    flag = "flag"
-
-
-class SpikedServiceStoreRowsOrigin(StrEnum):
-    """
-    Where a recording comes from.
+    Addresses of the ZeroMQ sockets, on this machine.
     """
 
-    live = "live"
-    upload = "upload"
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    events: Annotated[str, Field(description="PUB: all but pictures.")]
+    state: Annotated[
+        str,
+        Field(description="REP: the newest message of each kind, or those after a number."),
+    ]
+    previews: Annotated[str, Field(description="PUB: pictures.")]
 
 
 class CaptureRequest(BaseModel):
@@ -924,33 +948,26 @@ class ReconstructionPage(BaseModel):
     ]
 
 
-class SettingOut(BaseModel):
+class SystemOut(BaseModel):
     """
-    One setting; secrets are masked.
+    The running service.
     """
 
     model_config = ConfigDict(
         extra="ignore",
     )
-    key: str
-    value: Any
-    origin: SpikedServiceConfigOrigin
-    reloadable: Annotated[
-        bool,
-        Field(description="Whether `configuration:reload` brings a new value into effect."),
+    version: str
+    started_at: AwareDatetime
+    uptime_s: float
+    data_folder: str
+    disk: DiskOut
+    memory_bytes: Annotated[
+        int,
+        Field(description="Resident memory of the service itself, without its workers."),
     ]
-    doc: str
-
-
-class SettingsOut(BaseModel):
-    """
-    All settings in effect.
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    items: list[SettingOut]
+    pid: int
+    events_seq: Annotated[int, Field(description="Number of the newest event.")]
+    zmq: Annotated[ZmqOut | None, Field(description="null where ZeroMQ is turned off.")]
 
 
 class UploadRequest(BaseModel):
@@ -982,7 +999,7 @@ class CaptureOut(BaseModel):
     notes: str
     keep: Annotated[bool, Field(description="Retention leaves it alone.")]
     origin: Annotated[
-        SpikedServiceStoreRowsOrigin,
+        Origin,
         Field(description="live: captured here; upload: a recording from elsewhere."),
     ]
     source: str

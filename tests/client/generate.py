@@ -11,17 +11,33 @@ from pathlib import Path
 from typing import Any
 
 MODELS = Path(__file__).parents[2] / "spiked" / "client" / "models.py"
-_LEFT_OUT = frozenset(
-    "minimum maximum exclusiveMinimum exclusiveMaximum minLength maxLength minItems maxItems pattern title examples "
-    "example".split()
+_LIMITS = frozenset(
+    ("minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum", "minLength", "maxLength", "minItems", "maxItems")
 )
+_LEFT_OUT = _LIMITS | {"pattern", "title", "examples", "example"}
 _HEADER = '"""What goes over HTTP: made from the OpenAPI description, see tests/client."""'
 _OPTIONS = (
-    "--input-file-type openapi --output-model-type pydantic_v2.BaseModel --target-python-version 3.11 "
-    "--formatters builtin --extra-fields ignore --use-standard-collections --use-union-operator --strict-nullable "
-    "--use-schema-description --disable-timestamp --use-subclass-enum --collapse-root-models --use-annotated "
-    "--set-default-enum-member --use-one-literal-as-default"
-).split()
+    "--input-file-type",
+    "openapi",
+    "--output-model-type",
+    "pydantic_v2.BaseModel",
+    "--target-python-version",
+    "3.11",
+    "--formatters",
+    "builtin",
+    "--extra-fields",
+    "ignore",
+    "--use-standard-collections",
+    "--use-union-operator",
+    "--strict-nullable",
+    "--use-schema-description",
+    "--disable-timestamp",
+    "--use-subclass-enum",
+    "--collapse-root-models",
+    "--use-annotated",
+    "--set-default-enum-member",
+    "--use-one-literal-as-default",
+)
 
 
 def openapi() -> dict[str, Any]:

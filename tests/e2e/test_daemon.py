@@ -45,7 +45,7 @@ def test_a_recording_becomes_a_trajectory_and_novel_views(
     daemon: Callable[..., Any], room: Path, tmp_path: Path
 ) -> None:
     http = daemon().http
-    request = {"source": f"replay:{room / 'room.dat'}", "steps": 300}
+    request = {"source": f"replay:{room / 'room.dat'}", "options": {"steps": 300}}
     capture_id = http.post("captures", json=request).json()["id"]
 
     capture = finished(http, capture_id)
@@ -66,7 +66,7 @@ def test_a_recording_becomes_a_trajectory_and_novel_views(
     np.testing.assert_allclose(listed["positions"], estimate.centres, atol=1e-8)
 
     def render(rotation: np.ndarray, centre: np.ndarray) -> np.ndarray:
-        body = {"c2w": np.vstack([np.column_stack([rotation, centre]), [0, 0, 0, 1]]).tolist()}
+        body = {"camera": {"c2w": np.vstack([np.column_stack([rotation, centre]), [0, 0, 0, 1]]).tolist()}}
         answer = http.post(f"captures/{capture_id}/views", json=body, headers={"Accept": "image/x-exr"})
         assert answer.status_code == 200, answer.text
         (tmp_path / "view.exr").write_bytes(answer.content)

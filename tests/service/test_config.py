@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from spiked_service.config import LogLevel, Origin, Settings, load_settings, reloadable, setting
+from spiked_service.config import LogLevel, SettingOrigin, Settings, load_settings, reloadable, setting
 
 from spiked.errors import ConfigurationError
 
@@ -34,10 +34,10 @@ def test_flags_over_environment_over_file_over_defaults(tmp_path: Path, monkeypa
     assert (found.settings.host, found.settings.port, found.settings.log_level) == ("::1", 2000, LogLevel.WARNING)
     assert found.settings.devices == ["sim:", "replay:a.dat"]
     assert [found.origins[name] for name in ("host", "port", "log_level", "zmq")] == [
-        Origin.FILE,
-        Origin.ENVIRONMENT,
-        Origin.FLAG,
-        Origin.DEFAULT,
+        SettingOrigin.FILE,
+        SettingOrigin.ENVIRONMENT,
+        SettingOrigin.FLAG,
+        SettingOrigin.DEFAULT,
     ]
     assert found.file == path
 

@@ -42,7 +42,7 @@ def test_a_daemon_rehearses_trouble(daemon: Callable[..., Any]) -> None:
     rehearsal = ["--gap", "100:40", "--unplug-at", "400:10ms", "--corrupt", "0.01"]
     http = daemon("--device", "sim:?width=64&height=48", "--frames", "1200", *rehearsal).http
     deadline_s = time.monotonic() + 60
-    while not (counters := http.get("captures").json()[0]["counters"]) or counters["next_frame"] < 600:
+    while not (counters := http.get("captures").json()["items"][0]["counters"]) or counters["next_frame"] < 600:
         assert time.monotonic() < deadline_s, counters
         time.sleep(0.1)
     assert counters["lost"] == {"device": 200, "usb": 40, "ring": 0, "disk": 0}

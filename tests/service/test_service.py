@@ -26,9 +26,10 @@ def wait_for(condition: Callable[[], bool], what: str) -> None:
 
 
 def one_capture(daemon: Any) -> dict[str, Any]:
-    captures = daemon.http.get("captures").json()
-    assert len(captures) == 1
-    return dict(captures[0])
+    (capture,) = daemon.http.get("captures").json()["items"]
+    ids = capture["reconstruction_ids"]
+    job = daemon.http.get(f"reconstructions/{ids[-1]}").json() if ids else None
+    return {**capture, "reconstruction": job}
 
 
 def streaming(daemon: Any) -> dict[str, Any]:
@@ -69,8 +70,8 @@ def test_pages_and_health(daemon: Callable[..., Any]) -> None:
     assert "<title>spiked</title>" in httpx.get(one.address).text
     assert httpx.get(f"{one.address}docs", follow_redirects=True).status_code == 200
     examples = httpx.get(f"{one.address}openapi.json").json()["components"]["schemas"]["ViewRequest"]["examples"]
-    assert len(examples) == 2
-    assert [device["source"] for device in one.http.get("devices").json()][:2] == ["replay:rec.dat", "sim:"]
+    assert len(examples) == 3
+    assert [device["source"] for device in one.http.get("devices").json()["items"]][:2] == ["replay:rec.dat", "sim:"]
 
 
 def test_a_token_is_asked_for_and_taken_in_three_ways(daemon: Callable[..., Any]) -> None:
@@ -94,7 +95,7 @@ def test_a_source_that_cannot_be_opened_is_refused_at_once(daemon: Callable[...,
     assert answer.status_code == 422
     assert answer.headers["content-type"] == "application/problem+json"
     assert source.partition("?")[0].removeprefix("replay:") in answer.json()["detail"]
-    assert one.http.get("captures").json() == []
+    assert one.http.get("captures").json()["items"] == []
 
 
 def test_serving_a_device_that_cannot_be_opened_ends_with_one_line(tmp_path: Path) -> None:
@@ -112,7 +113,7 @@ def test_serving_a_device_that_cannot_be_opened_ends_with_one_line(tmp_path: Pat
 
 def test_one_capture_at_a_time_and_the_account_of_frames(daemon: Callable[..., Any]) -> None:
     one = daemon()
-    started = one.http.post("captures", json={"source": SMALL, "frames": 400, "steps": 10})
+    started = one.http.post("captures", json={"source": SMALL, "frames": 400, "options": {"steps": 10}})
     assert started.status_code == 201
     assert started.headers["location"].endswith(started.json()["id"])
     assert one.http.post("captures", json={"source": SMALL}).status_code == 409
@@ -183,7 +184,7 @@ def test_the_death_of_the_reconstruction_leaves_the_recording_and_begins_again_f
     daemon: Callable[..., Any],
 ) -> None:
     one = daemon()
-    one.http.post("captures", json={"source": SMALL, "steps": 10})
+    one.http.post("captures", json={"source": SMALL, "options": {"steps": 10}})
     capture = streaming(one)
     one.workers()["reconstruction"].kill()
     wait_for(lambda: one_capture(one)["warnings"] != [], "the death is told")

@@ -67,9 +67,10 @@ def test_a_capture_over_rest_gets_every_frame_and_is_reconstructed(
 ) -> None:
     rig = cameras(CameraSettings(str(room), plugged=False))
     http = daemon("--device", f"usb0?fov={FOV_DEG:g}&rate={RATE}", "--no-capture", seen=rig).http
-    device = http.get("devices").json()[0]
+    device = http.get("devices").json()["items"][0]
     assert (device["source"], device["kind"]) == (f"usb0?fov={FOV_DEG:g}&rate={RATE}", "usb")
-    capture_id = http.post("captures", json={"source": device["source"], "frames": FRAMES, "steps": 20}).json()["id"]
+    body = {"source": device["source"], "frames": FRAMES, "options": {"steps": 20}}
+    capture_id = http.post("captures", json=body).json()["id"]
 
     def counters() -> dict[str, Any]:
         return http.get(f"captures/{capture_id}").json().get("counters") or {}
@@ -87,9 +88,10 @@ def test_a_capture_over_rest_gets_every_frame_and_is_reconstructed(
     assert (capture["state"], capture["reason"]) == ("complete", "")
     assert capture["counters"]["received"] == FRAMES
     assert sum(capture["counters"]["lost"].values()) == 0
-    assert capture["reconstruction"]["frames"] == FRAMES
-    assert capture["reconstruction"]["poses"] > 0.9 * FRAMES
-    assert capture["reconstruction"]["splats"] > 100
+    job = http.get(f"reconstructions/{capture['reconstruction_ids'][0]}").json()
+    assert job["frames"] == FRAMES
+    assert job["poses"] > 0.9 * FRAMES
+    assert job["splats"] > 100
 
 
 def test_a_capture_goes_on_when_the_camera_is_back(
@@ -97,7 +99,7 @@ def test_a_capture_goes_on_when_the_camera_is_back(
 ) -> None:
     rig = cameras(CameraSettings(str(room), rate_hz=RATE, buffer_frames=2 * RATE))
     http = daemon("--device", f"usb0?fov={FOV_DEG:g}&rate={RATE}&transfer_kib=256", seen=rig).http
-    capture_id = http.get("captures").json()[0]["id"]
+    capture_id = http.get("captures").json()["items"][0]["id"]
 
     def counters() -> dict[str, Any]:
         return http.get(f"captures/{capture_id}").json().get("counters") or {}

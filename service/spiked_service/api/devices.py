@@ -28,21 +28,21 @@ def device_routes(captures: Captures, sources: Sources, route_class: type[APIRou
         return DevicesOut(items=[_out(captures, device) for device in sources.devices()])
 
     # Ids may hold slashes: replay:folder/file.dat. Hence the longer paths first.
-    @router.post("/{device_id:path}:arm", status_code=HTTPStatus.ACCEPTED, responses=problems(404, 409))
+    @router.post("/{device_id:device}:arm", status_code=HTTPStatus.ACCEPTED, responses=problems(404, 409))
     def arm_device(device_id: DeviceId, body: ArmRequest, idempotency_key: IdempotencyKey = None) -> DeviceOut:
         """Let it run without recording, so that a capture can begin up to `pretrigger_s` before it is asked for."""
         device = _find(sources, device_id)
         captures.arm(unhurried(device.source), body.pretrigger_s)
         return _out(captures, device)
 
-    @router.post("/{device_id:path}:disarm", status_code=HTTPStatus.ACCEPTED, responses=problems(404, 409))
+    @router.post("/{device_id:device}:disarm", status_code=HTTPStatus.ACCEPTED, responses=problems(404, 409))
     def disarm_device(device_id: DeviceId, idempotency_key: IdempotencyKey = None) -> DeviceOut:
         """Let it rest; nothing happens to one that is not armed."""
         device = _find(sources, device_id)
         captures.disarm(unhurried(device.source))
         return _out(captures, device)
 
-    @router.get("/{device_id:path}", responses=problems(404))
+    @router.get("/{device_id:device}", responses=problems(404))
     def get_device(device_id: DeviceId) -> DeviceOut:
         """State, counters and capabilities of one."""
         return _out(captures, _find(sources, device_id))

@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field
 from spiked_service.api.problems import problems
 from spiked_service.api.services import Services
 from spiked_service.commands.version import installed_version
-from spiked_service.config import Origin, field, reloadable
+from spiked_service.config import SettingOrigin, field, reloadable
 from spiked_service.health import Finding, Verdict, failed
 
 
@@ -68,7 +68,7 @@ class SettingOut(BaseModel):
 
     key: str = Field(examples=["limit_renders"])
     value: Any = Field(examples=[8])
-    origin: Origin
+    origin: SettingOrigin
     reloadable: bool = Field(description="Whether `configuration:reload` brings a new value into effect.")
     doc: str
 

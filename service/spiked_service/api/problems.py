@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
 
 from spiked.errors import SpikedError
+from spiked_service.api.paths import allowed_methods
 from spiked_service.errors import BusyError
 from spiked_service.limits import OverloadedError
 from spiked_service.pictures import FrameNotRecordedError
@@ -162,12 +163,15 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(HTTPException)
     async def _http(request: Request, error: HTTPException) -> JSONResponse:
         code = HTTPStatus(error.status_code)
-        detail, advice = str(error.detail), None
+        detail, advice, headers = str(error.detail), None, {**(error.headers or {})}
         if detail == code.phrase and code is HTTPStatus.NOT_FOUND:
             detail, advice = f"there is nothing at {request.url.path}", "/docs lists what there is"
         elif detail == code.phrase and code is HTTPStatus.METHOD_NOT_ALLOWED:
             detail = f"{request.url.path} does not take {request.method}"
-        return problem(code, detail, dict(error.headers or {}), instance=request.url.path, what_to_do=advice)
+            headers["Allow"] = ", ".join(allowed_methods(app.openapi(), request.url.path)) or headers.get(
+                "Allow", "GET"
+            )
+        return problem(code, detail, headers, instance=request.url.path, what_to_do=advice)
 
     @app.exception_handler(Exception)
     async def _unexpected(request: Request, error: Exception) -> JSONResponse:

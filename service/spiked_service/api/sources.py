@@ -1,6 +1,5 @@
 """Which sources a request may name: devices, and files in the folders that the settings open."""
 
-from http import HTTPStatus
 from pathlib import Path
 
 from spiked.errors import SourceError
@@ -10,7 +9,6 @@ from spiked_service.live import LiveSettings
 from spiked_service.store.catalogue import UnknownIdError
 
 _FILE_KINDS = ("replay", "pcie")
-STATUS = HTTPStatus.UNPROCESSABLE_ENTITY
 
 
 class Sources:
@@ -25,7 +23,7 @@ class Sources:
         return known_devices(self._settings.now.devices)
 
     def named(self, source: str | None, device: str | None) -> str:
-        """The source of a request. Raises UnknownIdError for a device, SourceError for a file that is not open to it."""
+        """The source of a request. Raises UnknownIdError for a device, SourceError for a file not open to it."""
         if source is None:
             found = next((one.source for one in self.devices() if one.source == device), None)
             if found is None:

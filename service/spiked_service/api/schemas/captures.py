@@ -3,7 +3,7 @@
 from datetime import datetime
 from typing import Any, Self
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, StrictBool, model_validator
 
 from spiked.ring import DeviceState, Policy
 from spiked.sensor import Mosaic, Sensor
@@ -128,8 +128,8 @@ class CaptureRequest(In):
     pretrigger_s: float = Field(0.0, ge=0, le=60, description="Begin so much earlier, from an armed device's ring.")
     name: Name = ""
     notes: Notes = ""
-    record: bool = Field(True, description="Keep the frames in the data folder.")
-    reconstruct: bool = Field(True, description="Reconstruct while it runs.")
+    record: StrictBool = Field(True, description="Keep the frames in the data folder.")
+    reconstruct: StrictBool = Field(True, description="Reconstruct while it runs.")
     options: ReconstructionOptions = Field(default_factory=ReconstructionOptions)
     intrinsics: IntrinsicsModel | None = Field(None, description="If the source does not know its own.")
 
@@ -151,7 +151,7 @@ class CaptureChange(In):
 
     name: Name | None = None
     notes: Notes | None = None
-    keep: bool | None = Field(None, description="Retention leaves it alone.")
+    keep: StrictBool | None = Field(None, description="Retention leaves it alone.")
 
 
 class SensorOut(Out):

@@ -2,7 +2,7 @@
 
 from datetime import datetime
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, StrictBool
 
 from spiked.recording.sidecar import Sidecar
 from spiked.sensor import BitOrder, Layout, Mosaic
@@ -19,7 +19,7 @@ class GeometryModel(In):
     frame_rate_hz: float | None = Field(None, gt=0, le=1e7)
     layout: Layout | None = None
     bit_order: BitOrder | None = None
-    flipped: bool | None = Field(None, description="Rows are stored bottom-up.")
+    flipped: StrictBool | None = Field(None, description="Rows are stored bottom-up.")
     mosaic: Mosaic | None = Field(None, description="Colour pattern of the upright image.")
     intrinsics: IntrinsicsModel | None = None
 

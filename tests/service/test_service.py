@@ -122,7 +122,7 @@ def test_one_capture_at_a_time_and_the_account_of_frames(daemon: Callable[..., A
     assert (capture["state"], capture["reason"]) == ("complete", "")
     assert capture["counters"]["received"] == capture["counters"]["next_frame"] == 400
     assert capture["reconstruction"]["frames"] == 400
-    assert one.http.get(f"captures/{capture['id']}/preview").content.startswith(b"RIFF")
+    assert one.http.get(f"captures/{capture['id']}/preview?format=webp").content.startswith(b"RIFF")
     assert not ring_of(capture).exists()
     assert one.workers() == {}
 

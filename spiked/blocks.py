@@ -160,8 +160,28 @@ class Window:
 
 
 def _layout(sensor: Sensor) -> _blocks.Layout:
-    msb = sensor.bit_order is BitOrder.MSB
-    return _blocks.Layout(sensor.width, sensor.height, sensor.row_stride, sensor.flipped, msb)
+    """Of the sensor last asked for, most often: a block is reduced in less time than a sensor takes to hash."""
+    global _last_layout  # noqa: PLW0603
+    known, layout = _last_layout
+    if known is not sensor:
+        msb = sensor.bit_order is BitOrder.MSB
+        layout = _blocks.Layout(sensor.width, sensor.height, sensor.row_stride, sensor.flipped, msb)
+        _last_layout = (sensor, layout)
+    return layout
+
+
+_last_layout: tuple[Sensor | None, _blocks.Layout] = (None, None)
+
+
+def unpack(frames: NDArray[np.uint8], sensor: Sensor, *, out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+    """Stored frames, uint8 [n, frame_bytes], to upright images, uint8 [n, height, width] of 0 and 1.
+
+    With `out` its first n images are written and returned.
+    """
+    if out is None:
+        out = np.empty((len(frames), sensor.height, sensor.width), np.uint8)
+    _blocks.unpack_frames(frames, _layout(sensor), out)
+    return out[: len(frames)]
 
 
 def instruction_sets() -> list[str]:
@@ -190,6 +210,8 @@ def reduce_blocks(
     else:
         count, first, last = out.count, out.first, out.last
     _blocks.reduce_frames(frames, _layout(sensor), count, first, last, instruction_set=instruction_set)
+    if out is not None and len(count) == blocks:
+        return Blocks(first_frame, len(frames), count, first, last)
     return Blocks(first_frame, len(frames), count[:blocks], first[:blocks], last[:blocks])
 
 

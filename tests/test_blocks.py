@@ -20,6 +20,7 @@ from spiked.blocks import (
     merge,
     reduce_block,
     reduce_blocks,
+    unpack,
 )
 from spiked.sensor import BitOrder, Layout, Sensor
 
@@ -297,3 +298,15 @@ def test_an_unknown_instruction_set_is_refused() -> None:
     environment = {**os.environ, "SPIKED_SIMD": "mmx"}
     run = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False)
     assert "SPIKED_SIMD=mmx" in run.stderr
+
+
+@pytest.mark.parametrize("sensor", [Sensor(400, 250, 1.0), Sensor(48, 5, 1.0, flipped=False)], ids=str)
+def test_unpacked_images_are_the_bits(sensor: Sensor) -> None:
+    bits = np.random.default_rng(3).random((5, sensor.height, sensor.width)) < 0.3
+    frames = stored(bits, sensor)
+    assert (unpack(frames, sensor) == bits).all()
+    out = np.full((7, sensor.height, sensor.width), 9, np.uint8)
+    assert (unpack(frames, sensor, out=out) == bits).all()
+    assert (out[5:] == 9).all()
+    with pytest.raises(ValueError, match="fewer images"):
+        unpack(frames, sensor, out=out[:4])

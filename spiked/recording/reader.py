@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from spiked.blocks import unpack
 from spiked.errors import ConfigurationError, RecordingError
 from spiked.recording.geometry import DEFAULT_RATE_HZ, Origin, OriginKind, guess, tags_agree
 from spiked.recording.sidecar import (
@@ -85,10 +86,14 @@ class Recording:
             frames = rows.reshape(count, self.sensor.height * self.sensor.row_bytes)
         return REVERSED_BITS[frames] if self.sensor.bit_order is BitOrder.MSB else frames
 
+    def images(self, first: int, count: int, *, out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+        """Upright frames, uint8 [count, height, width] of 0 and 1, in `out` if given. Raises RecordingError."""
+        return unpack(self.read(first, count), self.sensor, out=out)
+
     def frame(self, k: int) -> NDArray[np.bool_]:
         """One upright frame, bool [height, width]."""
-        bits = np.unpackbits(self.compact(k, 1)[0], bitorder="little").reshape(self.sensor.height, self.sensor.width)
-        return (bits[::-1] if self.sensor.flipped else bits).astype(np.bool_)
+        image: NDArray[np.bool_] = self.images(k, 1)[0].astype(np.bool_)
+        return image
 
     def chunks(self, count: int = 256) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """All frames in order: (index of the first, stored frames uint8 [<= count, frame_bytes])."""

@@ -1,6 +1,6 @@
 """How fast the renderer is on this machine, next to figures that mean something on any other.
 
-Times are minima over repetitions, for machines that do other work as well.
+Times are minima over repetitions, for machines that do other work as well; the spread says how far they differed.
 """
 
 import time
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.native._raster import multiply_adds
+from spiked.pose import exp_so3
 from spiked.render.camera import Camera
 from spiked.render.cpu import Rasteriser, usable_cores
 from spiked.render.loss import dssim, robust
@@ -18,8 +19,9 @@ from spiked.render.optimiser import Adam
 from spiked.render.splats import Floats, Splats
 from spiked.sensor import Intrinsics
 
-OPERATIONS_PER_PIXEL = 18 + 36
-"""Vector arithmetic instructions that a splat costs a pixel, forward and backward, for one colour."""
+FORWARD_OPERATIONS, BACKWARD_OPERATIONS = 18, 34
+"""Vector arithmetic instructions that a splat costs a pixel, for one colour."""
+MOTION_PX = 2.0
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,11 @@ class Row:
     ratio: float | None = None
     """A number that can be compared between machines; `against` says what the value was divided by."""
     against: str = ""
+    target: str = ""
+    """What was agreed that it should reach."""
+    spread: float | None = None
+    """Half the distance between the quartiles over the median of the repetitions."""
+    threads: int = 1
 
 
 @dataclass(frozen=True)
@@ -52,6 +59,7 @@ def measure(sizes: tuple[Size, ...] = SIZES, repetitions: int = 10) -> list[Row]
     rows = [Row("fused multiply-adds, one core", peak * 1e-9, "10^9/s")]
     for size in sizes:
         rows += _steps(size, repetitions, peak)
+    rows += _accumulation(sizes[0], repetitions)
     rows.append(_against_naive(repetitions))
     rows += _fused(sizes[0], repetitions)
     return rows
@@ -77,14 +85,29 @@ def scene(size: Size, colours: int = 1, seed: int = 0) -> tuple[Camera, Splats]:
     )
 
 
-def fastest_seconds(work: Callable[[], object], repetitions: int) -> float:
-    """The shortest of a few runs."""
-    best = np.inf
-    for _ in range(repetitions):
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of a few repetitions."""
+
+    best_s: float
+    spread: float
+
+
+def repeated(work: Callable[[], object], repetitions: int) -> Timing:
+    """Timing of so many runs, after one to warm up."""
+    work()
+    times = []
+    for _ in range(max(1, repetitions)):
         start = time.perf_counter()
         work()
-        best = min(best, time.perf_counter() - start)
-    return float(best)
+        times.append(time.perf_counter() - start)
+    low, middle, high = np.quantile(times, (0.25, 0.5, 0.75))
+    return Timing(min(times), float((high - low) / 2 / middle))
+
+
+def fastest_seconds(work: Callable[[], object], repetitions: int) -> float:
+    """The shortest of a few runs."""
+    return repeated(work, repetitions).best_s
 
 
 def _peak_per_second() -> float:
@@ -98,6 +121,14 @@ def _peak_per_second() -> float:
     return done / seconds
 
 
+TARGETS = {
+    (20_000, 1): "<= 10 ms",
+    (20_000, 2): "<= 5.5 ms",
+    (50_000, 1): "<= 80 ms",
+    (50_000, 2): "<= 45 ms",
+}
+
+
 def _steps(size: Size, repetitions: int, peak: float) -> list[Row]:
     camera, splats = scene(size)
     rotation, centre = np.eye(3)[None], np.zeros((1, 3))
@@ -106,15 +137,136 @@ def _steps(size: Size, repetitions: int, peak: float) -> list[Row]:
     for threads in sorted({1, min(2, usable_cores()), usable_cores()}):
         rasteriser = Rasteriser(camera, threads)
 
+        def forward(rasteriser: Rasteriser = rasteriser) -> None:
+            rasteriser.forward(splats, rotation, centre)
+
         def step(rasteriser: Rasteriser = rasteriser) -> None:
             rasteriser.forward(splats, rotation, centre)
             rasteriser.backward(d_values)
 
-        seconds = fastest_seconds(step, repetitions)
-        ideal = rasteriser.block_evaluations * 16 * OPERATIONS_PER_PIXEL / peak / threads
-        name = f"step, {size.splats // 1000}k splats, {size.width}x{size.height}, {threads} thread(s)"
-        rows.append(Row(f"{name}, {rasteriser.instructions}", seconds * 1e3, "ms", ideal / seconds, "of peak"))
+        for name, work, operations, target in (
+            ("forward", forward, FORWARD_OPERATIONS, ""),
+            ("step", step, FORWARD_OPERATIONS + BACKWARD_OPERATIONS, TARGETS.get((size.splats, threads), "")),
+        ):
+            timing = repeated(work, repetitions)
+            share = rasteriser.block_evaluations * 16 * operations / peak / threads / timing.best_s
+            label = f"{name}, {size.splats // 1000}k splats, {size.width}x{size.height}, {rasteriser.instructions}"
+            rows.append(Row(label, timing.best_s * 1e3, "ms", share, "of peak", target, timing.spread, threads))
     return rows
+
+
+def passing(
+    camera: Camera, poses: int, motion_px: float = MOTION_PX
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotations [poses, 3, 3] and centres of a camera that turns and shifts so that the image moves so far."""
+    times = np.linspace(-0.5, 0.5, poses)
+    angle = motion_px / camera.intrinsics.fx
+    return (
+        np.stack([exp_so3(np.array([-0.5, 0.8, 0.2]) * angle * t) for t in times]),
+        np.outer(times, [0.3, 0.2, 0.1]) * angle,
+    )
+
+
+def _accumulation(size: Size, repetitions: int) -> list[Row]:
+    """A camera that moves two pixels while it looks, each pixel over its own window, beside one still render."""
+    camera, splats = scene(size)
+    rng = np.random.default_rng(1)
+    shape = (size.height, size.width)
+    d_values = rng.normal(size=shape).astype(np.float32)
+    windows = np.stack([rng.uniform(0, 0.2, shape), rng.uniform(0.8, 1, shape)]).astype(np.float32)
+    rasteriser = Rasteriser(camera, 1)
+
+    def exactly(poses: int) -> Floats:
+        """The mean over each pixel's window of so many exact renders."""
+        edges = (np.arange(poses + 1, dtype=np.float32) / poses)[:, None, None]
+        overlap = np.clip(np.minimum(windows[1], edges[1:]) - np.maximum(windows[0], edges[:-1]), 0, None)
+        rotations, centres = passing(camera, 2 * poses + 1)
+        weights = (overlap / (windows[1] - windows[0])).astype(np.float32)
+        return rasteriser.forward(splats, rotations[1::2], centres[1::2], weights=weights).values
+
+    def step(render: Callable[[], object]) -> Timing:
+        def work() -> None:
+            render()
+            rasteriser.backward(d_values)
+
+        return repeated(work, repetitions)
+
+    truth = exactly(32)
+    still = step(lambda: rasteriser.forward(splats, *passing(camera, 1)))
+    where = f"{size.splats // 1000}k splats, {size.width}x{size.height}, {MOTION_PX:g} px"
+    rows = []
+    for sub_frames in (1, 2, 4):
+        rotations, centres = passing(camera, sub_frames + 1)
+        scaled = windows * np.float32(sub_frames)
+        image = rasteriser.forward_moving(splats, rotations, centres, scaled).values
+        timing = step(
+            lambda rotations=rotations, centres=centres, scaled=scaled: rasteriser.forward_moving(  # type: ignore[misc]
+                splats, rotations, centres, scaled
+            )
+        )
+        error = 100 * float(np.std(image - truth) / np.std(truth))
+        against = f"of a still step; error {error:.2g} % of contrast"
+        target = "<= 3" if sub_frames <= 2 else ""
+        name = f"moving step, {sub_frames} sub-frame(s), {where}"
+        rows.append(Row(name, timing.best_s * 1e3, "ms", timing.best_s / still.best_s, against, target, timing.spread))
+    timing = step(lambda: exactly(8))
+    error = 100 * float(np.std(exactly(8) - truth) / np.std(truth))
+    against = f"of a still step; error {error:.2g} % of contrast"
+    name = f"8 exact sub-poses, {where}"
+    rows.append(Row(name, timing.best_s * 1e3, "ms", timing.best_s / still.best_s, against, "", timing.spread))
+    return rows
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Times of steps of growing size, and the exponent of the power law through them."""
+
+    name: str
+    sizes: list[float]
+    seconds: list[float]
+
+    @property
+    def exponent(self) -> float:
+        """Slope of log time over log size, by least squares."""
+        return float(np.polyfit(np.log(self.sizes), np.log(self.seconds), 1)[0])
+
+
+def scaling(repetitions: int = 3) -> list[Scaling]:
+    """Time of a step against splats and pixels at the same contributions a pixel, against splats of one size, and
+    against threads."""
+
+    def seconds(size: Size, threads: int = 1, coverage: int | None = None) -> float:
+        """`coverage`: the number of splats that the splats' size is made for."""
+        camera, splats = scene(size)
+        if coverage is not None:
+            splats.log_scales += np.float32(0.5 * np.log(size.splats / coverage))
+        d_values = np.ones((size.height, size.width), np.float32)
+        rasteriser = Rasteriser(camera, threads)
+
+        def step() -> None:
+            rasteriser.forward(splats, np.eye(3)[None], np.zeros((1, 3)))
+            rasteriser.backward(d_values)
+
+        return repeated(step, repetitions).best_s
+
+    counts = [5_000, 20_000, 50_000, 200_000, 500_000]
+    sides = [(400, 250), (640, 400), (1000, 1000)]
+    threads = [n for n in (1, 2, 4, 8, 16) if n <= usable_cores()]
+    small = Size(20_000, 400, 250)
+    return [
+        Scaling("splats, 60 a pixel", list(map(float, counts)), [seconds(Size(n, 400, 250)) for n in counts]),
+        Scaling(
+            "splats of one size",
+            list(map(float, counts[:3])),
+            [seconds(Size(n, 400, 250), coverage=20_000) for n in counts[:3]],
+        ),
+        Scaling(
+            "pixels, 60 splats each",
+            [float(w * h) for w, h in sides],
+            [seconds(Size(50_000, w, h)) for w, h in sides],
+        ),
+        *([Scaling("threads", list(map(float, threads)), [seconds(small, n) for n in threads])] if threads[1:] else []),
+    ]
 
 
 def _against_naive(repetitions: int) -> Row:

@@ -13,7 +13,7 @@ def test_the_naive_renderer_draws_the_same_picture() -> None:
 
 def test_every_row_is_a_positive_number() -> None:
     rows = benchmark.measure((benchmark.Size(300, 64, 40),), repetitions=1)
-    assert len({row.name for row in rows}) == len(rows)
+    assert len({(row.name, row.threads) for row in rows}) == len(rows)
     assert all(row.value > 0 for row in rows)
     steps = [row for row in rows if row.name.startswith("step")]
     assert steps

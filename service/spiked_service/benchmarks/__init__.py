@@ -1,0 +1,1 @@
+"""What `spiked bench` measures across modules; each module's own figures come from its own benchmark."""

@@ -1,0 +1,55 @@
+"""`spiked bench` measures what it says; how fast things are is not judged here."""
+
+import json
+from pathlib import Path
+
+import pytest
+from spiked_service.benchmarks import files, sustained
+from spiked_service.benchmarks.report import Machine, Row, document, text
+from spiked_service.cli import app
+from typer.testing import CliRunner
+
+from spiked.render import benchmark as renderer
+from spiked.ring import RingError
+from spiked.sensor import Sensor
+
+
+def test_files_are_written_and_decoded(tmp_path: Path) -> None:
+    rows = files.rows(tmp_path, megabytes=2)
+    assert [row.ratio is not None and row.ratio > 0 for row in rows] == [True] * 3
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_stream_is_accounted_for_frame_by_frame(tmp_path: Path) -> None:
+    outcome = sustained.run(Sensor(64, 40, 2000.0), 0.5, record=tmp_path)
+    assert outcome.frames == 1000
+    assert set(outcome.lost) == {"tracking", "recorder"}
+    assert set(outcome.consumer_shares) == {"tracking", "recorder", "preview"}
+    assert all(0 <= lost <= outcome.frames for lost in outcome.lost.values())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_consumer_that_dies_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises((RingError, OSError)):
+        sustained.run(Sensor(64, 40, 2000.0), 0.2, record=tmp_path / "missing")
+
+
+def test_rows_as_text_and_as_a_document() -> None:
+    machine = Machine("a processor", 2, "a system", 0.1, 1e11, 1e10)
+    rows = [Row("work", 1.5, "ms", 0.6, "of peak", ">= 0.55", 0.02, 2), Row("more", 3, "GB/s")]
+    lines = text(machine, rows)
+    assert "a processor" in lines[0]
+    assert "0.6 of peak" in lines[1]
+    assert "[>= 0.55]" in lines[1]
+    assert json.loads(json.dumps(document(machine, rows)))["rows"][0]["ratio"] == 0.6
+
+
+def test_growth_is_fitted() -> None:
+    law = renderer.Scaling("cubes", [1.0, 10.0, 100.0], [2.0, 2e3, 2e6])
+    assert law.exponent == pytest.approx(3)
+
+
+def test_the_command_explains_itself() -> None:
+    shown = CliRunner().invoke(app, ["bench", "--help"], env={"COLUMNS": "200"})
+    assert shown.exit_code == 0
+    assert "--json" in shown.output

@@ -90,7 +90,7 @@ def capture_routes(
     """Routes below `captures`. Plain functions: they run on threads, the event loop only passes requests on."""
     router = APIRouter(prefix="/captures", tags=["captures"], route_class=route_class)
 
-    @router.post("", status_code=HTTPStatus.CREATED, responses=problems(409, 507))
+    @router.post("", status_code=HTTPStatus.CREATED, responses=problems(404, 409, 507))
     def start_capture(
         body: CaptureRequest, request: Request, response: Response, idempotency_key: IdempotencyKey = None
     ) -> CaptureOut:

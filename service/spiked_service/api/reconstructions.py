@@ -59,11 +59,17 @@ TEXT: dict[str, Any] = {"schema": {"type": "string"}}
 ETAG: dict[str, Any] = {"ETag": {"description": "Changes with the content.", "schema": {"type": "string"}}}
 VERSION_HEADER: dict[str, Any] = {"X-Scene-Version": {"description": "Its version.", "schema": {"type": "integer"}}}
 NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "What you have is the newest."}}
+_TRAJECTORY = {"schema": {"$ref": "#/components/schemas/TrajectoryOut"}}
 TRAJECTORY_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "The trajectory.",
         "headers": {**ETAG, **VERSION_HEADER},
-        "content": {"text/plain": TEXT, "application/zip": BINARY},
+        "content": {
+            "application/json": _TRAJECTORY,
+            "text/plain": TEXT,
+            "application/vnd.nerfstudio+json": TEXT,
+            "application/zip": BINARY,
+        },
     },
     **NOT_MODIFIED,
     **problems(404),

@@ -55,7 +55,7 @@ TRAJECTORY_TYPES = {
     TrajectoryFormat.TUM: ("text/plain; charset=utf-8", "tum"),
     TrajectoryFormat.KITTI: ("text/plain; charset=utf-8", "kitti.txt"),
     TrajectoryFormat.COLMAP: ("application/zip", "colmap.zip"),
-    TrajectoryFormat.NERFSTUDIO: ("application/json", "transforms.json"),
+    TrajectoryFormat.NERFSTUDIO: ("application/vnd.nerfstudio+json", "transforms.json"),
 }
 
 

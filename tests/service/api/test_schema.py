@@ -1,20 +1,11 @@
 """The running daemon against its own description: no failure of the service, no answer that is not described."""
 
-import os
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-
-CONFIG = """
-[generation]
-allow-x00 = true
-
-[parameters]
-"""
-ALL_CHECKS = "all"
 
 
 def fuzz(service: Any, folder: Path, known: dict[str, str], *options: str) -> None:
@@ -32,9 +23,7 @@ def fuzz(service: Any, folder: Path, known: dict[str, str], *options: str) -> No
         "positive_data_acceptance",
     ]
     command += ["--seed", "1", "--request-timeout", "60", "--warnings", "off", *options]
-    done = subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, timeout=900, check=False, env={**os.environ}
-    )
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=3000, check=False)
     assert done.returncode == 0, done.stdout[-12_000:] + done.stderr[-2000:]
 
 
@@ -43,13 +32,9 @@ QUIET = ("--exclude-operation-id", "start_capture", "--exclude-operation-id", "a
 LASTING = ("--exclude-method", "DELETE")
 
 
-def test_random_requests(service: Any, tmp_path: Path) -> None:
-    fuzz(service, tmp_path / "random", {}, *QUIET, "--phases", "coverage,fuzzing", "--max-examples", "8")
-
-
 def test_requests_about_what_there_is(service: Any, done: Any, job: str, tmp_path: Path) -> None:
     known = {"capture_id": done.id, "reconstruction_id": job, "device_id": "sim:"}
-    options = ("--phases", "examples,coverage,fuzzing", "--max-examples", "8")
+    options = ("--phases", "examples,fuzzing", "--max-examples", "5")
     fuzz(service, tmp_path / "known", known, *QUIET, *LASTING, *options)
 
 

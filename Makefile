@@ -18,7 +18,7 @@ WEB := $(shell find web -path web/node_modules -prune -o -type f -print)
 PAGE := service/spiked_service/page/index.html
 NPM_CI := web/node_modules/.package-lock.json
 
-.PHONY: demo test test-slow lint bench page wheel clean
+.PHONY: demo test test-slow lint bench page api wheel clean
 .DELETE_ON_ERROR:
 
 # Without Node the daemon runs all the same; its page then says how to build it.
@@ -45,6 +45,12 @@ bench: $(VENV)/.native
 	$(BIN)/spiked bench
 
 page: $(PAGE)
+
+# One schema makes both clients: to be run when routes or models have changed, and its results committed.
+api: $(VENV)/.native $(NPM_CI)
+	$(BIN)/spiked openapi --out web/openapi.json
+	$(BIN)/python tests/client/generate.py web/openapi.json
+	cd web && npm run --silent types
 
 wheel: $(VENV)/.native $(PAGE)
 	$(BIN)/pip wheel --quiet --no-build-isolation --no-deps --wheel-dir dist .

@@ -15,4 +15,4 @@ def test_the_models_are_those_that_the_service_describes() -> None:
     generate = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(generate)
     made = generate.generate(generate.openapi())
-    assert generate.MODELS.read_text() == made, "run python tests/client/generate.py"
+    assert generate.MODELS.read_text() == made, "run make api"

@@ -30,6 +30,8 @@ _UNHURRIED_S = 0.3
 """A source that waits is held up for this long after so many frames, so that the map keeps pace with the path."""
 _PUBLISH_S = 1.5
 _TELL_S = 0.2
+_LIVE_NICE = 5
+"""Mapping takes every core there is; acquisition, and views of what is mapped, go before it."""
 _OFFLINE_NICE = 10
 
 
@@ -40,6 +42,7 @@ def run_reconstruction(order: ReconstructionOrder, link: Link) -> None:
     not take what is to be published.
     """
     if order.ring is not None:
+        os.nice(_LIVE_NICE)
         with RingReader.attach(order.ring, Policy.LOSSLESS, "reconstruction", order.first_frame) as reader:
             work = _begin(order, reader.geometry.sensor, link)
             _follow(reader, work, order)

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,6 +42,13 @@ def running(*command: str, cwd: Path | None = None) -> Iterator["Queue[str]"]:
         os.killpg(process.pid, signal.SIGTERM)
         process.wait(DEADLINE_S)
         reader.join()
+
+
+def wait_for(condition: Callable[[], bool], what: str) -> None:
+    deadline = time.monotonic() + 4 * DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline, f"waited in vain until {what}"
+        time.sleep(0.1)
 
 
 def reload_until(daemon: Any, lines: "Queue[str]") -> str:
@@ -86,6 +94,24 @@ def test_zmq_prints_poses(daemon: Callable[..., Any]) -> None:
     one = daemon()
     zmq = one.http.get("system").json()["zmq"]
     assert all(zmq[name].startswith("tcp://127.0.0.1:") for name in ("events", "state", "previews"))
+
+
+@pytest.mark.slow
+def test_the_path_is_drawn_and_poses_come_over_zmq(daemon: Callable[..., Any], tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "spiked_service", "simulate", "-o", str(tmp_path / "room"), "--motion", "arc"]
+    subprocess.run([*command, "--frames", "1280", "--width", "400", "--height", "250"], check=True, capture_output=True)
+    one = daemon()
+    port = one.http.get("system").json()["zmq"]["events"].rpartition(":")[2]
+    with (
+        running(sys.executable, str(EXAMPLES / "live_trajectory.py"), websocket(one), cwd=tmp_path),
+        running(sys.executable, str(EXAMPLES / "zmq_events.py"), port) as poses,
+    ):
+        wait_for(lambda: one.http.get("system").json()["event_clients"] == 1, "the example listens")
+        body = {"source": f"replay:{tmp_path / 'room' / 'simulated.dat'}", "options": {"steps": 10}}
+        assert one.http.post("captures", json=body).status_code == 201
+        frame, *position = poses.get(timeout=4 * DEADLINE_S).split()
+        assert int(frame) >= 0 and len(position) == 3
+        wait_for((tmp_path / "trajectory.png").is_file, "the picture is there")
 
 
 def test_the_trajectory_example_has_twenty_lines() -> None:

@@ -60,6 +60,7 @@ class SystemOut(BaseModel):
     memory_bytes: int = Field(description="Resident memory of the service itself, without its workers.")
     pid: int
     events_seq: int = Field(description="Number of the newest event.")
+    event_clients: int = Field(description="Clients of the events now, WebSocket and server-sent events.")
     zmq: ZmqOut | None = Field(description="null where ZeroMQ is turned off.")
 
 
@@ -149,6 +150,7 @@ def operations_routes(services: Services) -> APIRouter:
             memory_bytes=resident_bytes(),
             pid=os.getpid(),
             events_seq=services.bus.seq,
+            event_clients=services.event_clients.inside,
             zmq=None if services.zmq is None else ZmqOut(**vars(services.zmq)),
         )
 

@@ -1,0 +1,165 @@
+"""Many clients for long: no frame is lost, memory stays, and everybody gets every message."""
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+CLIENTS = Path(__file__).with_name("clients.py")
+EVENT_CLIENTS, VIEW_CLIENTS = 50, 8
+VIEW_PERIOD_S = 0.5
+RATE_HZ = 20_000
+WIDTH, HEIGHT = 96, 64
+START_S = 240.0
+GROWTH_BYTES = 24 << 20
+"""Memory may grow by so much, whatever the length: caches fill, and malloc keeps what it once had."""
+
+
+class Memory:
+    """Resident memory of the service and of the workers that should not grow, once a second."""
+
+    def __init__(self, daemon: Any) -> None:
+        self._daemon = daemon
+        self.bytes: dict[str, list[int]] = {}
+        self.files: list[int] = []
+
+    def look(self) -> None:
+        processes = {"service": psutil.Process(self._daemon.process.pid), **self._daemon.workers()}
+        self.files.append(processes["service"].num_fds())
+        for role in ("service", "acquisition", "recorder", "preview"):
+            if role in processes:
+                usage = processes[role].memory_info()
+                self.bytes.setdefault(role, []).append(usage.rss - usage.shared)  # the ring is shared
+
+    def growth(self) -> dict[str, int]:
+        """From the second quarter to the last, medians."""
+        grown = {}
+        for role, seen in self.bytes.items():
+            quarter = max(1, len(seen) // 4)
+            grown[role] = int(statistics.median(seen[-quarter:]) - statistics.median(seen[quarter : 2 * quarter]))
+        return grown
+
+
+@contextmanager
+def clients(*arguments: str) -> Iterator[Callable[[], list[dict[str, Any]]]]:
+    """Clients at work, and how to end them and have their reports."""
+    process = subprocess.Popen([sys.executable, str(CLIENTS), *arguments], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+
+    def reports() -> list[dict[str, Any]]:
+        process.terminate()
+        assert process.stdout is not None
+        return list(json.loads(process.stdout.readline()))
+
+    try:
+        yield reports
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def wait_for(condition: Callable[[], Any], what: str) -> Any:
+    deadline = time.monotonic() + START_S
+    while not (found := condition()):
+        assert time.monotonic() < deadline, f"waited in vain until {what}"
+        time.sleep(0.1)
+    return found
+
+
+def recorded(folder: Path, width: int, height: int) -> Path:
+    """1,280 frames of a simulated camera."""
+    command = [sys.executable, "-m", "spiked_service", "simulate", "-o", str(folder), "--frames", "1280"]
+    command += ["--motion", "arc", "--width", str(width), "--height", str(height)]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    return folder / "simulated.dat"
+
+
+def a_scene(daemon: Any, recording: Path) -> str:
+    """A reconstruction that views can be rendered from."""
+    body = {"source": f"replay:{recording}", "record": False, "options": {"steps": 20}}
+    capture = daemon.http.post("captures", json=body).json()["id"]
+
+    def done() -> Any:
+        jobs = daemon.http.get("reconstructions", params={"capture_id": capture}).json()["items"]
+        return jobs and jobs[0]["state"] in ("complete", "failed") and jobs[0]
+
+    job = wait_for(done, "there is a scene")
+    assert job["state"] == "complete" and job["version"] > 0, job
+    return str(job["id"])
+
+
+def soak(daemon: Any, tmp_path: Path, seconds: float) -> None:
+    recording = recorded(tmp_path / "small", WIDTH, HEIGHT)
+    scene = a_scene(daemon, recorded(tmp_path / "room", 400, 250))
+    repeats = int(seconds * RATE_HZ / 1280) + 1
+    address = daemon.address.rstrip("/")
+    with (
+        clients("events", address, str(EVENT_CLIENTS)) as listeners,
+        clients("views", address, str(VIEW_CLIENTS), scene, str(VIEW_PERIOD_S)) as viewers,
+    ):
+        source = f"replay:{recording}?pace=1&repeat={repeats}"
+        started = daemon.http.post("captures", json={"source": source, "options": {"steps": 20}})
+        assert started.status_code == 201, started.text
+        capture = f"captures/{started.json()['id']}"
+        wait_for(lambda: "recorder" in daemon.workers(), "the recorder runs")
+        memory = Memory(daemon)
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s:
+            memory.look()
+            time.sleep(1)
+        daemon.http.post(f"{capture}:stop")
+        daemon.http.post(f"{capture}:stop")
+        final = wait_for(lambda: (now := daemon.http.get(capture).json())["recording"] and now, "it is recorded")
+        views, events = viewers(), listeners()
+
+    counters = final["counters"]
+    assert counters["received"] + sum(counters["lost"].values()) == counters["next_frame"]
+    assert sum(counters["lost"].values()) == 0
+    assert final["recording"]["frames"] == counters["next_frame"] > 0.9 * seconds * RATE_HZ
+    assert final["verdict"]["grade"] == "good", final["verdict"]
+
+    assert all(client["disorder"] == 0 and "closed" not in client for client in events)
+    assert all(set(client["lost"]) <= {"preview"} for client in events)
+    for topic in set().union(*(client["messages"] for client in events)) - {"preview"}:
+        counts = [client["messages"][topic] for client in events]
+        assert max(counts) - min(counts) <= 0.02 * max(counts) + 20, (topic, counts)  # they ended one after another
+
+    ms = sorted(took for client in views for took in client["ms"])
+    status = {code: sum(client["status"].get(code, 0) for client in views) for code in ("200", "503")}
+    assert status["200"] + status["503"] == len(ms) and status["200"] > 0.5 * len(ms), status
+    report = {
+        "seconds": seconds,
+        "frames": counters["next_frame"],
+        "messages": sum(sum(client["messages"].values()) for client in events),
+        "views": len(ms),
+        "view_ms_median": statistics.median(ms),
+        "growth_mib": {role: round(grown / 2**20, 1) for role, grown in memory.growth().items()},
+        "memory_mib": {role: round(seen[-1] / 2**20) for role, seen in memory.bytes.items()},
+        "files": (memory.files[0], memory.files[-1]),
+    }
+    print(json.dumps(report))
+    assert all(grown < GROWTH_BYTES for grown in memory.growth().values()), report
+    assert memory.files[-1] <= memory.files[0] + 20, report
+
+
+def test_many_clients_for_half_a_minute(daemon: Callable[..., Any], tmp_path: Path) -> None:
+    soak(daemon(), tmp_path, 20)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_many_clients_for_ten_minutes(daemon: Callable[..., Any], tmp_path: Path) -> None:
+    if os.statvfs(tmp_path).f_bavail * os.statvfs(tmp_path).f_frsize < 20 << 30:
+        pytest.skip("needs 20 GiB for the recording")
+    soak(daemon(), tmp_path, 600)

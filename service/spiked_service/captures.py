@@ -133,7 +133,9 @@ class Captures:
             self._refuse_if_busy(device)
             if device in self._armed:
                 raise BusyError(f"{device} is armed already: disarm it first to change what it keeps")
-            standby = self._armed[device] = Standby(source, pretrigger_s, self._folder, self._announce, self._disarmed)
+            standby = self._armed[device] = Standby(
+                hurried(source), pretrigger_s, self._folder, self._announce, self._disarmed
+            )
             return standby
 
     def disarm(self, source: str) -> None:
@@ -421,3 +423,10 @@ def unhurried(source: str) -> str:
     if not kind.startswith(("replay:", "sim:")) or "pace=" in query:
         return source
     return f"{kind}?{query}&{urlencode({'pace': 0})}" if query else f"{kind}?pace=0"
+
+
+def hurried(source: str) -> str:
+    """The source without `pace=0`: as fast as a camera, because nothing that stands by holds it up."""
+    kind, _, query = source.partition("?")
+    options = [option for option in query.split("&") if option and option != "pace=0"]
+    return f"{kind}?{'&'.join(options)}" if options else kind

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from spiked_service.captures import unhurried
+from spiked_service.captures import hurried, unhurried
 from spiked_service.ids import new_id
 from spiked_service.images import ImageFormat, encode
 from spiked_service.offline import Piece, pieces
@@ -90,3 +90,11 @@ def test_feeding_follows_the_capture_index_around_gaps(tmp_path: Path) -> None:
         Piece(65, 32, 71),
         Piece(97, 3, 103),
     ]
+
+
+@pytest.mark.parametrize(
+    ("given", "used"),
+    [("sim:?pace=0", "sim:"), ("sim:?seed=1&pace=0", "sim:?seed=1"), ("usb0?fov=40", "usb0?fov=40"), ("usb0", "usb0")],
+)
+def test_an_armed_source_runs_at_its_own_pace(given: str, used: str) -> None:
+    assert hurried(given) == used

@@ -7,7 +7,7 @@ from fastapi import APIRouter, FastAPI
 from fastapi.concurrency import run_in_threadpool
 
 from spiked_service.api.captures import capture_routes
-from spiked_service.api.devices import device_routes
+from spiked_service.api.devices import DeviceWatch, device_routes
 from spiked_service.api.docs import mount_docs
 from spiked_service.api.events import event_routes
 from spiked_service.api.idempotency import IdempotencyKeys, idempotent
@@ -31,15 +31,20 @@ from spiked_service.views import ViewRenderer
 def create_app(services: Services) -> FastAPI:
     """The application. Where tokens are needed, every request but the health checks must bring one."""
 
+    sources = Sources(services.settings)
+    watch = DeviceWatch(services.captures, sources, services.bus)
+
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        watch.start()
         yield
+        await run_in_threadpool(watch.stop)
         await run_in_threadpool(services.captures.close)
 
     app = FastAPI(title="spiked", version=installed_version(), docs_url=None, redoc_url=None, lifespan=lifespan)
     describe(app)
     install(app)
-    app.include_router(_api(services))
+    app.include_router(_api(services, sources))
     app.include_router(health_routes(services))
     app.include_router(metrics_routes(services))
     app.add_middleware(Security, settings=services.settings, tokens=services.tokens)
@@ -49,12 +54,11 @@ def create_app(services: Services) -> FastAPI:
     return app
 
 
-def _api(services: Services) -> APIRouter:
+def _api(services: Services, sources: Sources) -> APIRouter:
     register_path_kinds()
     captures, reconstructions, keeping = services.captures, services.reconstructions, services.keeping
     once = idempotent(IdempotencyKeys(keeping.catalogue))
     views = ViewRenderer(services.renders)
-    sources = Sources(services.settings)
     results = Results(reconstructions, captures)
     uploads = Uploads(keeping.folder, keeping.catalogue)
     api = APIRouter(prefix="/api/v1")

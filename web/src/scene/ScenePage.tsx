@@ -8,6 +8,7 @@ import { nameOf } from "../state/capture";
 import { count } from "../state/format";
 import { adjust, go, route, useRoute } from "../state/route";
 import {
+  isEnded,
   loadReconstructions,
   newestCapture,
   newestReconstruction,
@@ -165,8 +166,13 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
           <div className="veil">
             {problem !== null ? (
               <Trouble text={problem} />
-            ) : job.state === "failed" ? (
-              <Empty icon="problem" title="The reconstruction has failed">
+            ) : isEnded(job) && job.version === 0 ? (
+              <Empty
+                icon="problem"
+                title={
+                  job.state === "failed" ? "The reconstruction has failed" : "No scene came of this reconstruction"
+                }
+              >
                 {job.reason}
               </Empty>
             ) : (

@@ -776,6 +776,26 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/metrics": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Metrics
+         * @description Figures for Prometheus; docs/operations.md explains each.
+         */
+        get: operations["get_metrics_metrics_get"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
 }
 export type webhooks = Record<string, never>;
 export interface components {
@@ -990,7 +1010,7 @@ export interface components {
              */
             keep: boolean;
             /** @description live: captured here; upload: a recording from elsewhere. */
-            origin: components["schemas"]["spiked_service__store__rows__Origin"];
+            origin: components["schemas"]["Origin"];
             /** Source */
             source: string;
             state: components["schemas"]["CaptureState"];
@@ -1384,6 +1404,12 @@ export interface components {
          */
         Mosaic: "RGGB" | "BGGR" | "GRBG" | "GBRG";
         /**
+         * Origin
+         * @description Where a recording comes from.
+         * @enum {string}
+         */
+        Origin: "live" | "upload";
+        /**
          * Output
          * @description What a view shows.
          * @enum {string}
@@ -1721,6 +1747,12 @@ export interface components {
             mosaic: components["schemas"]["Mosaic"] | null;
         };
         /**
+         * SettingOrigin
+         * @description Where a value comes from; later ones prevail.
+         * @enum {string}
+         */
+        SettingOrigin: "default" | "file" | "environment" | "flag";
+        /**
          * SettingOut
          * @description One setting; secrets are masked.
          */
@@ -1735,7 +1767,7 @@ export interface components {
              * @example 8
              */
             value: unknown;
-            origin: components["schemas"]["spiked_service__config__Origin"];
+            origin: components["schemas"]["SettingOrigin"];
             /**
              * Reloadable
              * @description Whether `configuration:reload` brings a new value into effect.
@@ -1821,6 +1853,13 @@ export interface components {
              * @description Number of the newest event.
              */
             events_seq: number;
+            /**
+             * Event Clients
+             * @description Clients of the events now, WebSocket and server-sent events.
+             */
+            event_clients: number;
+            /** @description null where ZeroMQ is turned off. */
+            zmq: components["schemas"]["ZmqOut"] | null;
         };
         /**
          * TimelineOut
@@ -2185,17 +2224,27 @@ export interface components {
             white?: number | null;
         };
         /**
-         * Origin
-         * @description Where a value comes from; later ones prevail.
-         * @enum {string}
+         * ZmqOut
+         * @description Addresses of the ZeroMQ sockets, on this machine.
          */
-        spiked_service__config__Origin: "default" | "file" | "environment" | "flag";
-        /**
-         * Origin
-         * @description Where a recording comes from.
-         * @enum {string}
-         */
-        spiked_service__store__rows__Origin: "live" | "upload";
+        ZmqOut: {
+            /**
+             * Events
+             * @description PUB: all but pictures.
+             * @example tcp://127.0.0.1:8651
+             */
+            events: string;
+            /**
+             * State
+             * @description REP: the newest message of each kind, or those after a number.
+             */
+            state: string;
+            /**
+             * Previews
+             * @description PUB: pictures.
+             */
+            previews: string;
+        };
     };
     responses: never;
     parameters: never;
@@ -2685,6 +2734,15 @@ export interface operations {
             };
             /** @description A token is needed. */
             401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description There is no such thing, or not yet. */
+            404: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -3824,7 +3882,9 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
+                    "application/json": components["schemas"]["TrajectoryOut"];
                     "text/plain": string;
+                    "application/vnd.nerfstudio+json": string;
                     "application/zip": string;
                 };
             };
@@ -4715,7 +4775,9 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
+                    "application/json": components["schemas"]["TrajectoryOut"];
                     "text/plain": string;
+                    "application/vnd.nerfstudio+json": string;
                     "application/zip": string;
                 };
             };
@@ -6272,6 +6334,26 @@ export interface operations {
                 };
                 content: {
                     "application/json": components["schemas"]["HealthOut"];
+                };
+            };
+        };
+    };
+    get_metrics_metrics_get: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "text/plain": string;
                 };
             };
         };

@@ -1,7 +1,7 @@
 """How fast views come while mapping goes on: `python docs/measure_views.py [ADDRESS]`, with `spiked serve` there.
 
 Starts a capture of the simulated camera (400x250), waits until its map is refined, and asks for views from along its
-path with 1, 4 and 8 clients. Each client is a thread with a connection of its own; they share the machine with the service.
+path with 1, 4 and 8 clients, each a thread with a connection of its own on the service's machine.
 """
 
 import http.client

@@ -3,7 +3,7 @@
 import json
 import os
 import threading
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -39,6 +39,10 @@ class UploadOffsetError(UploadError):
         self.offset_bytes = offset_bytes
 
 
+class UploadTooLargeError(UploadError):
+    """More than the settings allow."""
+
+
 class UploadBusyError(UploadError):
     """Another request works on the same upload."""
 
@@ -46,7 +50,9 @@ class UploadBusyError(UploadError):
 class Uploads:
     """Takes recordings in. Methods may be called from any thread, `append` from an event loop."""
 
-    def __init__(self, folder: DataFolder, catalogue: Catalogue) -> None:
+    def __init__(self, folder: DataFolder, catalogue: Catalogue, limit_bytes: Callable[[], int]) -> None:
+        """`limit_bytes` tells how long a recording may be, now."""
+        self._limit_bytes = limit_bytes
         self._folder = folder
         self._catalogue = catalogue
         self._lock = threading.Lock()
@@ -55,7 +61,9 @@ class Uploads:
     def create(
         self, name: str, notes: str, size: int, sidecar: str | None, geometry: str | None, sha256: str | None
     ) -> UploadRow:
-        """Announce a recording of `size` bytes. Raises StoreError when the disk has no room for it."""
+        """Announce a recording of `size` bytes. Raises UploadTooLargeError, StoreError if there is no room."""
+        if size > self._limit_bytes():
+            raise UploadTooLargeError(f"{size} bytes are more than the {self._limit_bytes()} that an upload may have")
         free = self._folder.space().free_bytes
         if size > free - _RESERVE_BYTES:
             raise StoreError(

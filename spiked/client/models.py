@@ -967,6 +967,10 @@ class SystemOut(BaseModel):
     ]
     pid: int
     events_seq: Annotated[int, Field(description="Number of the newest event.")]
+    event_clients: Annotated[
+        int,
+        Field(description="Clients of the events now, WebSocket and server-sent events."),
+    ]
     zmq: Annotated[ZmqOut | None, Field(description="null where ZeroMQ is turned off.")]
 
 

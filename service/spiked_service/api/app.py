@@ -60,7 +60,7 @@ def _api(services: Services, sources: Sources) -> APIRouter:
     once = idempotent(IdempotencyKeys(keeping.catalogue))
     views = ViewRenderer(services.renders)
     results = Results(reconstructions, captures)
-    uploads = Uploads(keeping.folder, keeping.catalogue)
+    uploads = Uploads(keeping.folder, keeping.catalogue, lambda: services.settings.now.limit_upload_bytes)
     api = APIRouter(prefix="/api/v1")
     api.include_router(device_routes(captures, sources, once))
     api.include_router(capture_routes(captures, sources, keeping.folder, results, views, once))

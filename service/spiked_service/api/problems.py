@@ -15,7 +15,7 @@ from spiked_service.errors import BusyError
 from spiked_service.limits import OverloadedError
 from spiked_service.pictures import FrameNotRecordedError
 from spiked_service.store.catalogue import StoreError, UnknownIdError
-from spiked_service.uploads import UploadBusyError, UploadError, UploadOffsetError
+from spiked_service.uploads import UploadBusyError, UploadError, UploadOffsetError, UploadTooLargeError
 
 MEDIA_TYPE = "application/problem+json"
 _RETRY_S = 1
@@ -75,6 +75,7 @@ _STATUS: dict[type[SpikedError], HTTPStatus] = {
     FrameNotRecordedError: HTTPStatus.NOT_FOUND,
     BusyError: HTTPStatus.CONFLICT,
     UploadBusyError: HTTPStatus.CONFLICT,
+    UploadTooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
     UploadOffsetError: HTTPStatus.CONFLICT,
     UploadError: HTTPStatus.CONFLICT,
     UnsupportedTypeError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,

@@ -43,7 +43,7 @@ def test_five_formats_hold_the_same_poses(service: Any, job: str, tmp_path: Any)
     assert len(tum) == len(listed.frames) > 100
     np.testing.assert_allclose(listed.positions, tum.centres, atol=1e-8)
     np.testing.assert_allclose(np.array(listed.frames) + 0.5, tum.times_s * 20_000, atol=1e-3)
-    assert "track" in listed.states
+    assert set(listed.states) <= {"boot", "track", "degraded"}
     kitti = np.loadtxt(io.BytesIO(client.trajectory_file(job, "kitti"))).reshape(-1, 3, 4)
     np.testing.assert_allclose(kitti, tum.matrices()[:, :3], atol=1e-7)
     frames = json.loads(client.trajectory_file(job, "nerfstudio"))["frames"]

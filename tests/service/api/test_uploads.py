@@ -150,7 +150,14 @@ def test_announcements_that_cannot_be(service: Any, body: dict[str, Any]) -> Non
     assert service.http.post("uploads", json=body).status_code == 422
 
 
-def test_no_room_is_told_at_once(service: Any) -> None:
-    answer = service.http.post("uploads", json={"name": "a", "bytes": 2**42})
+def test_more_than_the_settings_allow_is_told_at_once(service: Any) -> None:
+    answer = service.http.post("uploads", json={"name": "a", "bytes": 2**41})
+    assert answer.status_code == 413
+    assert "may have" in answer.json()["detail"]
+
+
+def test_more_than_the_disk_has_is_told_at_once(daemon: Any) -> None:
+    one = daemon("--set", f"limit_upload_bytes={2**42}")
+    answer = one.http.post("uploads", json={"name": "a", "bytes": 2**41})
     assert answer.status_code == 507
     assert "do not fit" in answer.json()["detail"]

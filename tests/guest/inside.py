@@ -18,6 +18,7 @@ USB = Path(__file__).resolve().parents[1] / "usb"
 sys.path.append(str(USB))
 
 import numpy as np  # noqa: E402
+from driving import Driver  # noqa: E402
 from virtual_camera.core import Camera  # noqa: E402
 from virtual_camera.descriptors import Identity, Speed  # noqa: E402
 from virtual_camera.faults import Fault, Kind  # noqa: E402
@@ -39,17 +40,27 @@ class Guest:
         self.pictures = np.fromfile(out / "noise.dat", np.uint8).reshape(-1, COMPACT_BYTES)
         self._plugs = 0
 
+    @property
+    def environment(self) -> dict[str, str]:
+        """For programs that use the cameras."""
+        path = os.pathsep.join([str(USB), os.environ.get("PYTHONPATH", "")])
+        return {**os.environ, "PYTHONPATH": path}
+
     def plug(
         self, *faults: Fault, port: int = 0, serial: str = "000000000001", speed: Speed = Speed.SUPER, lines: int = 0
     ) -> UsbIpCamera:
-        """A camera at a port of the virtual hub, when the kernel and udev know it."""
-        self._plugs += 1
+        """A new camera at a port of the virtual hub, when the kernel and udev know it."""
         stream = Stream(self.pictures, lines=lines, nbytes=50 * lines & 0xFFFFFFFF, faults=faults)
+        return self.plug_in(Camera(stream, Identity(serial=serial), speed), port)
+
+    def plug_in(self, known: Camera, port: int) -> UsbIpCamera:
+        """A camera at a port, be it for the first time or not."""
+        self._plugs += 1
         ours, theirs = socket.socketpair()
-        camera = UsbIpCamera(ours, Camera(stream, Identity(serial=serial), speed))
-        port += _FIRST_SUPER_PORT if speed is Speed.SUPER else 0
+        camera = UsbIpCamera(ours, known)
+        port += _FIRST_SUPER_PORT if known.speed is Speed.SUPER else 0
         before = set(cameras())
-        (VHCI / "attach").write_text(f"{port} {theirs.fileno()} {self._plugs} {_SPEEDS[speed]}")
+        (VHCI / "attach").write_text(f"{port} {theirs.fileno()} {self._plugs} {_SPEEDS[known.speed]}")
         theirs.close()
         until(lambda: set(cameras()) - before, "the kernel sees the camera")
         subprocess.run(["udevadm", "settle", "-t", "30"], check=True)
@@ -66,7 +77,7 @@ class Guest:
         call = json.dumps({"args": args, "kwargs": kwargs, "user": None})
         done = subprocess.run(
             [sys.executable, "-m", "plain_client", function, call],
-            env={**os.environ, "PYTHONPATH": str(USB)},
+            env=self.environment,
             stdout=subprocess.PIPE,
             text=True,
             check=True,
@@ -152,7 +163,41 @@ def discarded(guest: Guest) -> Any:
     return answer
 
 
-SCENES = (listed, read, refused, troubled, pulled, discarded)
+def driven(guest: Guest) -> Any:
+    """The driver through dropped frames, a stall, a babble, and its camera pulled out and plugged in elsewhere."""
+    rate = 250
+    stream = Stream(guest.pictures, rate_hz=rate, buffer_frames=4 * rate)
+    known = Camera(stream)
+    camera = guest.plug_in(known, 0)
+    driver = Driver(guest, f"usb0?rate={rate}&silence_s=3&transfer_kib=64&hide_ms=1000", patience_s=120.0)
+    driver.wait_for_frames(100)
+    for kind in (Kind.DROP, Kind.STALL, Kind.BABBLE):
+        camera.add(Fault(1, kind, count=7))
+        driver.wait_for_frames(2 * rate)
+    seen = len(driver.told.states)
+    guest.unplug(camera)
+    driver.wait_for_state("absent", after=seen)
+    stream.power_on(lines=1000, nbytes=77)
+    guest.plug_in(known, 4)
+    driver.wait_for_state("streaming", after=len(driver.told.states))
+    driver.wait_for_frames(rate)
+    told = driver.stop()
+    return {
+        "states": told.states,
+        "gaps": told.gaps,
+        "end": told.end,
+        "received": told.received,
+        "offsets": told.offsets,
+        "closed_s": told.closed_s,
+        "sent": all(
+            any(run.first <= number and number + count <= run.first + run.count for run in stream.sent)
+            for (_, number), count in told.runs.items()
+            if count
+        ),
+    }
+
+
+SCENES = (listed, read, refused, troubled, pulled, discarded, driven)
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,8 @@ def guest(pictures: Path, tmp_path_factory: pytest.TempPathFactory, pytestconfig
     out = tmp_path_factory.mktemp("guest") / "out"
     out.mkdir()
     (out / "noise.dat").write_bytes(pictures.read_bytes())
-    console = run(kernel, [sys.executable, str(Path(__file__).parent / "inside.py"), "/tmp/out"], out)
+    python = ["/usr/bin/env", f"PYTHONPATH={os.environ.get('PYTHONPATH', '')}", sys.executable]
+    console = run(kernel, [*python, str(Path(__file__).parent / "inside.py"), "/tmp/out"], out)
     return Scenes(out, console)
 
 
@@ -91,3 +93,17 @@ def test_a_camera_pulled_out_while_it_is_read_is_found_at_another_port(guest: Sc
 
 def test_poll_and_discard_are_as_in_the_mocked_one(guest: Scenes) -> None:
     assert guest["discarded"] == {"ready": [0, 1, 0], "same": True, "status": -errno.ENOENT, "actual": 0}
+
+
+def test_the_driver_goes_on_through_trouble_on_a_real_kernel(guest: Scenes) -> None:
+    scene = guest["driven"]
+    assert scene["received"] + sum(count for _, count, _ in scene["gaps"]) == scene["end"]
+    assert scene["sent"], "a frame came that was not sent, or under another's number"
+    causes = [cause for _, _, cause in scene["gaps"]]
+    assert next(count for _, count, cause in scene["gaps"] if cause == "device") == 7
+    assert causes[-1] == "device"  # unplugged
+    states = [state for state, _ in scene["states"]]
+    assert states.count("lost") == 3
+    assert "absent" in states
+    assert states[-1] == "streaming"
+    assert scene["closed_s"] < 3.0  # under emulation

@@ -7,12 +7,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from virtual_camera.rig import Report, VirtualCameras
+from virtual_camera.rig import Report
 
 _HERE = Path(__file__).resolve().parent
 PATIENCE_S = 40.0
@@ -62,10 +62,20 @@ class Told:
         return [offset for at, offset in enumerate(offsets) if not at or offset != offsets[at - 1]]
 
 
+class Machine(Protocol):
+    """Where the driver runs."""
+
+    @property
+    def environment(self) -> Mapping[str, str]:
+        """In which it finds the cameras."""
+        ...
+
+
 class Driver:
     """`driver_client` as a process that sees the virtual cameras."""
 
-    def __init__(self, rig: VirtualCameras, spec: str, *, user: int | None = None) -> None:
+    def __init__(self, rig: Machine, spec: str, *, user: int | None = None, patience_s: float = PATIENCE_S) -> None:
+        self._patience_s = patience_s
         path = os.pathsep.join([str(_HERE), os.environ.get("PYTHONPATH", "")])
         self._process = subprocess.Popen(
             [sys.executable, "-m", "driver_client", spec, *([] if user is None else [str(user)])],
@@ -78,8 +88,9 @@ class Driver:
         self._lines: queue.Queue[str] = queue.Queue()
         threading.Thread(target=self._listen, daemon=True).start()
 
-    def wait_for(self, condition: Callable[[Told], Any], seconds: float = PATIENCE_S) -> Told:
+    def wait_for(self, condition: Callable[[Told], Any]) -> Told:
         """Until the condition is fulfilled. Raises TimeoutError with what was told."""
+        seconds = self._patience_s
         deadline_s = time.monotonic() + seconds
         while not condition(self.told):
             try:

@@ -96,7 +96,7 @@ class Driver:
             try:
                 self._hear(self._lines.get(timeout=max(0.0, deadline_s - time.monotonic())))
             except queue.Empty as error:
-                raise TimeoutError(f"not so within {seconds:g} s: {self.told}") from error
+                raise TimeoutError(f"not so within {seconds:g} s: {str(self.told)[:5000]}") from error
         return self.told
 
     def wait_for_state(self, *states: str, after: int = 0) -> Told:

@@ -1,7 +1,7 @@
 """The whole driver with every frame looked at: a source, the acquisition loop and the ring, and a reader that compares.
 
 `python -m whole_driver SPEC FRAMES PICTURES`, in a process that sees the virtual cameras; it reads until FRAMES frames,
-lost ones included, or until its standard input ends, and prints an `Account` as JSON.
+lost ones included, and prints an `Account` as JSON. Without PICTURES nothing is compared, for a measurement of speed.
 """
 
 import json
@@ -19,10 +19,9 @@ from spiked_driver import acquire, open_source
 from virtual_camera.rig import Report, VirtualCameras
 from virtual_camera.stream import COMPACT_BYTES, STAMP_BYTES
 
-from spiked.ring import End, Frames, Gap, Policy, RingReader, RingWriter
+from spiked.ring import End, Frames, Gap, Policy, Ring, RingReader, RingWriter
 
 _HERE = Path(__file__).resolve().parent
-MOST_RUNS = 10_000
 
 
 @dataclass
@@ -43,8 +42,6 @@ class Account:
     seconds: float = 0.0
     """From the first frame to the last."""
     acquisition_cpu_s: float = 0.0
-    states: int = 0
-    """How often the device's state changed."""
 
     @property
     def lost_frames(self) -> int:
@@ -65,11 +62,11 @@ class Account:
         assert self.lost_frames == not_sent + (sent - self.received)
 
 
-def run(rig: VirtualCameras, spec: str, frames: int, pictures: Path, *, timeout_s: float = 120.0) -> Account:
+def run(rig: VirtualCameras, spec: str, frames: int, pictures: Path | None, *, timeout_s: float = 240.0) -> Account:
     """Play a capture of so many frames against the rig's cameras, and give its account."""
     path = os.pathsep.join([str(_HERE), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
-        [sys.executable, "-m", "whole_driver", spec, str(frames), str(pictures)],
+        [sys.executable, "-m", "whole_driver", spec, str(frames), *([str(pictures)] if pictures else [])],
         stdout=subprocess.PIPE,
         text=True,
         env={**rig.environment, "PYTHONPATH": path},
@@ -122,6 +119,20 @@ def _judge(name: str, pictures: str) -> None:
     print(json.dumps(asdict(account)))
 
 
+def _unwatched(spec: str, frames: int) -> None:
+    source = open_source(spec)
+    with RingWriter.create(source.sensor) as writer:
+        start_s, cpu_s = time.monotonic(), time.process_time()
+        acquire(source, writer, threading.Event(), limit_frames=frames)
+        seconds, cpu_s = time.monotonic() - start_s, time.process_time() - cpu_s
+        status = Ring.attach(writer.name).status().writer
+        lost = {cause: count for cause, count in status.lost.items() if count}
+        account = Account(
+            received=status.committed, lost=lost, end=status.next_frame, seconds=seconds, acquisition_cpu_s=cpu_s
+        )
+    print(json.dumps(asdict(account)))
+
+
 def _capture(spec: str, frames: int, pictures: str) -> None:
     source = open_source(spec)
     stop = threading.Event()
@@ -139,5 +150,7 @@ def _capture(spec: str, frames: int, pictures: str) -> None:
 if __name__ == "__main__":
     if sys.argv[1] == "judge":
         _judge(sys.argv[2], sys.argv[3])
+    elif len(sys.argv) == 3:
+        _unwatched(sys.argv[1], int(sys.argv[2]))
     else:
         _capture(sys.argv[1], int(sys.argv[2]), sys.argv[3])

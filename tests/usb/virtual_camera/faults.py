@@ -22,7 +22,7 @@ class Kind(StrEnum):
     STALL = "stall"
     """The endpoint halts (EPIPE) until the host clears it."""
     BABBLE = "babble"
-    """A transfer fails with EOVERFLOW, and its bytes are lost."""
+    """A transfer fails with EOVERFLOW, having the bytes that came before."""
     SILENCE = "silence"
     """Nothing is sent for `seconds`; frames go by meanwhile, as far as there is a clock."""
     UNPLUG = "unplug"

@@ -6,14 +6,14 @@ PYTHON ?= python3.11
 TORCH ?= torch==2.13.0
 BUILD_REQUIRES := "scikit-build-core>=0.10" "nanobind>=2.4" "cmake>=3.25" ninja
 
-# Debian packages for tests of the USB camera: a mocked kernel, and, for the slow ones, a guest with a real one.
-MOCKS := umockdev libusb-1.0-0
+# Debian packages for tests of the USB camera: a mocked kernel, a fuzzer, and, for the slow ones, a guest's real kernel.
+MOCKS := umockdev libusb-1.0-0 clang libclang-rt-14-dev
 GUEST := qemu-system-x86 busybox-static udev
 
 VENV := .venv
 BIN := $(VENV)/bin
 NATIVE_SOURCES := CMakeLists.txt $(shell find spiked/native -name '*.cpp' -o -name '*.hpp' -o -name '*.inl' -o -name CMakeLists.txt)
-CPP := $(filter-out %CMakeLists.txt,$(NATIVE_SOURCES))
+CPP := $(filter-out %CMakeLists.txt,$(NATIVE_SOURCES)) $(wildcard tests/fuzz/*.?pp)
 WEB := $(shell find web -path web/node_modules -prune -o -type f -print)
 PAGE := service/spiked_service/page/index.html
 NPM_CI := web/node_modules/.package-lock.json

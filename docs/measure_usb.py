@@ -75,7 +75,8 @@ def losses(pictures: Path, seconds: float) -> None:
         print(f"| lost: {cause} | {account.lost.get(cause, 0):,} |")
     print(f"| received + lost | {account.received + account.lost_frames:,} |")
     cores = account.acquisition_cpu_s / seconds
-    print(f"\n{account.gaps} gaps; the acquisition process used {100 * cores:.0f} % of a core.")
+    largest = "" if account.largest_gap is None else " (the largest at frame {:,}: {:,})".format(*account.largest_gap)
+    print(f"\n{account.gaps} gaps{largest}; the acquisition process used {100 * cores:.0f} % of a core.")
 
 
 @dataclass(frozen=True)

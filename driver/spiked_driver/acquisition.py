@@ -31,14 +31,17 @@ def acquire(
     """Open the source, move its frames and gaps into the ring until it ends, and close it.
 
     Ends after `limit_frames` frames, lost ones included, or within a moment after `stop` is set. Waits for `consumers`
-    readers before the first frame, so that they miss none. Ends the capture in the ring in every case; the writer stays
+    readers before it opens the source, so that they miss none. Ends the capture in the ring in every case; the writer stays
     open. Errors of the source end the capture as failed, are published as the reason of the condition, and are raised.
     """
     filler = _Filler(writer, limit_frames)
     try:
-        with _opened(source):
-            reason = _wait_for_consumers(source, writer, stop, consumers) or _pump(source, filler, stop)
-            filler.flush()
+        # A camera sends from the moment it is open: what came while nobody is there to take it would be lost.
+        reason = _wait_for_consumers(source, writer, stop, consumers)
+        if reason is None:
+            with _opened(source):
+                reason = _pump(source, filler, stop)
+                filler.flush()
         filler.publish(source.condition)
     except BaseException as error:
         filler.flush()

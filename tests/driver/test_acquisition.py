@@ -204,3 +204,23 @@ def test_a_source_with_nothing_to_give_yet_comes_back_with_nothing() -> None:
     source.open()
     assert source.read_into(np.zeros((8, source.sensor.frame_bytes), np.uint8)) is None
     assert source.condition.state is DeviceState.ARMED
+
+
+def test_a_camera_is_not_opened_before_its_frames_are_awaited() -> None:
+    """An open camera sends, and what nobody takes yet would be lost."""
+    opened = threading.Event()
+
+    class Watched(SimulatedSource):
+        def open(self) -> None:
+            opened.set()
+            super().open()
+
+    source = Watched(SENSOR, seed=3, frames=8)
+    with RingWriter.create(source.sensor, slots=16) as writer:
+        thread = threading.Thread(target=acquire, args=(source, writer, threading.Event()), kwargs={"consumers": 1})
+        thread.start()
+        assert not opened.wait(0.2)
+        reader = RingReader.attach(writer.name, Policy.LOSSLESS, "test")
+        assert opened.wait(10)
+        take_all(reader)
+        thread.join()

@@ -82,7 +82,8 @@ extern "C" int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
             for (int64_t k = 0; !(choice & 1) && event.kind == Kind::frames && k < event.count; ++k) {
                 size_t best = 0, number = 0;
                 for (size_t candidate = 0; candidate < most_frames; ++candidate) {
-                    const size_t equal = equal_rows(view.data() + static_cast<size_t>(k) * PcieParser::compact_bytes, candidate);
+                    const size_t equal =
+                        equal_rows(view.data() + static_cast<size_t>(k) * PcieParser::compact_bytes, candidate);
                     if (equal > best) best = equal, number = candidate;
                 }
                 const size_t touched = damage.flips + 2 * damage.operations + (damage.inserted + damage.deleted) / 60;

@@ -64,8 +64,10 @@ class Judge {
         parser_.finish();
         drain();
         const auto& c = parser_.counters();
-        fuzz::require(static_cast<int64_t>(c.received + c.lost) == parser_.next_index(), "received + lost = next index");
-        fuzz::require(c.bytes == c.skipped + (c.received + c.duplicates) * UsbParser::frame_bytes, "all bytes are counted");
+        fuzz::require(static_cast<int64_t>(c.received + c.lost) == parser_.next_index(),
+                      "received + lost = next index");
+        fuzz::require(c.bytes == c.skipped + (c.received + c.duplicates) * UsbParser::frame_bytes,
+                      "all bytes are counted");
     }
 
   private:

@@ -35,6 +35,8 @@ class Account:
     lost: dict[str, int] = field(default_factory=dict)
     """By cause."""
     gaps: int = 0
+    largest_gap: tuple[int, int] | None = None
+    """First frame and count."""
     end: int = 0
     """Received and lost."""
     first_number: int | None = None
@@ -115,6 +117,8 @@ def _judge(name: str, pictures: str) -> None:
         elif isinstance(item, Gap):
             account.lost[item.cause] = account.lost.get(item.cause, 0) + item.count
             account.gaps += 1
+            if account.largest_gap is None or item.count > account.largest_gap[1]:
+                account.largest_gap = (item.first, item.count)
     account.end = item.frames
     print(json.dumps(asdict(account)))
 

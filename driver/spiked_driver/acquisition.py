@@ -31,8 +31,8 @@ def acquire(
     """Open the source, move its frames and gaps into the ring until it ends, and close it.
 
     Ends after `limit_frames` frames, lost ones included, or within a moment after `stop` is set. Waits for `consumers`
-    readers before it opens the source, so that they miss none. Ends the capture in the ring in every case; the writer stays
-    open. Errors of the source end the capture as failed, are published as the reason of the condition, and are raised.
+    readers before it opens the source, so that they miss none. Ends the capture in the ring in every case; the writer
+    stays open. Errors of the source end the capture as failed, are published as the reason of the condition, and are raised.
     """
     filler = _Filler(writer, limit_frames)
     try:

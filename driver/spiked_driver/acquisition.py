@@ -32,7 +32,8 @@ def acquire(
 
     Ends after `limit_frames` frames, lost ones included, or within a moment after `stop` is set. Waits for `consumers`
     readers before it opens the source, so that they miss none. Ends the capture in the ring in every case; the writer
-    stays open. Errors of the source end the capture as failed, are published as the reason of the condition, and are raised.
+    stays open. Errors of the source end the capture as failed, are published as the reason of the condition, and are
+    raised.
     """
     filler = _Filler(writer, limit_frames)
     try:

@@ -201,17 +201,14 @@ class Sharpener:
 
 
 def speed(frames: NDArray[np.uint8], sensor: Sensor) -> float:
-    """Median image motion in px a frame over stored frames [n, frame_bytes]; 0 where nothing can be followed."""
-    if len(frames) <= 2 * COARSE_FRAMES:
+    """Median image motion in px a frame at the beginning of stored frames [n, frame_bytes]; 0 where nothing can be
+    followed or there are fewer than two coarse windows."""
+    n = COARSE_FRAMES
+    if len(frames) < 2 * n:
         return 0.0
-    ends = []
-    for begin in (0, len(frames) - COARSE_FRAMES):
-        part = frames[begin : begin + COARSE_FRAMES]
-        ends.append(_small(aligned_window(part, sensor, 0, 0, COARSE_FRAMES).count))
-    field = _coarse_motion(ends[0], ends[1], sensor)
-    if field is None:
-        return 0.0
-    return float(np.median(np.linalg.norm(field, axis=2))) / (len(frames) - COARSE_FRAMES)
+    a, b = (_small(aligned_window(frames[i : i + n], sensor, 0, 0, n).count) for i in (0, n))
+    field = _coarse_motion(a, b, sensor)
+    return 0.0 if field is None else float(np.median(np.linalg.norm(field, axis=2))) / n
 
 
 def _small(count: NDArray[np.uint16]) -> Picture:

@@ -43,6 +43,11 @@ class Posed:
     rotation: Array | None = None
     centre: Array | None = None
     inliers: float = 0.0
+    """Share of the known points in view that agree with its pose."""
+    chi2: float | None = None
+    """Squared residual of a typical point over what the noise of the tracks explains; 1 is as it should be."""
+    sigma_px: float | None = None
+    """Predicted error of the pose, as the image at the median depth is displaced by it."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +58,21 @@ class Fit:
     centre: Array
     inliers: float
     points: int
+    chi2: float = 1.0
+    sigma_px: float = np.inf
 
 
 BOOT_VIEWS = 10
 MIN_PARALLAX_PX = 0.8
 """Motion that rotation cannot explain before a bootstrap is tried; tracks are good to 0.05 px."""
 MIN_POINTS = 15
+LEAST_NOISE_PX = 0.15
+"""Points that were found lately are not yet better than this, however clean their tracks are."""
+WORST_CHI2 = 2.5
+WORST_SIGMA_PX = 1.0
+WORST_INLIERS = 0.5
+WORST_OVERLAP = 0.25
+"""Tracking counts as degraded beyond any of these; overlap is the share of the tracks whose points are known."""
 KEY_EVERY = 8
 """Every eighth posed view is kept for relocalisation."""
 GLOBAL_VIEWS = 100
@@ -175,6 +189,7 @@ class Odometry:
 
     def _accept(self, view: Posed, fit: Fit) -> None:
         view.rotation, view.centre, view.inliers = fit.rotation, fit.centre, fit.inliers
+        view.chi2, view.sigma_px = fit.chi2, fit.sigma_px
 
     def _pose_newest(self, picture: Picture) -> None:
         view = self.views[-1]
@@ -189,8 +204,8 @@ class Odometry:
                 return
             fit = found
         self._accept(view, fit)
-        if fit.inliers < 0.6 or fit.points < 2 * MIN_POINTS:
-            self._become(State.DEGRADED, f"{fit.points} known points in view, {fit.inliers:.0%} agree with one pose")
+        if (why := self._doubt(fit, len(view.ids))) is not None:
+            self._become(State.DEGRADED, why)
         elif self.state is not State.TRACK:
             self._become(State.TRACK, "enough points agree again")
         count = len(self.views)
@@ -200,6 +215,18 @@ class Odometry:
             self._adjust_recent()
         if count >= self._next_global:
             self.settle()
+
+    def _doubt(self, fit: Fit, tracks: int) -> str | None:
+        """Why a pose is to be taken with care, or None."""
+        if fit.inliers < WORST_INLIERS or fit.points < 2 * MIN_POINTS:
+            return f"{fit.points} known points in view, {fit.inliers:.0%} agree with one pose"
+        if fit.sigma_px > WORST_SIGMA_PX:
+            return f"the pose is only known to {fit.sigma_px:.1f} px: the known points leave much of the view empty"
+        if fit.chi2 > WORST_CHI2:
+            return f"points lie {np.sqrt(fit.chi2):.1f} times as far off as their noise explains"
+        if fit.points < WORST_OVERLAP * tracks:
+            return f"only {fit.points / tracks:.0%} of what is in view has been seen long enough to be known"
+        return None
 
     def _fit(self, view: Posed, rotation: Array, centre: Array) -> Fit:
         """Robust Gauss-Newton of one pose on the known points."""
@@ -231,8 +258,26 @@ class Odometry:
             gradient = np.einsum("mki,mk->i", weighted, error)
             step = -np.linalg.solve(hessian + 1e-9 * np.eye(6) * np.trace(hessian), gradient)
             rotation, centre = exp_so3(step[:3]) @ rotation, centre + step[3:]
-        inliers = float(np.mean(np.linalg.norm(error, axis=1) < 1.5 * INLIER_PX))
-        return Fit(rotation, centre, inliers, len(points))
+        size = np.linalg.norm(error, axis=1)
+        inliers = float(np.mean(size < 1.5 * INLIER_PX))
+        noise = max(1.3 * self._noise_px, LEAST_NOISE_PX)
+        chi2 = float((np.median(size) / (1.1774 * noise)) ** 2)
+        depth = float(np.median((points - centre) @ rotation[:, 2]))
+        covariance = max(chi2, 1.0) * noise**2 * np.linalg.inv(hessian + 1e-9 * np.eye(6) * np.trace(hessian))
+        return Fit(rotation, centre, inliers, len(points), chi2, self._displacement(covariance, rotation, depth))
+
+    def _displacement(self, covariance: Array, rotation: Array, depth: float) -> float:
+        """Root mean square motion (px, one direction) of the image of a plane at `depth` under errors of a pose with
+        this covariance [6, 6] of (rotation, centre)."""
+        k = self.intrinsics
+        across, down = np.linspace(-1, 1, 5) * k.cx / k.fx, np.linspace(-1, 1, 5) * k.cy / k.fy
+        x, y = (g.ravel() for g in np.meshgrid(across, down))
+        one, zero = np.ones_like(x), np.zeros_like(x)
+        rows = np.stack([np.stack([k.fx * one, zero, -k.fx * x], 1), np.stack([zero, k.fy * one, -k.fy * y], 1)], 1)
+        by_point = rows @ rotation.T / max(depth, 1e-6)
+        ray = depth * np.stack([x, y, one], 1) @ rotation.T
+        jacobian = np.concatenate([by_point @ hat(ray), -by_point], 2)
+        return float(np.sqrt(max(np.einsum("nki,ij,nkj->", jacobian, covariance, jacobian), 0.0) / (2 * len(x))))
 
     def _relocalise(self, picture: Picture) -> Fit | None:
         """Find known points of earlier key views in this one; on success they become tracks again."""
@@ -380,6 +425,7 @@ class Odometry:
         times = np.array([self.views[n].time for n in numbers])
         start = self._coarsest(times, bundle)
         spline, _ = bundle.optimise_spline(start, times, 8, SCALE_PX / 2, tolerance=1e-3)
+        self._noise_px = float(np.median(np.linalg.norm(bundle.residuals(), axis=1))) / 1.1774
         self.spline = self._in_old_frame(spline, bundle, numbers)
         self._take(bundle, ids, numbers)
         others = [n for n in posed if n not in set(numbers)]

@@ -58,6 +58,12 @@ class Status:
     """Grows whenever the scene or the trajectory changed."""
     progress: float
     """Share of the final refinement done, 0 to 1."""
+    inliers: float | None = None
+    """Of the newest pose, as are the next two: the share of known points that agree with it."""
+    chi2: float | None = None
+    """Squared residual of a typical point over what noise explains; 1 is as it should be."""
+    sigma_px: float | None = None
+    """Predicted error, as a displacement of the image at the median depth."""
 
 
 @dataclass(frozen=True)
@@ -367,7 +373,10 @@ class Reconstructor:
     def status(self) -> Status:
         """Where the work stands."""
         o, m = self._odometry, self._mapper
-        return Status(o.state, o.reason, self._stage, self._frames, len(m.scene), m.loss, self._version, self._progress)
+        last = next((v for v in reversed(o.views) if v.rotation is not None), None)
+        pose = (last.inliers, last.chi2, last.sigma_px) if last is not None else (None, None, None)
+        done = self._progress
+        return Status(o.state, o.reason, self._stage, self._frames, len(m.scene), m.loss, self._version, done, *pose)
 
     def tracked(self, since: int = 0) -> list[Tracked]:
         """The views tracked so far, in order, without the first `since`."""
@@ -380,6 +389,8 @@ class Reconstructor:
                 view.rotation,
                 None if view.centre is None else view.centre * self._unit,
                 rates.get(view.time, 0.0),
+                view.sigma_px,
+                view.chi2,
             )
             for view in self._odometry.views[since:]
         ]
@@ -470,6 +481,8 @@ class Reconstructor:
                     "frames": v.length,
                     "motion_px": round(v.motion_px, 3),
                     "inliers": round(v.inliers, 3),
+                    "chi2": None if v.chi2 is None else round(v.chi2, 3),
+                    "sigma_px": None if v.sigma_px is None else round(v.sigma_px, 4),
                     "state": str(v.state),
                 }
                 for v in odometry.views

@@ -16,7 +16,7 @@ Image = NDArray[np.float32]
 
 MARGIN = 24
 """Frames looked at on both sides of a window for the spikes nearest to its edges."""
-PROBE = 32
+PROBE = 16
 """Frames that the motion is first judged from."""
 WINDOWS = (4, 8, 16, 32, 64)
 FIRST_WINDOW = 16

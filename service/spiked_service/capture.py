@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 
+from spiked.errors import SpikedError
 from spiked_service.announcer import Announcer
 from spiked_service.backoff import Backoff
 from spiked_service.child import Child, Spare
@@ -200,18 +201,30 @@ class LiveCapture:
             sensor = replace(opened.sensor, intrinsics=plan.intrinsics or opened.sensor.intrinsics)
             frames = opened.frames if self._stop_frame is None else self._stop_frame - self._first_frame
             self._set(state=CaptureState.STREAMING, sensor=sensor, frames_planned=frames)
-            if self._recording:
-                self._start_recorder(recorder)
-            if self._reconstructing:
-                row = self._reconstructions.begin_live(
-                    self._row,
-                    opened,
-                    self._reconstruction_ended,
-                    first_frame=self._first_frame,
-                    stop_frame=self._stop_frame,
-                    spare=reconstructor,
-                )
-                self._reconstruction_id = row.id
+            try:
+                self._start_readers(opened, recorder, reconstructor)
+            except (OSError, SpikedError) as error:
+                # What did not start reads nothing; what did goes on to the end that now comes.
+                self._recording = self._recording and self._recorder is not None
+                self._reconstructing = self._reconstruction_id is not None
+                self._fail(f"the capture's workers cannot be started: {error}; look at the disk of the data folder")
+                if self._stream is not None:
+                    self._stream.stop()
+
+    def _start_readers(self, opened: RingOpened, recorder: Spare | None, reconstructor: Spare | None) -> None:
+        """Raises OSError or StoreError."""
+        if self._recording:
+            self._start_recorder(recorder)
+        if self._reconstructing:
+            row = self._reconstructions.begin_live(
+                self._row,
+                opened,
+                self._reconstruction_ended,
+                first_frame=self._first_frame,
+                stop_frame=self._stop_frame,
+                spare=reconstructor,
+            )
+            self._reconstruction_id = row.id
 
     def _start_recorder(self, spare: Spare | None = None, resume: bool = False) -> None:
         assert self._opened is not None

@@ -101,7 +101,13 @@ class Captures:
             standby = self._armed.pop(device, None)
             capture = self._noted(plan)
             if standby is None:
-                self._flow(capture, plan)
+                try:
+                    self._flow(capture, plan)
+                except OSError as error:
+                    del self._live[capture.id]
+                    self._catalogue.captures.remove(capture.id)
+                    self._folder.remove(self._folder.capture(capture.id))
+                    raise BusyError(f"no worker can be started: {error.strerror}; end other programs") from error
         if standby is not None:
             standby.trigger(capture, plan)
         snapshot = self.get(capture.id)

@@ -7,9 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
-from spiked_service.logs import relay
+from spiked_service.logs import logger, relay
 from spiked_service.messages import STOP, Logged, News, Order, Role, news_lines
 
+_log = logger("spiked.service")
 _LEAVE_S = 10.0
 """A spare that still starts leaves when it has started."""
 
@@ -108,19 +109,28 @@ class Child:
                 return  # it is dead or dismissed, which on_exit tells
 
     def _listen(self) -> None:
+        failure = None
         with self._stdout:
             for line in self._stdout:
                 if not line.endswith(b"\n"):
                     break  # it was killed while it spoke
-                news = news_lines.validate_json(line)
-                if isinstance(news, Logged):
-                    relay(news)
-                else:
-                    self._on_news(news)
+                try:
+                    self._take(line)
+                except Exception as error:  # whatever goes wrong here, the worker's end must still be told
+                    _log.exception("news could not be taken", role=str(self.role))
+                    failure = failure or f"the service failed over news of the {self.role} worker: {error!r}"
+                    self.dismiss()
         code = self._process.wait()
         with self._writing:
             self._stdin.close()
-        self._on_exit(self._verdict(code))
+        self._on_exit(failure or self._verdict(code))
+
+    def _take(self, line: bytes) -> None:
+        news = news_lines.validate_json(line)
+        if isinstance(news, Logged):
+            relay(news)
+        else:
+            self._on_news(news)
 
     def _verdict(self, code: int) -> str | None:
         if code == 0:

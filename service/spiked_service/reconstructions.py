@@ -324,16 +324,23 @@ class Reconstructions:
         self._begin(begun, order, None)
 
     def _begin(self, row: ReconstructionRow, order: ReconstructionOrder, spare: Spare | None) -> ReconstructionRow:
-        order.folder.mkdir(exist_ok=True)
         job = self._jobs[row.id] = _Job(row)
         self._save(row)
-        job.child = Child(
-            order,
-            order.folder / "log",
-            lambda news: self._hear(job, news),
-            lambda trouble: self._ended(job, trouble),
-            spare,
-        )
+        try:
+            order.folder.mkdir(exist_ok=True)
+            job.child = Child(
+                order,
+                order.folder / "log",
+                lambda news: self._hear(job, news),
+                lambda trouble: self._ended(job, trouble),
+                spare,
+            )
+        except OSError as error:
+            del self._jobs[row.id]
+            self._on_live_end.pop(row.id, None)
+            reason = f"its worker cannot be started: {error.strerror}"
+            self._save(replace(row, state=JobState.FAILED, reason=reason, ended_at=datetime.now(UTC)))
+            raise
         return row
 
     def _hear(self, job: _Job, news: News) -> None:

@@ -45,7 +45,7 @@ def recorded_only(source: str, **more: object) -> Plan:
 
 def test_a_recording_holds_what_the_source_gave(keeping: Keeping, tmp_path: Path) -> None:
     frames = random_recording(tmp_path / "noise.dat", 1000)
-    plan = recorded_only(f"replay:{tmp_path / 'noise.dat'}?pace=0", name="noise", notes="by hand")
+    plan = recorded_only(f"replay:{tmp_path / 'noise.dat'}?pace=0.1", name="noise", notes="by hand")
     started = keeping.captures.start(plan)
     done = over(keeping, started.id)
     row = done.row
@@ -317,3 +317,15 @@ def test_the_service_ends_within_a_moment_and_closes_the_recording(tmp_path: Pat
         assert (row.state, row.reason) == (CaptureState.COMPLETE, "ended, because the service was")
         assert row.verdict is not None and row.verdict.grade is Grade.GOOD
         assert_holds(keeping.captures.recording(capture_id), frames)
+
+
+def test_a_reconstruction_that_cannot_be_begun_leaves_the_recording(
+    keeping: Keeping, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(keeping.folder, "reconstruction", lambda _: tmp_path / "no" / "such")
+    capture_id = keeping.captures.start(Plan(f"{SMALL}&pace=0")).id
+    row = over(keeping, capture_id).row
+    assert row.state is CaptureState.FAILED
+    assert "cannot be started" in row.reason
+    assert row.verdict is not None
+    assert keeping.reconstructions.counts()[JobState.RUNNING] == 0

@@ -76,7 +76,8 @@ def measure(recording: Path, pace: float, seconds: float, steps: int) -> str:
     """A row of the table."""
     with tempfile.TemporaryDirectory() as scratch:
         command = [sys.executable, "-m", "spiked_service", "serve", "--port", "0", "--data", f"{scratch}/data"]
-        daemon = subprocess.Popen([*command, "--runtime", f"{scratch}/run"], stdout=subprocess.PIPE, text=True)
+        command += ["--runtime", f"{scratch}/run", "--set", f"source_folders={recording.parent}"]
+        daemon = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         try:
             assert daemon.stdout is not None
             found = re.search(r"http://\S+", daemon.stdout.readline())
@@ -127,9 +128,12 @@ def row(recording: Path, pace: float, watch: Watch, poses: list[tuple[int, float
         first.setdefault(frame, at_s)
     tracking_s = min(first.values(), default=np.inf)  # poses of the bootstrap's frames come all at once, later
     came = {frame: watch.came_s(frame) for frame in first}
-    late = [at_s - light for frame, at_s in first.items() if (light := came[frame]) is not None and light > tracking_s]
-    if not late:
-        raise SystemExit(f"there were {len(first)} poses, none after the bootstrap: {job.get('reason') or job}")
+    delays = {frame: (light, at_s - light) for frame, at_s in first.items() if (light := came[frame]) is not None}
+    if not delays:
+        raise SystemExit(f"there was no pose: {job.get('reason') or job}")
+    late = [delay for light, delay in delays.values() if light > tracking_s]
+    which = "tracked live" if late else "all: the recording ended before the bootstrap was done"
+    late = late or [delay for _, delay in delays.values()]
     ms = 1000 * np.array(late)
     sensor = open_recording(recording).sensor
     begin = bisect_left(watch.next_frames, 1)  # the source waits for its consumers before its first frame
@@ -137,7 +141,7 @@ def row(recording: Path, pace: float, watch: Watch, poses: list[tuple[int, float
     lost = {reader.consumer: reader.lost for reader in watch.status.readers if reader.consumer != "preview"}
     figures = f"{np.median(ms):.0f} | {np.percentile(ms, 99):.0f} | {ms.min():.0f}"
     return (
-        f"| {sensor.width}x{sensor.height} | {rate:.0f} | {len(ms)} | {figures} | "
+        f"| {sensor.width}x{sensor.height} | {rate:.0f} | {len(ms)} ({which}) | {figures} | "
         f"{sum(watch.status.writer.lost.values())} | {', '.join(f'{k} {v}' for k, v in lost.items()) or '0'} |"
     )
 
@@ -149,11 +153,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=5.0, help="of the camera's own time")
     parser.add_argument("--steps", type=int, default=200)
     given = parser.parse_args()
+    recording = given.recording.resolve()
     print(f"{platform.processor() or platform.machine()}, Python {platform.python_version()}")
     print("| size | frames/s | poses | median ms | 99 % ms | least ms | lost before the ring | lost by consumers |")
     print("|---|---|---|---|---|---|---|---|")
     for pace in given.pace or [1.0]:
-        print(measure(given.recording, pace, given.seconds, given.steps), flush=True)
+        print(measure(recording, pace, given.seconds, given.steps), flush=True)
 
 
 if __name__ == "__main__":

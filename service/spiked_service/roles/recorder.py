@@ -31,7 +31,7 @@ def run_recorder(order: RecorderOrder, link: Link) -> None:
     Raises RecordingError if the recording cannot be begun, RingError if there is no such ring.
     """
     with suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, 0, _NICE)
+        os.nice(_NICE)  # before the others, whatever priority the service has
     if order.resume:
         writer = RecordingWriter.resume(order.path, durability=LIVE)
     start = order.first_frame + (writer.next_frame if order.resume else 0)

@@ -23,6 +23,8 @@ _SCENES = 4
 """Scenes remembered: the newest versions of a few reconstructions."""
 _CAMERAS = 4
 """Renderers that each slot keeps, by camera; their memory is then warm, which makes them 1.6 times as fast."""
+_KEPT_PIXELS = 1_200_000
+"""Renderers of larger pictures are not kept: theirs are some 100 MB."""
 
 
 class Output(StrEnum):
@@ -52,7 +54,8 @@ class _Slot:
 
     def draw(self, scene: Scene, camera: Camera, pose: Pose) -> Image:
         rasteriser = self._rasterisers.pop(camera, None) or Rasteriser(camera, threads=1)
-        self._rasterisers[camera] = rasteriser
+        if camera.width * camera.height <= _KEPT_PIXELS:
+            self._rasterisers[camera] = rasteriser
         if len(self._rasterisers) > _CAMERAS:
             self._rasterisers.popitem(last=False)
         return rasteriser.forward(scene, pose.rotation[None], pose.centre[None])

@@ -61,10 +61,12 @@ Frame = Annotated[
     int | None,
     Query(ge=0, le=LARGEST_INTEGER, description="Absolute index, from the recording; the newest frames if not given."),
 ]
-Gain = Annotated[float, Query(gt=0, le=1000, description="Times as bright.")]
+Gain = Annotated[float, Query(ge=0.001, le=1000, description="Times as bright.")]
 White = Annotated[
     float | None,
-    Query(gt=0, le=1e9, description="Value shown as white; if not given it is found in the picture (X-White tells)."),
+    Query(
+        ge=1e-6, le=1e6, description="Value shown as white; if not given it is found in the picture, and X-White tells."
+    ),
 ]
 _LIVE = (CaptureState.STARTING, CaptureState.STREAMING)
 _RECORDING_RESPONSES: dict[int | str, dict[str, Any]] = {

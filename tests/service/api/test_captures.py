@@ -89,6 +89,15 @@ def test_pictures_of_recorded_frames(service: Any, done: CaptureOut, kind: str) 
     assert picture(service.http.get(f"captures/{done.id}/preview", params=brighter)).mean() > image.mean()
 
 
+def test_a_white_and_a_gain_far_from_sense_are_refused(service: Any, done: CaptureOut) -> None:
+    """Their quotient was once more than the renderer's own limit, which ended in a failure of the service."""
+    for query in ({"gain": 1e-300}, {"white": 1e-68}, {"white": 1e9}, {"gain": 1e9}):
+        answer = service.http.get(f"captures/{done.id}/preview", params={"kind": "render", **query})
+        assert answer.status_code == 422
+    extreme = {"kind": "render", "gain": 0.001, "white": 1e6, "frame": 300}
+    assert service.http.get(f"captures/{done.id}/preview", params=extreme).status_code == 200
+
+
 def test_a_frame_that_was_not_recorded_has_no_picture(service: Any, done: CaptureOut) -> None:
     answer = service.http.get(f"captures/{done.id}/preview", params={"frame": FRAMES})
     assert answer.status_code == 404

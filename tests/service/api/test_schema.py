@@ -34,7 +34,7 @@ LASTING = ("--exclude-method", "DELETE")
 
 def test_requests_about_what_there_is(service: Any, done: Any, job: str, tmp_path: Path) -> None:
     known = {"capture_id": done.id, "reconstruction_id": job, "device_id": "sim:"}
-    options = ("--phases", "examples,fuzzing", "--max-examples", "5")
+    options = ("--phases", "examples,coverage,fuzzing", "--max-examples", "5")
     fuzz(service, tmp_path / "known", known, *QUIET, *LASTING, *options)
 
 

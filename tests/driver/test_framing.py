@@ -282,3 +282,9 @@ def test_the_benchmark_parses_every_frame_it_times() -> None:
     result = benchmark_usb(frames=40, repeat=1)
     assert result.ratio == pytest.approx(result.parsed_bytes_a_second / result.memcpy_bytes_a_second)
     assert result.parsed_bytes_a_second > 0
+
+
+@pytest.mark.slow
+def test_one_core_parses_four_cameras() -> None:
+    """At least 1 GB/s; the camera sends 0.26."""
+    assert benchmark_usb().parsed_bytes_a_second > 1e9

@@ -228,3 +228,9 @@ def test_a_missing_device_says_where_to_look(tmp_path: Path) -> None:
 
 def test_the_benchmark_parses_every_frame_it_times() -> None:
     assert benchmark_pcie(frames=4, repeat=1).parsed_bytes_a_second > 0
+
+
+@pytest.mark.slow
+def test_one_core_keeps_up_with_the_capture_card() -> None:
+    """At least 2.6 GB/s; the camera sends 2.56."""
+    assert benchmark_pcie().parsed_bytes_a_second > 2.6e9

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from virtual_camera.faults import Fault, Kind
 from virtual_camera.host import CameraSettings
 from virtual_camera.rig import VirtualCameras
@@ -48,3 +49,12 @@ def test_damage_on_the_way_costs_the_frames_it_hits(cameras: Cameras, pictures: 
     account.check(rig.report())
     assert account.lost.get("usb") == 3
     assert account.lost.get("device", 0) == 0
+
+
+@pytest.mark.slow
+def test_a_minute_at_its_rate_is_accounted_for_to_the_frame(cameras: Cameras, pictures: Path) -> None:
+    """Ten minutes: `python docs/measure_usb.py losses`."""
+    rig = cameras(CameraSettings(str(pictures), rate_hz=20_000), usbfs_memory_mb=256)
+    account = run(rig, "usb0", 60 * 20_000, pictures)
+    account.check(rig.report())
+    assert account.received > 0

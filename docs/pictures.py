@@ -31,7 +31,7 @@ def pair(recording_path: Path, result: Path) -> tuple[Image, Image]:
     begin = recording.frames // 2 - WINDOW_FRAMES // 2
     first = max(0, begin - 32)
     frames = recording.read(first, min(recording.frames - first, WINDOW_FRAMES + 64))
-    windows = Windows(sensor, WINDOW_FRAMES, WINDOW_FRAMES)
+    windows = Windows(sensor, WINDOW_FRAMES)
     views = [*windows.feed(first, frames), *windows.flush()]
     view = min(views, key=lambda v: abs(v.time - recording.frames / 2))
     channels = None if sensor.mosaic is None else sensor.mosaic.channels(sensor.height, sensor.width)

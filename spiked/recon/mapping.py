@@ -137,6 +137,19 @@ class Mapper:
             expected = expected * factor
             if self.steps % NUISANCE_STEPS == NUISANCE_STEPS - 1:
                 self.nuisances.update()
+        slope, self._residuals[key] = self._slope(expected, target, level)
+        if factor is not None:
+            slope *= factor
+        gradients = level.rasteriser.backward(slope)
+        self.steps += 1
+        o = self.options
+        rates = (o.rate_means * decay, o.rate_quats, o.rate_scales, o.rate_opacities, o.rate_colours * self.white)
+        slopes = (gradients.means, gradients.quats, gradients.log_scales, gradients.opacity_logits, gradients.colours)
+        self.adam.step(self.scene.arrays(), slopes, rates, gradients.radius_px > 0)
+        return gradients
+
+    def _slope(self, expected: Image, target: Target, level: Level) -> tuple[Image, float]:
+        """The derivative of the loss by what is expected, and the weighted mean squared error in units of white."""
         error = expected - target.values
         floor = np.float32((self.options.floor * self.white) ** 2)
         weight = floor / (target.deviation**2 + floor)
@@ -145,16 +158,7 @@ class Mapper:
         if self.options.ssim > 0:
             share, structural = self.options.ssim, self._structural(expected, target, level)
             slope = (1 - share) * slope + share * SSIM_SCALE * structural
-        if factor is not None:
-            slope *= factor
-        gradients = level.rasteriser.backward(slope)
-        self._residuals[key] = float(np.mean(weight * error * error)) / self.white**2
-        self.steps += 1
-        o = self.options
-        rates = (o.rate_means * decay, o.rate_quats, o.rate_scales, o.rate_opacities, o.rate_colours * self.white)
-        slopes = (gradients.means, gradients.quats, gradients.log_scales, gradients.opacity_logits, gradients.colours)
-        self.adam.step(self.scene.arrays(), slopes, rates, gradients.radius_px > 0)
-        return gradients
+        return slope, float(np.mean(weight * error * error)) / self.white**2
 
     def _structural(self, expected: Image, target: Target, level: Level) -> Image:
         """The slope of 1 - SSIM; a mosaic is compared in grey, where every colour has the same share everywhere."""

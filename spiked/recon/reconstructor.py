@@ -30,7 +30,7 @@ from spiked.trajectory import Trajectory
 
 SUB_FRAME_PX = 3.0
 """Image motion that one sub-frame of straight, blurred motion renders well."""
-MAX_SUB_FRAMES = 12
+MAX_SUB_FRAMES = 6
 COARSE_SHARE = 0.5
 """Part of the refinement in which large images are looked at with fewer, larger pixels: a quarter of the work each."""
 YOUNG_STEPS = 800

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.recon.views import Image, View
+from spiked.recon.views import Image, View, luminance
 from spiked.render import Camera, rasteriser_for
 from spiked.sensor import Intrinsics, Mosaic, Sensor
 
@@ -54,6 +54,12 @@ class Level:
             np.stack([_mean(deviation[..., c], rest) / np.float32(rest) for c in range(3)], -1),
             small,
         )
+
+    def grey(self, image: Image) -> Image:
+        """One brightness a pixel, [H, W], of what this level renders or sees: all colours in the same proportion."""
+        if image.ndim == 3:
+            return np.ascontiguousarray(image.mean(-1, dtype=np.float32))
+        return luminance(image, None if self.channels is None else self._mosaic)
 
     def _mean(self, image: Image) -> Image:
         return _mean(image, self.factor)

@@ -23,6 +23,8 @@ SSIM_SCALE = 0.01
 """Brings 1 - SSIM to the size of the mean squared error."""
 
 
+LARGE_PIXELS = 130_000
+"""Images of more pixels are aligned at half their size."""
 SEED_SHARE = 0.6
 """Part of all splats that one view may begin with."""
 NUISANCES_FROM = 50
@@ -71,11 +73,6 @@ class Mapper:
         """Most splats that the map may hold."""
         share = self.options.splats_a_pixel * self.camera.width * self.camera.height
         return min(int(share), self.options.most_splats)
-
-    def weights(self, view: View) -> Image:
-        """Weight of each pixel's squared error, 1 for a noiseless one."""
-        floor = (self.options.floor * self.white) ** 2
-        return np.asarray(floor / (view.deviation**2 + floor), np.float32)
 
     def seed_from(self, view: View, rotation: Array, centre: Array, swept: Sweep) -> int:
         """Splats from the pixels of a swept view that the map does not cover yet; returns how many."""
@@ -151,14 +148,18 @@ class Mapper:
     def _slope(self, expected: Image, target: Target, level: Level) -> tuple[Image, float]:
         """The derivative of the loss by what is expected, and the weighted mean squared error in units of white."""
         error = expected - target.values
-        floor = np.float32((self.options.floor * self.white) ** 2)
-        weight = floor / (target.deviation**2 + floor)
+        weight = self._certainty(target.deviation)
         scale = np.float32(1 / (self.white**2 * error.size))
         slope = 2 * scale * weight * error
         if self.options.ssim > 0:
             share, structural = self.options.ssim, self._structural(expected, target, level)
             slope = (1 - share) * slope + share * SSIM_SCALE * structural
         return slope, float(np.mean(weight * error * error)) / self.white**2
+
+    def _certainty(self, deviation: Image) -> Image:
+        """Weight of a squared error, 1 for a noiseless pixel."""
+        floor = np.float32((self.options.floor * self.white) ** 2)
+        return np.asarray(floor / (deviation**2 + floor), np.float32)
 
     def _structural(self, expected: Image, target: Target, level: Level) -> Image:
         """The slope of 1 - SSIM; a mosaic is compared in grey, where every colour has the same share everywhere."""
@@ -178,16 +179,22 @@ class Mapper:
         self._residuals.clear()
         self.nuisances.forget_views()
 
-    def look(self, sight: Sight) -> Rendered:
-        """The map as a view saw it."""
-        return _look(self.levels[0], self.scene, sight, 0.0)
+    @property
+    def alignment_level(self) -> Level:
+        """The size at which the path is aligned: large images and mosaics are looked at with larger pixels."""
+        large = self.channels is not None or self.camera.width * self.camera.height > LARGE_PIXELS
+        return self.levels[min(1, len(self.levels) - 1)] if large else self.levels[0]
+
+    def look(self, sight: Sight, level: Level | None = None) -> Rendered:
+        """The map as a view saw it, at full size or at that of a level (which the sight's windows must have)."""
+        return _look(level or self.levels[0], self.scene, sight, 0.0)
 
     def densify(self, key: int, view: View, sight: Sight, share: float = 0.06) -> None:
         """Give splats to what is rendered worst: in place of dead ones first, then new ones up to the cap."""
         image = self.look(sight)
         middle = len(sight.centres) // 2
         rotation, centre = sight.rotations[middle], sight.centres[middle]
-        error = (view.rate - self.nuisances.factor(key) * image.values) * self.weights(view)
+        error = (view.rate - self.nuisances.factor(key) * image.values) * self._certainty(view.deviation)
         badness = cv2.GaussianBlur(np.abs(cv2.GaussianBlur(error, (0, 0), 0.7)), (0, 0), 1.0)
         badness = np.maximum(badness - np.median(badness), 0)
         dead = np.flatnonzero(self.scene.opacity_logits < -4.0)

@@ -42,7 +42,7 @@ class Options:
     window_frames: int | None = None
     """Frames of a view; None follows the motion (8 to 64)."""
     steps: int = 4000
-    """Gradient steps of the final refinement."""
+    """Gradient steps of the final refinement; images of more than 130,000 pixels get fewer, as each costs more."""
     seed: int = 0
     """Seed of everything random: the same input, options and seed give the same result."""
     threads: int | None = None

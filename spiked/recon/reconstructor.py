@@ -31,15 +31,19 @@ from spiked.trajectory import Trajectory
 SUB_FRAME_PX = 3.0
 """Image motion that one sub-frame of straight, blurred motion renders well."""
 MAX_SUB_FRAMES = 6
-COARSE_SHARE = 0.5
+COARSE_SHARE = 0.6
 """Part of the refinement in which large images are looked at with fewer, larger pixels: a quarter of the work each."""
+SMALL_PIXELS = 130_000
+"""Images up to here get all the steps that the options say."""
 YOUNG_STEPS = 800
 """Steps that a map which grows with the frames is looked at coarsely."""
 SEED_VIEWS = 5
 """Views swept for depth when the map begins."""
 SWEEP_NEIGHBOURS = 5
-ALIGN_EVERY = 500
-"""Steps of the refinement between alignments of the whole path with the map."""
+ALIGNMENTS = 8
+"""Times that the whole path is aligned with the map in a refinement, counting the one at its end, which is left out."""
+ALIGNED_VIEWS = 160
+"""Views looked at for it, at most."""
 
 
 @dataclass(frozen=True)
@@ -339,7 +343,7 @@ class Reconstructor:
         self._queue = []
         order = np.linspace(0, len(usable) - 1, SEED_VIEWS).round().astype(int)
         self._seed([usable[i] for i in order[np.argsort(np.abs(order - order.mean()))]])
-        steps = self.options.steps
+        steps = self._steps()
         for done in range(steps):
             if cancelled():
                 break
@@ -354,15 +358,24 @@ class Reconstructor:
                     progress(self.status())
         self._version += 1
 
+    def _steps(self) -> int:
+        """Steps of the refinement: fewer with the root of the pixels of a large image."""
+        pixels = self.camera.width * self.camera.height
+        return round(self.options.steps * min(1.0, float(np.sqrt(SMALL_PIXELS / pixels))))
+
     def _aligns(self, done: int, steps: int) -> bool:
         wanted = self.options.refine_poses and self.options.poses is None
-        return wanted and (done + 1) % ALIGN_EVERY == 0 and done < 0.9 * steps
+        return wanted and (done + 1) % max(1, steps // ALIGNMENTS) == 0 and done < 0.9 * steps
 
     def _align(self) -> None:
         spline = self.spline
         assert spline is not None
         numbered = [(i, self._views[i]) for i in self._mappable()]
-        self._refined = align_spline(spline, numbered, self._mapper, lambda view: self._sight(view, spline))
+        every = -(-len(numbered) // ALIGNED_VIEWS)
+        pixel = self._mapper.alignment_level.factor
+        self._refined = align_spline(
+            spline, numbered[::every], self._mapper, lambda view: self._sight(view, spline, pixel)
+        )
 
     def _note(self, running_s: float = 0.0) -> None:
         """Add the loss to the curve over seconds of work; `running_s` are not counted as spent yet."""

@@ -5,13 +5,14 @@ Each view is rendered with its depth; the image gradient of the render gives how
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
 from spiked.pose import Array, hat
 from spiked.recon.mapping import Mapper, Sight
-from spiked.recon.views import View, luminance
+from spiked.recon.views import View
 from spiked.spline import Spline
 
 
@@ -47,11 +48,17 @@ def _normal_equations(
     key: int, view: View, sight: Sight, rotation: Array, centre: Array, mapper: Mapper
 ) -> tuple[Array, Array]:
     """Hessian [6, 6] and gradient [6] of the view's weighted squared error, for (phi, centre) perturbed on the left."""
-    image = mapper.look(sight)
-    expected = np.asarray(image.values * mapper.nuisances.factor(key), np.float32)
-    error = (expected - view.rate) / mapper.white
-    k = mapper.camera.intrinsics
-    smooth = luminance(expected, None) / mapper.white
+    level = mapper.alignment_level
+    target = level.target(view, sight.windows)
+    image = mapper.look(replace(sight, windows=target.windows), level)
+    expected = image.values
+    if level.factor == 1:
+        expected = np.asarray(expected * mapper.nuisances.factor(key), np.float32)
+    smooth = level.grey(expected) / np.float32(mapper.white)
+    error = smooth - level.grey(target.values) / np.float32(mapper.white)
+    floor = mapper.options.floor
+    certainty = floor**2 / ((level.grey(target.deviation) / mapper.white) ** 2 + floor**2)
+    k = level.camera.intrinsics
     du = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 32)
     dv = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 32)
     edge = 2
@@ -71,6 +78,6 @@ def _normal_equations(
     jacobian = -np.concatenate([np.einsum("mj,mjk->mk", by_point, hat(ray)), -by_point], 1)
     e = error[v, u].astype(float)
     scale = 1.5 * np.median(np.abs(e)) + 1e-6
-    weight = mapper.weights(view)[v, u] / (1 + (e / (3 * scale)) ** 2)
+    weight = certainty[v, u] / (1 + (e / (3 * scale)) ** 2)
     weighted = jacobian * weight[:, None]
     return weighted.T @ jacobian, weighted.T @ e

@@ -38,6 +38,10 @@ class FramingCounters:
     restarts: int
     """Times that the camera's counters began anew."""
 
+    def position(self, frame_bytes: int) -> int:
+        """Up to which byte of the stream it has been understood, if a frame has that many."""
+        return (self.received + self.duplicates) * frame_bytes + self.skipped_bytes
+
 
 class Parser(Protocol):
     """The native face that both wire formats share."""

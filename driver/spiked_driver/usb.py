@@ -25,8 +25,12 @@ _log = logging.getLogger(__name__)
 RATE_HZ = 20_000.0
 SILENCE_S = 1.0
 """The camera free-runs: when nothing came for so long, something is wrong."""
-_DRAIN_S = 0.5
+_PATIENCE = 16
+"""A camera that stays silent is left alone for longer each time, up to so many times the first: it may be starting."""
+_DRAIN_S = 0.4
 """For transfers to end when a capture is stopped, which has a second in all."""
+_LOOK_S = 1.0
+"""How often to see which other cameras there are."""
 _DRY_FRAMES = 16
 """What lies in the camera and its bridge when nothing is queued, at most: frames it drops come after those."""
 
@@ -67,13 +71,15 @@ class UsbSource:
         self._session: UsbSession | None = None
         self._phase = _Phase.LOOKING
         self._camera: UsbCamera | None = None
-        self._others: frozenset[str] = frozenset()
+        self._others: set[str] = set()
+        self._looked_s = 0.0
         self._trouble: Trouble | None = None
         self._attempts = 0
         self._break: Cause | None = None
+        self._replugged = False  # the camera was without power in the break
         self._heard_s = 0.0  # when bytes came last
         self._waiting_since_s = 0.0
-        self._dry: tuple[int, int] | None = None
+        self._dry: tuple[int, int] | None = None  # bytes of the stream that had come when nothing was queued
         self._note = ""
         self._condition = Condition(DeviceState.IDLE)
 
@@ -129,7 +135,8 @@ class UsbSource:
         if self.plan.note:
             hides_ms = 1e3 * self.plan.hides_s
             self._warn(self.plan.note, f"hides only {hides_ms:.0f} ms of a busy host: see `spiked devices --doctor`")
-        self._camera, self._break, self._dry = None, None, None
+        self._camera, self._break, self._replugged, self._dry = None, None, False, None
+        self._others.clear()
         self._look(first=True)
 
     def close(self) -> None:
@@ -171,7 +178,7 @@ class UsbSource:
         try:
             reads.release()
             if (waiting := reads.ran_dry()) is not None:
-                ended_at = self._framing.next_index + waiting // USB_FRAME_BYTES
+                ended_at = self._framing.counters.bytes + waiting
                 self._dry = (self._dry[0] if self._dry else ended_at, ended_at)
             arrival = reads.next(READ_WAIT_S)
         except usb.core.USBError as error:
@@ -179,9 +186,12 @@ class UsbSource:
             return False
         now_s = time.monotonic()
         if arrival is None:
-            if now_s - max(self._heard_s, self._waiting_since_s) > self.options.silence_s:
+            limit_s = self.options.silence_s * min(_PATIENCE, 1 << min(self._attempts, 8))
+            if now_s - max(self._heard_s, self._waiting_since_s) > limit_s:
                 self._break_off(None)
             return False
+        if now_s - self._looked_s > _LOOK_S:
+            self._look_around(find_cameras())
         self._take(arrival, now_s)
         if arrival.trouble:
             self._break_off(arrival.trouble)
@@ -201,10 +211,12 @@ class UsbSource:
         assert self._break is not None
         rate_hz = self.options.rate_hz
         lost = max(0, round((now_s - self._heard_s) * rate_hz - size / USB_FRAME_BYTES))
-        # A camera that kept its power has kept its count, however odd the clock; one that was away may count anew.
-        kept = self._break is Cause.USB
-        self._framing.resume(lost, 1 << 31 if kept else round(rate_hz + 0.05 * lost), self._break)
+        # A camera that kept its power kept its count, so any step forward is believed. One that was unplugged may count
+        # anew, and is believed only if the clock agrees.
+        tolerance = round(rate_hz + 0.05 * lost) if self._replugged else 1 << 31
+        self._framing.resume(lost, tolerance, self._break)
         self._break = None
+        self._replugged = False
         self._dry = None
 
     def _break_off(self, trouble: Trouble | None) -> None:
@@ -236,10 +248,11 @@ class UsbSource:
         """Read on, from the same session where that helps, else from a new one."""
         assert self._session is not None
         cameras = find_cameras()
-        self._others = frozenset(camera.port for camera in cameras if camera != self._camera)
+        self._look_around(cameras)
         there = self._camera in cameras
-        kept = there and self._trouble not in (None, Trouble.GONE)
-        self._break = self._break or (Cause.USB if kept else Cause.DEVICE)
+        gone = not there or self._trouble is Trouble.GONE
+        self._replugged |= gone
+        self._break = self._break or (Cause.DEVICE if gone or self._trouble is None else Cause.USB)
         self._attempts += 1
         again = there and self._trouble in (None, Trouble.STALLED, Trouble.BABBLE) and self._attempts == 1
         if again and self._rearmed():
@@ -266,32 +279,43 @@ class UsbSource:
 
     def _look(self, *, first: bool = False) -> None:
         """Open the camera if it is there, and say where it stands. Raises SourceError only the `first` time."""
-        assert self._buffers is not None
         try:
             camera = self._find()
             if camera is None:
                 what = "was unplugged" if self._camera else "is not there"
                 self._condition = Condition(DeviceState.ABSENT, f"the camera {self.choice} {what}: waiting for it")
-                return
-            self._session = UsbSession(camera, self._buffers, asynchronous=self.options.asynchronous)
-            self._session.reads.start()
+            else:
+                self._connect(camera)
         except (NotUsableError, OutOfUsbMemoryError) as error:
             self._disconnect()
             if first:
                 raise
             self._condition = Condition(DeviceState.IDLE, str(error))
-            return
-        except (NotThereError, usb.core.USBError) as error:
+        except NotThereError as error:
             self._disconnect()
             self._condition = Condition(DeviceState.LOST, str(error))
-            return
+
+    def _connect(self, camera: UsbCamera) -> None:
+        """Raises NotUsableError, OutOfUsbMemoryError or NotThereError."""
+        assert self._buffers is not None
+        self._session = UsbSession(camera, self._buffers, asynchronous=self.options.asynchronous)
+        try:
+            self._session.reads.start()
+        except usb.core.USBError as error:
+            raise NotThereError(f"{trouble_of(error)} ({camera.port}: {error.strerror})") from error
         if self._session.reads.in_flight_bytes < self.plan.in_flight_bytes and self.options.asynchronous:
             fewer = "the kernel took fewer USB transfers than planned: other cameras use its usbfs memory too"
             self._warn(fewer, fewer)
-        if self._break and camera != self._camera:
-            self._break = Cause.DEVICE  # it was plugged in anew: what looked like a failed transfer was its end
+        if self._break and camera != self._camera:  # what looked like a failed transfer was its end
+            self._break, self._replugged = Cause.DEVICE, True
         self._camera = camera
+        self._look_around(find_cameras())
         self._armed()
+
+    def _look_around(self, cameras: list[UsbCamera]) -> None:
+        """Remember the ports of other cameras, so that none is taken for ours when ours is gone, and it was too."""
+        self._others |= {camera.port for camera in cameras if self._camera and camera.port != self._camera.port}
+        self._looked_s = time.monotonic()
 
     def _find(self) -> UsbCamera | None:
         cameras = find_cameras()
@@ -311,10 +335,11 @@ class UsbSource:
         if self._dry is None or gap.cause is not Cause.DEVICE:
             return gap
         first, last = self._dry
-        if gap.first > last + _DRY_FRAMES:
+        position = self._framing.counters.position(USB_FRAME_BYTES)
+        if position > last + _DRY_FRAMES * USB_FRAME_BYTES:
             self._dry = None
             return gap
-        return Gap(gap.first, gap.count, Cause.USB) if gap.first >= first - 1 else gap
+        return Gap(gap.first, gap.count, Cause.USB) if position > first - 2 * USB_FRAME_BYTES else gap
 
     def _warn(self, warning: str, note: str) -> None:
         _log.warning("%s", warning)

@@ -62,6 +62,10 @@ def test_a_capture_over_rest_gets_every_frame_and_is_reconstructed(
     wait_for(lambda: http.get(f"captures/{capture_id}").json()["state"] in ("complete", "failed"), "it ends")
     device = http.get("devices").json()["items"][0]
     assert (device["state"], device["port"], device["serial"]) == ("idle", "2-1", "000000000001")
+    doctor = {item["name"]: item for item in http.get("doctor").json()["items"]}
+    assert doctor["camera 2-1"]["status"] == "ok"
+    assert doctor["usbfs memory"]["status"] == "warning"
+    assert "usbfs_memory_mb" in doctor["usbfs memory"]["what_to_do"]
     assert device["capabilities"]["exposure"] == {"supported": False, "value": None}
     capture = http.get(f"captures/{capture_id}").json()
     assert (capture["state"], capture["reason"]) == ("complete", "")

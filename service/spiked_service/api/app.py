@@ -9,6 +9,7 @@ from fastapi.concurrency import run_in_threadpool
 from spiked_service.api.captures import capture_routes
 from spiked_service.api.devices import DeviceWatch, device_routes
 from spiked_service.api.docs import mount_docs
+from spiked_service.api.doctor import doctor_routes
 from spiked_service.api.events import event_routes
 from spiked_service.api.idempotency import IdempotencyKeys, idempotent
 from spiked_service.api.observe import Observe
@@ -65,6 +66,7 @@ def _api(services: Services, sources: Sources) -> APIRouter:
     api.include_router(device_routes(captures, sources, once))
     api.include_router(capture_routes(captures, sources, keeping.folder, results, views, once))
     api.include_router(reconstruction_routes(reconstructions, results, views, once))
+    api.include_router(doctor_routes(keeping.folder.path))
     api.include_router(option_routes())
     api.include_router(upload_routes(uploads, captures, once))
     api.include_router(event_routes(services.bus, services.event_clients))

@@ -1,6 +1,7 @@
 """Whether the machine is fit for its cameras."""
 
 import threading
+import time
 from pathlib import Path
 
 from fastapi import APIRouter
@@ -9,6 +10,9 @@ from pydantic import Field
 from spiked_service.api.problems import problems
 from spiked_service.api.schemas.base import Out
 from spiked_service.doctor import Finding, Status, examine
+
+_FRESH_S = 5.0
+"""So long an answer is given again: looking writes to the disk."""
 
 
 class DoctorItemOut(Out):
@@ -31,15 +35,32 @@ class DoctorOut(Out):
     items: list[DoctorItemOut]
 
 
+class _Doctor:
+    """Examines one machine, not more often than is good for its disk."""
+
+    def __init__(self, data: Path) -> None:
+        self._data = data
+        self._lock = threading.Lock()
+        self._at_s = -_FRESH_S
+        self._findings: list[Finding] = []
+
+    def examine(self) -> list[Finding]:
+        """What was found now, or a moment ago."""
+        with self._lock:
+            if time.monotonic() - self._at_s > _FRESH_S:
+                self._findings = examine(self._data)
+                self._at_s = time.monotonic()
+            return self._findings
+
+
 def doctor_routes(data: Path) -> APIRouter:
     """The route `doctor`, for the disk below that folder."""
     router = APIRouter(tags=["devices"])
-    one_at_a_time = threading.Lock()  # it writes to the disk to see how fast that is
+    doctor = _Doctor(data)
 
     @router.get("/doctor", responses=problems())
     def examine_machine() -> DoctorOut:
         """Look at USB rules, permissions, budget and port speed, the processor, and the disk; takes about a second."""
-        with one_at_a_time:
-            return DoctorOut(items=[DoctorItemOut.of(finding) for finding in examine(data)])
+        return DoctorOut(items=[DoctorItemOut.of(finding) for finding in doctor.examine()])
 
     return router

@@ -126,6 +126,7 @@ def rows(seconds: float, folder: Path | None = None) -> list[Row]:
     ):
         rate = sensor[0] * sensor[1] / 8 * 20_000 * 1e-6
         length = outcome.frames / 20_000
+        lost = ", ".join(f"{kind} lost {count}" for kind, count in outcome.lost.items())
         shares = ", ".join(f"{kind} {share:.2f}" for kind, share in outcome.consumer_shares.items())
         found.append(
             Row(
@@ -133,7 +134,7 @@ def rows(seconds: float, folder: Path | None = None) -> list[Row]:
                 sum(outcome.lost.values()),
                 "frames",
                 outcome.producer_share,
-                f"of a core to fill it; {shares}; {1e3 * outcome.behind_s:.0f} ms late at most",
+                f"of a core to fill it; {lost}; cores {shares}; {1e3 * outcome.behind_s:.0f} ms late at most",
                 "0 lost, < 0.15 of a core" if sensor[0] == 400 else "0 lost",
                 threads=os.cpu_count() or 1,
             )

@@ -175,22 +175,18 @@ void aligned_window(const Frames& frames, const Layout& layout, int64_t begin, i
     kernels.window(job);
 }
 
-// Bits of frames to upright images of bytes, 0 or 1: a table has the eight pixels of every byte.
+// Bits of frames to upright images of bytes, 0 or 1.
 void unpack_frames(const Frames& frames, const Layout& layout, const Images<uint8_t>& images) {
     const Geometry g = geometry_of(layout, frames);
+    const Kernels& kernels = kernels_named("");
     check_image(images, g, 1);
     if (images.shape(0) < frames.shape(0)) throw std::invalid_argument("the output holds fewer images than frames");
     nb::gil_scoped_release release;
-    uint8_t pixels[256][8];
-    for (int byte = 0; byte < 256; ++byte)
-        for (int k = 0; k < 8; ++k) pixels[byte][k] = byte >> (g.msb ? 7 - k : k) & 1;
     uint8_t* out = images.data();
     for (size_t n = 0; n < frames.shape(0); ++n) {
         const uint8_t* frame = frames.data() + static_cast<int64_t>(n) * frames.stride(0);
-        for (size_t y = 0; y < g.height; ++y) {
-            const uint8_t* row = frame + (g.flipped ? g.height - 1 - y : y) * g.row_stride;
-            for (size_t x = 0; x < g.width; x += 8, out += 8) std::memcpy(out, pixels[row[x / 8]], 8);
-        }
+        for (size_t y = 0; y < g.height; ++y, out += g.width)
+            kernels.unpack(frame + (g.flipped ? g.height - 1 - y : y) * g.row_stride, g.width / 8, g.msb, out);
     }
 }
 

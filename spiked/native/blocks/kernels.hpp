@@ -56,6 +56,7 @@ struct Kernels {
     const char* name;
     void (*reduce)(const ReduceJob&);
     void (*window)(const WindowJob&);
+    void (*unpack)(const uint8_t* row, size_t bytes, bool msb, uint8_t* pixels);  // eight pixels a byte, 0 or 1
 };
 
 // Null where the instruction set was not compiled in.

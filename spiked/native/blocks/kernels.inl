@@ -200,5 +200,30 @@ void window(const WindowJob& job) {
     }
 }
 
+// The eight pixels of every byte, LSB first and MSB first.
+struct Unpacked {
+    uint8_t pixels[2][256][8];
+    constexpr Unpacked() : pixels() {
+        for (int byte = 0; byte < 256; ++byte)
+            for (int k = 0; k < 8; ++k) {
+                pixels[0][byte][k] = (uint8_t)(byte >> k & 1);
+                pixels[1][byte][k] = (uint8_t)(byte >> (7 - k) & 1);
+            }
+    }
+};
+constexpr Unpacked kUnpacked;
+
+void unpack(const uint8_t* row, size_t bytes, bool msb, uint8_t* pixels) {
+    size_t i = 0;
+#if defined(__AVX512BITALG__) && defined(__GFNI__)
+    for (; !msb && i + 8 <= bytes; i += 8) {
+        uint64_t bits;
+        memcpy(&bits, row + i, sizeof bits);
+        _mm512_storeu_si512(pixels + 8 * i, _mm512_maskz_set1_epi8(bits, 1));
+    }
+#endif
+    for (; i < bytes; ++i) memcpy(pixels + 8 * i, kUnpacked.pixels[msb][row[i]], 8);
+}
+
 }  // namespace
 }  // namespace spiked

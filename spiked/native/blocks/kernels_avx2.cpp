@@ -6,7 +6,7 @@
 namespace spiked {
 
 const Kernels* avx2_kernels() {
-    static const Kernels kernels = {"avx2", reduce, window};
+    static const Kernels kernels = {"avx2", reduce, window, unpack};
     return &kernels;
 }
 

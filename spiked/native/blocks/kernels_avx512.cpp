@@ -6,7 +6,7 @@
 namespace spiked {
 
 const Kernels* avx512_kernels() {
-    static const Kernels kernels = {"avx512", reduce, window};
+    static const Kernels kernels = {"avx512", reduce, window, unpack};
     return &kernels;
 }
 

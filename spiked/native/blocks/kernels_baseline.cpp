@@ -3,7 +3,7 @@
 namespace spiked {
 
 const Kernels* baseline_kernels() {
-    static const Kernels kernels = {"baseline", reduce, window};
+    static const Kernels kernels = {"baseline", reduce, window, unpack};
     return &kernels;
 }
 

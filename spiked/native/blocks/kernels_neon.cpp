@@ -7,7 +7,7 @@
 namespace spiked {
 
 const Kernels* neon_kernels() {
-    static const Kernels kernels = {"neon", reduce, window};
+    static const Kernels kernels = {"neon", reduce, window, unpack};
     return &kernels;
 }
 

@@ -1,0 +1,73 @@
+"""What the tests of the page share: patience, a daemon with something to show, and the canvas of the scene."""
+
+import base64
+import io
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+Picture = NDArray[np.float64]
+PATIENCE_S = 120.0
+DESKTOP = {"width": 1280, "height": 800}
+PHONE = {"width": 390, "height": 844}
+
+
+def until(condition: Callable[[], Any], what: str, patience_s: float = PATIENCE_S) -> Any:
+    """Wait for something and return it."""
+    deadline_s = time.monotonic() + patience_s
+    while not (value := condition()):
+        assert time.monotonic() < deadline_s, f"not so within {patience_s:g} s: {what}"
+        time.sleep(0.1)
+    return value
+
+
+def finished(http: Any, capture_id: str) -> dict[str, Any]:
+    """The capture when it is over."""
+
+    def over() -> dict[str, Any] | None:
+        capture: dict[str, Any] = http.get(f"captures/{capture_id}").json()
+        return capture if capture["state"] in ("complete", "failed") else None
+
+    return until(over, f"capture {capture_id} is over", 300)
+
+
+class Studied:
+    """A daemon that has captured and reconstructed a recording."""
+
+    def __init__(self, daemon: Any, capture: dict[str, Any]) -> None:
+        self.daemon = daemon
+        self.address: str = daemon.address
+        self.http = daemon.http
+        self.capture_id: str = capture["id"]
+        self.reconstruction_id: str = capture["reconstruction_ids"][0]
+
+    def reconstruction(self) -> dict[str, Any]:
+        """As it is now."""
+        found: dict[str, Any] = self.http.get(f"reconstructions/{self.reconstruction_id}").json()
+        return found
+
+
+def picture(page: Any) -> Picture:
+    """What the canvas shows, [H, W, 3], 0 to 1."""
+    url = page.evaluate("() => document.querySelector('.stage canvas').toDataURL('image/png')")
+    return decoded(base64.b64decode(url.split(",")[1]))
+
+
+def decoded(content: bytes) -> Picture:
+    """An encoded picture, [H, W, 3], 0 to 1."""
+    return np.asarray(Image.open(io.BytesIO(content)).convert("RGB"), np.float64) / 255
+
+
+def psnr_db(a: Picture, b: Picture) -> float:
+    """Likeness of two pictures of one size."""
+    return float(-10 * np.log10(max(float(np.mean((a - b) ** 2)), 1e-12)))
+
+
+def shown_version(page: Any) -> int:
+    """Version of the scene on the canvas; 0 before the first."""
+    canvas = page.locator(".stage canvas")
+    return int(canvas.get_attribute("data-version") or 0) if canvas.count() else 0

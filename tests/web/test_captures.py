@@ -1,0 +1,97 @@
+"""The Captures page: found, looked at, reconstructed once more, compared, deleted and brought back."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from browsing import Studied, until
+
+
+@pytest.mark.slow
+def test_a_capture_is_found_and_looked_at(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit(f"{studied.address}?page=captures")
+    row = page.get_by_role("row").filter(has_text="desk, by hand")
+    row.wait_for()
+    assert "good" in row.inner_text()
+    assert "51.2" in row.inner_text()  # milliseconds
+    until(lambda: row.locator("img").evaluate("image => image.naturalWidth") > 0, "a thumbnail")
+    page.get_by_label("Search captures").fill("no such thing")
+    page.get_by_text("Nothing is found").wait_for()
+    page.get_by_label("Search captures").fill("DESK")
+    row.wait_for()
+    assert "search=DESK" in page.url
+
+    row.get_by_role("link").click()
+    page.get_by_text("Over time").wait_for()
+    assert studied.capture_id in page.url
+    for plot in ("χ²", "Loss", "PSNR estimate", "Spike rate", "Flicker"):
+        page.locator(f"figure.plot:has(figcaption:has-text('{plot}')) canvas").wait_for()
+    page.get_by_text("No frames are missing").wait_for()
+    page.locator("summary").filter(has_text="Log").click()
+    until(lambda: len(page.locator(".log pre").inner_text()) > 10, "a log")
+
+
+@pytest.mark.slow
+def test_everything_can_be_downloaded(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit(f"{studied.address}?page=captures&capture={studied.capture_id}")
+    page.get_by_role("link", name="nerfstudio").wait_for()
+    targets = page.eval_on_selector_all("a[download]", "links => links.map(link => link.href)")
+    assert len(targets) == 9
+    for target in targets:
+        answer = studied.http.get(target)
+        assert answer.status_code == 200, target
+        assert answer.content, target
+
+
+@pytest.mark.slow
+def test_renamed_rerun_and_compared(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit(f"{studied.address}?page=captures&capture={studied.capture_id}")
+    name = page.get_by_label("Name of the capture")
+    name.fill("desk, by hand, again")
+    name.press("Enter")
+    until(
+        lambda: studied.http.get(f"captures/{studied.capture_id}").json()["name"] == "desk, by hand, again",
+        "the service knows the name",
+    )
+    page.get_by_role("button", name="Re-run with other options").click()
+    page.get_by_label("steps").fill("50")
+    page.get_by_role("button", name="Reconstruct", exact=True).click()
+    compared = page.locator("table.compared")
+    compared.wait_for()
+    jobs = studied.http.get("reconstructions", params={"capture_id": studied.capture_id}).json()["items"]
+    again = next(job for job in jobs if not job["live"])
+    assert again["options"]["steps"] == 50
+    until(
+        lambda: studied.http.get(f"reconstructions/{again['id']}").json()["state"] == "complete", "it is reconstructed"
+    )
+    until(lambda: compared.locator("tbody tr").first.inner_text().split("\t")[1].strip() != "0", "its poses are shown")
+    legend = page.locator("figure.plot:has(figcaption:has-text('Loss')) .u-legend")
+    until(lambda: "#1" in legend.inner_text() and "#2" in legend.inner_text(), "both are in one plot")
+
+
+@pytest.mark.slow
+def test_deleted_and_brought_back(studied: Studied, visit: Callable[..., Any]) -> None:
+    plan = {"source": "sim:?width=64&height=48", "frames": 64, "name": "throw-away", "reconstruct": False}
+    capture_id = studied.http.post("captures", json=plan).json()["id"]
+    until(lambda: studied.http.get(f"captures/{capture_id}").json()["state"] == "complete", "a capture more")
+    page = visit(f"{studied.address}?page=captures")
+    row = page.get_by_role("row").filter(has_text="throw-away")
+    page.get_by_role("button", name="Delete throw-away").click()
+    row.wait_for(state="detached")
+    assert studied.http.get(f"captures/{capture_id}").json()["deleted_at"] is not None
+    page.get_by_role("button", name="Undo").click()
+    row.wait_for()
+    assert studied.http.get(f"captures/{capture_id}").json()["deleted_at"] is None
+    studied.http.delete(f"captures/{capture_id}")
+
+
+@pytest.mark.slow
+def test_set_up_tells_where_each_setting_comes_from(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit(f"{studied.address}?page=setup")
+    row = page.get_by_role("row").filter(has=page.get_by_text("port", exact=True))
+    row.wait_for()
+    assert "flag" in row.inner_text()
+    page.get_by_role("button", name="Reload").click()
+    page.get_by_text("The configuration was read again").wait_for()
+    for link in page.locator(".links a").all():
+        assert studied.http.get(studied.address + link.get_attribute("href")).status_code == 200

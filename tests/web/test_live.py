@@ -1,0 +1,158 @@
+"""The Live page: a capture from its start to its verdict, and a daemon or a camera that goes away meanwhile."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from browsing import PATIENCE_S, Studied, until
+from virtual_camera.host import CameraSettings
+from virtual_camera.rig import VirtualCameras
+
+FIRST_PAINT_MS = 1000
+
+
+def number(text: str | None) -> int:
+    """A count as the page writes it, with thin spaces; 0 for a dash."""
+    return int(re.sub(r"\D", "", text or "") or 0)
+
+
+def received(page: Any) -> int:
+    return number(page.locator("dl.stats div:has(dt:text-is('Received')) dd").first.text_content())
+
+
+def test_a_capture_is_started_watched_and_judged(daemon: Callable[..., Any], visit: Callable[..., Any]) -> None:
+    one = daemon("--device", "sim:?width=160&height=100", "--no-capture")
+    page = visit(one.address)
+    page.get_by_text("No capture yet").wait_for()
+    page.get_by_label("Name", exact=True).fill("first light")
+    page.get_by_label("Length", exact=True).select_option("frames")
+    page.get_by_label("Length in frames").fill("400")
+    page.get_by_label("Reconstruct").uncheck()
+    page.get_by_role("button", name="Start").click()
+
+    image = page.locator(".picture img")
+    image.wait_for()
+    page.locator("[data-grade]").wait_for()  # no reload, no click: it appears by itself
+    assert "good" in page.locator("[data-grade]").inner_text()
+    assert received(page) == 400
+    assert image.evaluate("image => image.naturalWidth") == 160
+    bars = page.locator(".histogram rect")
+    assert until(bars.count, "a histogram") >= 8
+
+    (capture,) = one.http.get("captures").json()["items"]
+    assert (capture["name"], capture["verdict"]["grade"]) == ("first light", "good")
+    assert capture["reconstruction_ids"] == []
+
+
+def test_a_capture_without_end_is_stopped(daemon: Callable[..., Any], visit: Callable[..., Any]) -> None:
+    page = visit(daemon("--device", "sim:?width=160&height=100&pace=0.05", "--no-capture").address)
+    page.get_by_label("Reconstruct").uncheck()
+    page.get_by_role("button", name="Start").click()
+    first = until(lambda: received(page), "frames come")
+    until(lambda: received(page) > first, "more frames come, without a reload")
+    page.get_by_role("button", name="Stop").click()
+    page.locator("[data-grade]").wait_for()
+
+
+def test_what_is_refused_is_said(daemon: Callable[..., Any], visit: Callable[..., Any]) -> None:
+    page = visit(daemon("--device", "sim:", "--no-capture").address)
+    page.get_by_label("Device").select_option(label="Another source…")
+    page.get_by_label("Source", exact=True).fill("replay:missing.dat")
+    page.get_by_role("button", name="Start").click()
+    told = page.locator(".panel .trouble")
+    told.wait_for()
+    assert "missing.dat" in told.inner_text()
+
+
+@pytest.mark.slow
+def test_kinds_of_pictures_and_gain(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit(studied.address)
+    image = page.locator(".picture img")
+    sources = set()
+    for kind in ("Interval", "Accumulation", "Render"):
+        page.get_by_text(kind, exact=True).click()
+        until(lambda: image.count() and image.get_attribute("src") not in sources, f"the picture {kind}")
+        sources.add(image.get_attribute("src"))
+
+    def mean() -> float:
+        return float(
+            image.evaluate(
+                """image => {
+                    const canvas = new OffscreenCanvas(32, 20);
+                    const pen = canvas.getContext('2d');
+                    pen.drawImage(image, 0, 0, 32, 20);
+                    return pen.getImageData(0, 0, 32, 20).data.reduce((sum, x, i) => i % 4 == 3 ? sum : sum + x, 0);
+                }"""
+            )
+        )
+
+    before = mean()
+    page.get_by_label("Gain").fill("-2")
+    until(lambda: mean() < 0.5 * before, "the picture is darker")
+
+
+@pytest.mark.slow
+def test_the_page_recovers_when_the_daemon_dies(daemon_class: Any, tmp_path: Path, visit: Callable[..., Any]) -> None:
+    one = daemon_class("--no-capture", "--device", "sim:", folder=tmp_path)
+    port = one.address.rsplit(":", 1)[1].strip("/")
+    page = visit(one.address)
+    page.get_by_text("connected", exact=True).wait_for()
+    one.process.kill()
+    one.close()
+    page.get_by_text("disconnected", exact=True).wait_for()
+    page.get_by_text("What is shown below may be old").wait_for()
+    two = daemon_class("--no-capture", "--device", "sim:", "--port", port, folder=tmp_path)
+    try:
+        page.get_by_text("connected", exact=True).wait_for()
+        assert page.get_by_text("What is shown below may be old").count() == 0
+    finally:
+        page.goto("about:blank")
+        two.close()
+
+
+@pytest.mark.slow
+def test_a_camera_is_unplugged_and_comes_back(
+    cameras: Callable[..., VirtualCameras],
+    daemon: Callable[..., Any],
+    visit: Callable[..., Any],
+    pictures: Path,
+) -> None:
+    rig = cameras(CameraSettings(str(pictures), rate_hz=2000, buffer_frames=4000))
+    one = daemon("--device", "usb0?fov=60&rate=2000&transfer_kib=256", "--no-capture", seen=rig)
+    page = visit(one.address)
+    page.get_by_label("Reconstruct").uncheck()
+    page.get_by_role("button", name="Start").click()
+    until(lambda: received(page) > 100, "frames come")
+    sign = page.locator(".panel:has(h2:text-is('Capture')) header .badge")
+    rig.unplug()
+    until(lambda: sign.inner_text() in ("absent", "lost"), "the page says that the camera is gone")
+    before = received(page)
+    rig.plug(port="2-5")
+    until(lambda: sign.inner_text() == "streaming", "the page says that the camera is back")
+    until(lambda: received(page) > before + 200, "frames come again")
+    lost = page.locator("table:has(caption:text-is('Frames lost, by cause')) tbody td").first
+    assert number(lost.text_content()) > 0
+    page.get_by_role("button", name="Stop").click()
+    page.locator("[data-grade='degraded']").wait_for()
+
+
+@pytest.mark.slow
+def test_the_first_paint_comes_within_a_second(studied: Studied, visit: Callable[..., Any]) -> None:
+    measured = []
+    for _ in range(5):  # the machine may be busy; the page is judged by its best
+        page = visit(studied.address)
+        page.locator(".live").wait_for()
+        measured.append(page.evaluate("performance.getEntriesByName('first-contentful-paint')[0].startTime"))
+        if measured[-1] < FIRST_PAINT_MS:
+            break
+    assert min(measured) < FIRST_PAINT_MS, measured
+
+
+@pytest.mark.slow
+def test_a_token_in_the_address_is_kept_out_of_sight(daemon: Callable[..., Any], visit: Callable[..., Any]) -> None:
+    one = daemon("--token", "sesame-open-the-door", "--no-capture", token="sesame-open-the-door")
+    page = visit(f"{one.address}?token=sesame-open-the-door")
+    page.get_by_text("connected", exact=True).wait_for(timeout=1000 * PATIENCE_S)
+    assert "token" not in page.url

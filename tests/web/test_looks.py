@@ -1,0 +1,124 @@
+"""Every page in both themes and on a phone: reachable by keyboard, clean for axe, and a screenshot of each."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from browsing import DESKTOP, PHONE, Studied, shown_version, until
+from PIL import Image
+
+pytestmark = pytest.mark.slow  # WebGL is drawn by the CPU here
+
+AXE = Path(__file__).resolve().parents[2] / "web" / "node_modules" / "axe-core" / "axe.min.js"
+PAGES = {
+    "live": "",
+    "scene": "?page=scene",
+    "ride": "?page=scene&ride=1&frame=320",
+    "captures": "?page=captures",
+    "capture": "?page=captures&capture={capture_id}",
+    "setup": "?page=setup",
+}
+MOST_BYTES = 300_000
+
+
+def settled(page: Any, name: str) -> None:
+    """Wait until there is on the page what makes it that page."""
+    if name in ("scene", "ride"):
+        until(lambda: shown_version(page) > 0, "a scene")
+        page.wait_for_timeout(1500)  # SwiftShader draws the newest sorting after that
+    if name == "ride":
+        page.locator("img.observed").wait_for()
+    if name == "live":
+        page.locator(".picture img").wait_for()
+        until(lambda: page.locator(".histogram rect").count(), "a histogram")
+    if name == "captures":
+        page.locator(".list tbody tr").first.wait_for()
+    if name == "capture":
+        page.locator("figure.plot").nth(4).wait_for()
+    if name == "setup":
+        page.locator(".configuration tbody tr").first.wait_for()
+
+
+def violations(page: Any) -> list[str]:
+    page.evaluate(AXE.read_text())
+    found = page.evaluate("() => axe.run()")["violations"]
+    return [f"{one['id']}: {one['help']}: {[node['html'][:200] for node in one['nodes']]}" for one in found]
+
+
+@pytest.mark.parametrize("theme", ["dark", "light"])
+@pytest.mark.parametrize("name", PAGES)
+def test_each_page(studied: Studied, visit: Callable[..., Any], pictures_folder: Path, name: str, theme: str) -> None:
+    page = visit(studied.address + PAGES[name].format(capture_id=studied.capture_id), theme=theme)
+    settled(page, name)
+    keep(page, pictures_folder / f"{name}-{theme}.webp")
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= DESKTOP["width"]
+    if not AXE.is_file():
+        pytest.skip("axe-core is not installed (make page)")
+    assert violations(page) == []
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_each_page_on_a_phone(studied: Studied, visit: Callable[..., Any], pictures_folder: Path, name: str) -> None:
+    page = visit(studied.address + PAGES[name].format(capture_id=studied.capture_id), viewport=PHONE, touch=True)
+    settled(page, name)
+    keep(page, pictures_folder / f"{name}-phone.webp")
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
+    if AXE.is_file():
+        assert violations(page) == []
+
+
+def keep(page: Any, path: Path) -> None:
+    """A screenshot, small enough for documentation."""
+    raw = path.with_suffix(".png")
+    page.screenshot(path=raw)
+    Image.open(raw).convert("RGB").save(path, quality=82, method=6)
+    raw.unlink()
+    assert path.stat().st_size < MOST_BYTES
+
+
+def test_the_theme_is_chosen_and_remembered(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit(studied.address, theme="dark")
+    paper = "() => getComputedStyle(document.documentElement).backgroundColor"
+    dark = page.evaluate(paper)
+    page.get_by_role("button", name="Theme: as the system").click()
+    page.get_by_role("button", name="Theme: dark").click()
+    light = page.evaluate(paper)
+    assert light != dark
+    page.reload()
+    page.get_by_role("button", name="Theme: light").wait_for()
+    assert page.evaluate(paper) == light
+
+
+def test_everything_is_reached_by_keyboard(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit(studied.address)
+    page.locator(".live").wait_for()
+    page.keyboard.press("Tab")
+    assert page.evaluate("() => document.activeElement.textContent") == "Skip to content"
+    reached = []
+    for _ in range(30):
+        page.keyboard.press("Tab")
+        reached.append(page.evaluate("() => document.activeElement.textContent.trim() || document.activeElement.type"))
+    assert [name for name in reached if name in ("Live", "Scene", "Captures", "Set-up")] == [
+        "Live",
+        "Scene",
+        "Captures",
+        "Set-up",
+    ]
+    assert "Start" in reached
+    page.evaluate("() => document.activeElement.blur()")
+    page.keyboard.press("3")
+    page.get_by_role("heading", name="Captures").wait_for()
+    page.go_back()
+    page.locator(".live").wait_for()
+
+
+def test_nothing_is_fetched_from_elsewhere(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit("about:blank")
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    for name, query in PAGES.items():
+        page.goto(studied.address + query.format(capture_id=studied.capture_id))
+        settled(page, name)
+    assert len(asked) > 20
+    assert [url for url in asked if not url.startswith((studied.address, "blob:", "data:"))] == []

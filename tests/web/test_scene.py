@@ -1,0 +1,218 @@
+"""The Scene page: what is on the canvas is what the service would render, and stays while versions come and go."""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browsing import PHONE, Studied, decoded, picture, psnr_db, shown_version, until
+
+from spiked.scene import Scene
+
+pytestmark = pytest.mark.slow  # WebGL is drawn by the CPU here
+
+MANY = 500_000
+
+
+def open_scene(visit: Callable[..., Any], address: str, **more: Any) -> Any:
+    page = visit(address, **more)
+    until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+    return page
+
+
+def contrast(page: Any) -> float:
+    return float(picture(page).std())
+
+
+def test_the_scene_grows_while_the_camera_moves(
+    daemon: Callable[..., Any], visit: Callable[..., Any], room: Path
+) -> None:
+    one = daemon("--device", "sim:", "--no-capture")
+    plan = {"source": f"replay:{room}", "options": {"steps": 400}}
+    capture_id = one.http.post("captures", json=plan).json()["id"]
+    page = visit(f"{one.address}?page=scene&capture={capture_id}")
+    until(lambda: shown_version(page) > 0, "the first version is on the canvas")
+    until(lambda: contrast(page) > 0.03, "something is to be seen")
+    # A sample of what is on the canvas at every frame drawn from here on: a flash would be a nearly empty picture.
+    page.evaluate(
+        """() => {
+            const canvas = document.querySelector('.stage canvas');
+            const small = new OffscreenCanvas(40, 25).getContext('2d', { willReadFrequently: true });
+            window.lit = [];
+            const look = () => {
+                small.drawImage(canvas, 0, 0, 40, 25);
+                const data = small.getImageData(0, 0, 40, 25).data;
+                let lit = 0;
+                for (let i = 0; i < data.length; i += 4) lit += data[i] > 60;
+                window.lit.push(lit);
+                requestAnimationFrame(look);
+            };
+            look();
+        }"""
+    )
+    first, before = shown_version(page), picture(page)
+    view = page.evaluate("() => location.search")
+    until(lambda: shown_version(page) >= first + 2, "two newer versions")
+    until(lambda: np.abs(picture(page) - before).mean() > 1e-4, "the picture has changed")
+    lit = page.evaluate("() => window.lit")
+    assert len(lit) > 3
+    assert min(lit) > 0.4 * np.median(lit), "the canvas went dark between two versions"
+    assert page.evaluate("() => location.search") == view, "a new version moved the camera"
+
+
+def test_the_canvas_shows_what_the_service_renders(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = open_scene(visit, f"{studied.address}?page=scene&ride=1&frame=320")
+    page.get_by_text("Rendered", exact=True).click()
+    size = page.evaluate("() => { const c = document.querySelector('.stage canvas'); return [c.width, c.height]; }")
+    frame = int(page.get_by_label("Frame", exact=True).input_value())
+    body = {"camera": {"frame": frame}, "width": size[0], "height": size[1]}
+    answer = studied.http.post(
+        f"reconstructions/{studied.reconstruction_id}/views", json=body, params={"format": "png"}
+    )
+    assert answer.status_code == 200, answer.text
+    served = decoded(answer.content)
+    until(lambda: psnr_db(picture(page), served) > 30, f"30 dB, not {psnr_db(picture(page), served):.1f}", 20)
+
+
+def test_spz_previews_lie_where_the_whole_scene_lies(studied: Studied, visit: Callable[..., Any]) -> None:
+    whole = open_scene(visit, f"{studied.address}?page=scene&ride=1&frame=320")
+    whole.get_by_text("Rendered", exact=True).click()
+    page = visit("about:blank")
+    # The page is told of a scene too large to be shown at once, and shows a sample of it: here all of it, as SPZ.
+    page.route(
+        re.compile(r"/reconstructions\?|/reconstructions/[^/]+$"),
+        lambda route: route.fulfill(
+            response=(answer := route.fetch()),
+            body=re.sub(r'"splats":\s*\d+', '"splats": 999999', answer.text()),
+        ),
+    )
+    page.goto(f"{studied.address}?page=scene&ride=1&frame=320")
+    until(lambda: shown_version(page) > 0, "a preview is on the canvas")
+    page.get_by_text("Rendered", exact=True).click()
+    assert page.get_by_role("button", name="Show all").count() == 1
+    until(lambda: psnr_db(picture(page), picture(whole)) > 30, "the preview looks like the whole", 20)
+    page.get_by_role("button", name="Show all").click()
+    page.get_by_role("button", name="all splats").wait_for(state="detached")
+
+
+def test_scrubbing_moves_the_camera_and_is_kept_in_the_url(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = open_scene(visit, f"{studied.address}?page=scene&ride=1")
+    slider = page.get_by_label("Frame", exact=True)
+    until(lambda: int(slider.get_attribute("max") or 0) > 500, "the path is there")
+    page.get_by_text("Rendered", exact=True).click()
+    slider.fill("100")
+    early = picture(page)
+    slider.fill("500")
+    until(lambda: np.abs(picture(page) - early).mean() > 0.01, "another view")
+    assert "frame=500" in page.url
+    slider.press("ArrowRight")
+    until(lambda: "frame=501" in page.url, "a frame on")
+    page.reload()
+    until(lambda: shown_version(page) > 0, "the scene is back")
+    assert until(lambda: slider.input_value() == "501", "the same frame")
+    page.get_by_role("button", name="End").click()
+    until(lambda: "frame" not in page.url, "it follows the newest")
+    page.get_by_role("button", name="Play").click()
+    until(lambda: "frame" in page.url, "it plays")
+    page.get_by_role("button", name="Pause").click()
+
+
+def test_riding_along_compares_observed_and_rendered(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = open_scene(visit, f"{studied.address}?page=scene&frame=320")
+    page.get_by_role("button", name="Ride along").click()
+    observed = page.locator("img.observed")
+    observed.wait_for()
+    stage = page.locator(".stage")
+    box = stage.bounding_box()
+    assert abs(box["width"] / box["height"] - 320 / 200) < 0.02
+
+    def shown() -> Any:
+        return decoded(stage.screenshot())[40:-80]  # without the names above and the buttons below
+
+    page.get_by_text("Rendered", exact=True).click()
+    rendered = shown()
+    page.get_by_text("Observed", exact=True).click()
+    until(lambda: 15 < psnr_db(shown(), rendered) < 60, "the camera has seen what is rendered", 20)
+    seen = shown()
+    page.get_by_text("Wipe", exact=True).click()
+    page.locator("input.wipe").fill("0.25")
+    wiped = shown()
+    quarter = wiped.shape[1] // 4
+    assert psnr_db(wiped[:, : quarter - 4], seen[:, : quarter - 4]) > 40
+    assert psnr_db(wiped[:, quarter + 4 :], rendered[:, quarter + 4 :]) > 40
+    page.get_by_text("Difference", exact=True).click()
+    page.wait_for_timeout(100)
+    difference = shown()
+    assert psnr_db(difference, np.clip(4 * np.abs(seen - rendered), 0, 1)) > 30
+
+
+def test_views_are_bookmarked_and_linked(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = open_scene(visit, f"{studied.address}?page=scene")
+    canvas = page.locator(".stage canvas")
+    at_first = picture(page)
+    page.get_by_role("button", name="Add").click()
+    box = canvas.bounding_box()
+    page.mouse.move(box["x"] + 300, box["y"] + 300)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 420, box["y"] + 330, steps=4)
+    page.mouse.up()
+    until(lambda: "camera=" in page.url, "the view is in the URL")
+    until(lambda: np.abs(picture(page) - at_first).mean() > 0.005, "the view has turned")
+    turned = picture(page)
+    elsewhere = open_scene(visit, page.url)
+    until(lambda: psnr_db(picture(elsewhere), turned) > 30, "the link shows the same view", 20)
+    page.get_by_role("button", name="View 1", exact=True).click()
+    until(lambda: psnr_db(picture(page), at_first) > 30, "the bookmark brings the first view back", 20)
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Screenshot").click()
+    assert decoded(Path(download.value.path()).read_bytes()).shape == at_first.shape
+
+
+def test_keys_fly_through_the_scene_only_while_it_has_the_focus(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = open_scene(visit, f"{studied.address}?page=scene")
+    page.get_by_text("Fly", exact=True).click()
+    page.keyboard.press("w")
+    page.wait_for_timeout(300)
+    assert "camera=" not in page.url
+    page.locator(".stage canvas").focus()
+    page.keyboard.down("w")
+    until(lambda: "camera=" in page.url, "it flies")
+    page.keyboard.up("w")
+
+
+def test_half_a_million_splats(studied: Studied, visit: Callable[..., Any]) -> None:
+    random = np.random.default_rng(5)
+    scene = Scene(
+        random.normal(0, 1, (MANY, 3)).astype(np.float32) + np.float32([0, 0, 4]),
+        np.tile(np.float32([1, 0, 0, 0]), (MANY, 1)),
+        np.full((MANY, 3), np.log(0.01), np.float32),
+        np.full(MANY, 2.0, np.float32),
+        random.uniform(0, 1, (MANY, 1)).astype(np.float32),
+    )
+    content = scene.ply()
+    page = visit("about:blank")
+    page.route(re.compile(r"/scene\?"), lambda route: route.fulfill(body=content))
+    page.goto(f"{studied.address}?page=scene")
+    canvas = page.locator(".stage canvas")
+    until(lambda: canvas.count() and canvas.get_attribute("data-splats") == str(MANY), "all of them are on the canvas")
+    until(lambda: contrast(page) > 0.03, "they are to be seen")
+
+
+def test_the_scene_on_a_phone(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = open_scene(visit, f"{studied.address}?page=scene", viewport=PHONE, touch=True)
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
+    box = page.locator(".stage canvas").bounding_box()
+    assert box["width"] == PHONE["width"]
+    page.get_by_role("button", name="Ride along").tap()
+    page.locator("img.observed").wait_for()
+
+
+def test_without_webgl_the_page_says_so(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit("about:blank")
+    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    page.goto(f"{studied.address}?page=scene")
+    page.get_by_text("This browser gives no WebGL 2").wait_for()
+    assert json.loads(studied.http.get("system").text)["pid"]

@@ -33,6 +33,12 @@ def reconstruct(seen: SimulatedCamera, steps: int = 60) -> tuple[Reconstructor, 
     return reconstructor, np.inf if score.errors is None else score.errors.ate_percent, score.coverage
 
 
+def followed(reconstructor: Reconstructor) -> None:
+    """The camera is followed; poses that are less certain than usual are said to be, with the reason."""
+    status = reconstructor.status()
+    assert status.state is State.TRACK or (status.state is State.DEGRADED and status.reason), status
+
+
 @pytest.fixture(scope="module")
 def ordinary() -> float:
     """The path's error in percent on a good day."""
@@ -45,11 +51,8 @@ def test_dim_light(ordinary: float) -> None:
     """0.05 spikes a frame: one spike in twenty frames."""
     seen = camera(gain=0.11)
     reconstructor, error, coverage = reconstruct(seen)
-    status = reconstructor.status()
-    if status.state is State.TRACK:
-        assert coverage > 0.9 and error < 5 * ordinary + 2.0
-    else:
-        assert "light" in status.reason or "dark" in status.reason, status
+    followed(reconstructor)
+    assert coverage > 0.9 and error < 5 * ordinary + 2.0
 
 
 def test_fixed_pattern_of_three_percent(ordinary: float) -> None:
@@ -62,7 +65,7 @@ def test_fixed_pattern_of_three_percent(ordinary: float) -> None:
 
 def test_flicker_of_the_mains(ordinary: float) -> None:
     reconstructor, error, coverage = reconstruct(camera(lighting=Lighting(flicker=0.08, flicker_hz=100)))
-    assert reconstructor.status().state is State.TRACK
+    followed(reconstructor)
     assert coverage > 0.98 and error < 2 * ordinary + 0.5
 
 

@@ -98,11 +98,12 @@ $(VENV)/.native: $(VENV)/.packages $(NATIVE_SOURCES)
 	$(BIN)/pip install --quiet --no-build-isolation --no-deps --editable .
 	touch $@
 
-# The packages of the lock file, and the page made with them, which goes into the wheel.
+# The packages of the lock file, and the page made with them, which goes into the wheel. Not `npm ci`: it asks the lock file for the
+# optional packages of other systems, too, which npm leaves out when it writes one.
 $(NPM_CI): web/package.json web/package-lock.json
 	@node -e 'process.exit(parseInt(process.versions.node) < 20 ? 1 : 0)' 2>/dev/null && command -v npm >/dev/null || \
 	  { echo "the page needs Node 20 or newer, with npm" >&2; exit 1; }
-	cd web && npm ci --silent --no-audit --no-fund
+	cd web && npm install --no-save --silent --no-audit --no-fund
 	touch $@
 
 $(PAGE): $(NPM_CI) $(WEB)

@@ -147,7 +147,10 @@ class Odometry:
             common = np.intersect1d(start.ids, newest.ids)
             self._boot_views = 0
         count = len(self.views) - self._boot_start
-        if count < BOOT_VIEWS or ((count % 3 or count < self._boot_views) and not final):
+        if count < BOOT_VIEWS:
+            self.reason = f"{count} of {BOOT_VIEWS} views for a first map: move the camera sideways"
+            return
+        if (count % 3 or count < self._boot_views) and not final:
             return
         chosen = self._equal_flow()
         for k in chosen[1:-1]:

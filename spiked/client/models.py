@@ -505,6 +505,16 @@ class StatsOut(BaseModel):
     mean_rate: Annotated[float, Field(description="Spikes a pixel and frame.")]
 
 
+class Status(StrEnum):
+    """
+    How bad it is.
+    """
+
+    ok = "ok"
+    warning = "warning"
+    problem = "problem"
+
+
 class TimelineOut(BaseModel):
     """
     How a reconstruction went, arrays of the same length; null where a value is not known.
@@ -845,6 +855,31 @@ class DevicesOut(BaseModel):
         extra="ignore",
     )
     items: list[DeviceOut]
+
+
+class DoctorItemOut(BaseModel):
+    """
+    One thing that was looked at.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    name: str
+    status: Status
+    finding: str
+    what_to_do: Annotated[str | None, Field(description="null where all is well.")]
+
+
+class DoctorOut(BaseModel):
+    """
+    All that was looked at.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    items: list[DoctorItemOut]
 
 
 class FindingOut(BaseModel):

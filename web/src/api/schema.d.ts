@@ -564,6 +564,26 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/api/v1/doctor": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Examine Machine
+         * @description Look at USB rules, permissions, budget and port speed, the processor, and the disk; takes about a second.
+         */
+        get: operations["examine_machine_api_v1_doctor_get"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
     "/api/v1/options": {
         parameters: {
             query?: never;
@@ -1267,6 +1287,36 @@ export interface components {
             total_bytes: number;
         };
         /**
+         * DoctorItemOut
+         * @description One thing that was looked at.
+         */
+        DoctorItemOut: {
+            /**
+             * Name
+             * @example usbfs memory
+             */
+            name: string;
+            status: components["schemas"]["Status"];
+            /**
+             * Finding
+             * @example 16 MiB for all cameras, 65 MiB are wanted
+             */
+            finding: string;
+            /**
+             * What To Do
+             * @description null where all is well.
+             */
+            what_to_do: string | null;
+        };
+        /**
+         * DoctorOut
+         * @description All that was looked at.
+         */
+        DoctorOut: {
+            /** Items */
+            items: components["schemas"]["DoctorItemOut"][];
+        };
+        /**
          * FindingOut
          * @description What one check found.
          */
@@ -1821,6 +1871,12 @@ export interface components {
              */
             mean_rate: number;
         };
+        /**
+         * Status
+         * @description How bad it is.
+         * @enum {string}
+         */
+        Status: "ok" | "warning" | "problem";
         /**
          * SystemOut
          * @description The running service.
@@ -3581,7 +3637,7 @@ export interface operations {
                 frame?: number | null;
                 /** @description Times as bright. */
                 gain?: number;
-                /** @description Value shown as white; if not given it is found in the picture (X-White tells). */
+                /** @description Value shown as white; if not given it is found in the picture, and X-White tells. */
                 white?: number | null;
                 /** @description Wins over Accept; PNG if neither says. */
                 format?: components["schemas"]["ImageFormat"] | null;
@@ -5283,6 +5339,80 @@ export interface operations {
             };
             /** @description There is no such thing, or not yet. */
             404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Something in the request cannot be. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too busy, or about to end. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    examine_machine_api_v1_doctor_get: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["DoctorOut"];
+                };
+            };
+            /** @description The request cannot be read. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is needed. */
+            401: {
                 headers: {
                     [name: string]: unknown;
                 };

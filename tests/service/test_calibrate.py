@@ -44,7 +44,7 @@ def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_reconstruction_uses_a_calibration(calibration: Path, tmp_path: Path) -> None:
     camera = SimulatedCamera(SENSOR, 2, MotionKind.ARC, noise=SensorNoise(dead_share=0.005), flow_px=0.25, parallax=0.5)
-    recording = record(tmp_path / "arc.dat", SENSOR, camera.next_frames(320))
+    recording = record(tmp_path / "arc.dat", SENSOR, camera.next_frames(480))
     done = spiked("reconstruct", recording, "-o", tmp_path / "out", "--steps", 60, "--calibration", calibration)
     assert done.returncode == 0, done.stderr
     assert json.loads((tmp_path / "out" / "report.json").read_text())["options"]["calibration"] is True
@@ -61,7 +61,7 @@ def test_a_wrong_mosaic_is_said_and_corrected_on_request(tmp_path: Path) -> None
     true = Sensor(160, 96, 20000.0, mosaic=Mosaic.GRBG, intrinsics=SENSOR.intrinsics)
     said = Sensor(160, 96, 20000.0, mosaic=Mosaic.BGGR, intrinsics=SENSOR.intrinsics)
     camera = SimulatedCamera(true, 2, MotionKind.ARC, flow_px=0.25, parallax=0.5)
-    recording = record(tmp_path / "rec.dat", said, camera.next_frames(320))
+    recording = record(tmp_path / "rec.dat", said, camera.next_frames(480))
     done = spiked("reconstruct", recording, "-o", tmp_path / "wrong", "--steps", 20)
     assert "--mosaic auto" in done.stderr and "GRBG" in done.stderr
     report = json.loads((tmp_path / "wrong" / "report.json").read_text())

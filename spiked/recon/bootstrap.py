@@ -20,7 +20,7 @@ SCALE_PX = 0.3
 """Scale of the Cauchy loss: tracks on spike-aligned rates are good to about 0.05 px."""
 INLIER_PX = 1.0
 LEAST_INLIERS = 0.6
-PARALLAX_NOISES = 10.0
+PARALLAX_NOISES = 5.0
 """Parallax, in standard deviations of a place on a track, that a first map needs: with less, depths are noise."""
 SAME = 0.8
 """Correlation of inverse depths above which two outcomes are one scene."""

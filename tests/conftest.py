@@ -32,7 +32,7 @@ UNSETTLED = (
     "tests/service/api/test_schema.py",
     "tests/service/api/test_uploads.py",
 )
-"""Suites of many processes that have not yet passed as a whole on a quiet machine: with the slow ones until they have."""
+"""Suites of many processes that have not passed as a whole on a quiet machine yet: among the slow ones till then."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

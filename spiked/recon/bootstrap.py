@@ -29,6 +29,9 @@ CLEAR_T = 5.0
 CLEAR_RATIO = 1.02
 """A rival is worse when its cost is by the first ratio, or by the last with this t value over the tracks."""
 
+MORE_MOTION = "move the camera sideways"
+"""What helps whenever depths cannot be told yet."""
+
 
 class Guess(StrEnum):
     """Where a hypothesis came from."""
@@ -94,9 +97,7 @@ def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = 0.8) -> Verd
         return Verdict(None, f"only {len(views.ids)} tracks span the views; more texture or light is needed", [])
     rotation_only = _rotation_residual(views)
     if rotation_only < min_parallax_px:
-        return Verdict(
-            None, f"parallax {rotation_only:.1f} px is below {min_parallax_px:g}: move the camera sideways", []
-        )
+        return Verdict(None, f"parallax {rotation_only:.1f} px is below {min_parallax_px:g}: {MORE_MOTION}", [])
     rng = np.random.default_rng(seed)
     count = len(views.ids)
     starts: dict[Guess, Callable[[], Bundle | None]] = {
@@ -112,7 +113,7 @@ def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = 0.8) -> Verd
         tried.append(_converge(guess, bundle, rotation_only))
         wanted = PARALLAX_NOISES * tried[0].noise_px()
         if rotation_only < wanted and tried[0].inliers > LEAST_INLIERS:
-            reason = f"parallax {rotation_only:.1f} px is below {wanted:.1f} for tracks this noisy: move sideways"
+            reason = f"parallax {rotation_only:.1f} px is below {wanted:.1f} for tracks this noisy: {MORE_MOTION}"
             return Verdict(None, reason, tried, wanted)
     best = min(tried, key=lambda h: h.cost)
     rival = _converge(Guess.MIRROR, _mirrored(views, best.bundle), rotation_only)
@@ -128,7 +129,7 @@ def _judge(best: Hypothesis, tried: list[Hypothesis]) -> Verdict:
     for rival in tried:
         if rival is not best and _likeness(rival, best) < SAME and not _clearly_worse(rival, best):
             name = "its depth-reversed twin" if _likeness(rival, best) < 0 else "another one"
-            reason = f"the scene and {name} explain the tracks equally well: more motion is needed"
+            reason = f"the scene and {name} explain the tracks equally well: {MORE_MOTION}"
             return Verdict(None, reason, tried)
     return Verdict(best, "accepted", tried)
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.pose import Array, exp_so3, hat, log_so3, mean_rotation
-from spiked.recon.bootstrap import INLIER_PX, SCALE_PX, Views, bootstrap
+from spiked.recon.bootstrap import INLIER_PX, MORE_MOTION, SCALE_PX, Views, bootstrap
 from spiked.recon.bundle import Bundle
 from spiked.recon.smooth import coarsest
 from spiked.recon.tracks import Picture, Tracks, search
@@ -148,7 +148,7 @@ class Odometry:
             self._boot_views = 0
         count = len(self.views) - self._boot_start
         if count < BOOT_VIEWS:
-            self.reason = f"{count} of {BOOT_VIEWS} views for a first map: move the camera sideways"
+            self.reason = f"{count} of {BOOT_VIEWS} views for a first map: {MORE_MOTION}"
             return
         if (count % 3 or count < self._boot_views) and not final:
             return

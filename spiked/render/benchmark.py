@@ -55,7 +55,7 @@ SIZES = (Size(20_000, 400, 250), Size(50_000, 1000, 1000))
 
 def measure(sizes: tuple[Size, ...] = SIZES, repetitions: int = 10) -> list[Row]:
     """All rows: peak, steps of each size on one thread and on all cores, losses and Adam."""
-    peak = _peak_per_second()
+    peak = peak_per_second()
     rows = [Row("fused multiply-adds, one core", peak * 1e-9, "10^9/s")]
     for size in sizes:
         rows += _steps(size, repetitions, peak)
@@ -90,6 +90,7 @@ class Timing:
     """Seconds of a few repetitions."""
 
     best_s: float
+    median_s: float
     spread: float
 
 
@@ -102,22 +103,18 @@ def repeated(work: Callable[[], object], repetitions: int) -> Timing:
         work()
         times.append(time.perf_counter() - start)
     low, middle, high = np.quantile(times, (0.25, 0.5, 0.75))
-    return Timing(min(times), float((high - low) / 2 / middle))
+    return Timing(min(times), float(middle), float((high - low) / 2 / middle))
 
 
-def fastest_seconds(work: Callable[[], object], repetitions: int) -> float:
-    """The shortest of a few runs."""
-    return repeated(work, repetitions).best_s
-
-
-def _peak_per_second() -> float:
+def peak_per_second() -> float:
+    """Fused multiply-adds a second of one core, all vector lanes counted."""
     done = 0.0
 
     def work() -> None:
         nonlocal done
         done = multiply_adds(1_000_000)
 
-    seconds = fastest_seconds(work, 5)
+    seconds = repeated(work, 5).best_s
     return done / seconds
 
 
@@ -274,8 +271,8 @@ def _against_naive(repetitions: int) -> Row:
     camera, splats = scene(size)
     rasteriser = Rasteriser(camera, 1)
     rotation, centre = np.eye(3)[None], np.zeros((1, 3))
-    fast = fastest_seconds(lambda: rasteriser.forward(splats, rotation, centre), repetitions)
-    slow = fastest_seconds(lambda: naive_image(camera, splats), 1)
+    fast = repeated(lambda: rasteriser.forward(splats, rotation, centre), repetitions).best_s
+    slow = repeated(lambda: naive_image(camera, splats), 1).best_s
     return Row("forward, 400 splats, 160x100, 1 thread", fast * 1e3, "ms", slow / fast, "times as fast as NumPy")
 
 
@@ -325,4 +322,4 @@ def _fused(size: Size, repetitions: int) -> list[Row]:
         (f"D-SSIM, {where}", lambda: dssim(rendered, target)),
         (f"Adam, {size.splats // 1000}k splats", lambda: adam.step(arrays, arrays, [1e-6] * 5)),
     )
-    return [Row(name, fastest_seconds(work, repetitions) * 1e3, "ms") for name, work in timed]
+    return [Row(name, repeated(work, repetitions).best_s * 1e3, "ms") for name, work in timed]

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 from spiked_service.benchmarks import files, sustained
-from spiked_service.benchmarks.report import Machine, Row, document, text
+from spiked_service.benchmarks.report import Machine, document, text
 from spiked_service.cli import app
 from typer.testing import CliRunner
 
 from spiked.render import benchmark as renderer
+from spiked.render.benchmark import Row
 from spiked.ring import RingError
 from spiked.sensor import Sensor
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.recording import LIVE, RecordingWriter, open_recording
+from spiked.render.benchmark import Row, repeated
 from spiked.sensor import Sensor
-from spiked_service.benchmarks.report import Row, timed
 
 _BATCH = 128  # frames a write
 _PLAIN_BYTES = 1 << 20
@@ -48,7 +48,7 @@ def _writing(folder: Path, megabytes: int) -> Row:
         path.unlink()
 
     # In turn, since a disk is not the same from one minute to the next.
-    pairs = [(timed(plain, 2), timed(ours, 2)) for _ in range(3)]
+    pairs = [(repeated(plain, 2), repeated(ours, 2)) for _ in range(3)]
     ratio = float(np.median([a.median_s / b.median_s for a, b in pairs]))
     speed = batches * batch.nbytes / min(b.best_s for _, b in pairs)
     against = "of a plain write's speed, both synced, ours with CRC"
@@ -67,8 +67,8 @@ def _decoding(folder: Path) -> list[Row]:
     for name, usual in (("whole file at once", by_masks), ("frame by frame", by_frames)):
         if not (usual(path, 20) == expected).all():
             raise AssertionError(f"the benchmark's own decoder is wrong: {name}")
-        ours = timed(lambda: _by_us(path), 5)
-        theirs = timed(lambda usual=usual: usual(path, 400), 2)  # type: ignore[misc]
+        ours = repeated(lambda: _by_us(path), 5)
+        theirs = repeated(lambda usual=usual: usual(path, 400), 2)  # type: ignore[misc]
         found.append(
             Row(
                 f"decode .dat to images, 400x250, {name}",

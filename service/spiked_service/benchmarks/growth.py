@@ -7,8 +7,8 @@ import numpy as np
 
 from spiked.blocks import reduce_blocks
 from spiked.render import benchmark as renderer
+from spiked.render.benchmark import Row, repeated
 from spiked.sensor import Sensor
-from spiked_service.benchmarks.report import Row, timed
 
 _MEMORY = """
 import resource, sys
@@ -54,6 +54,6 @@ def _frames() -> renderer.Scaling:
             for first in range(0, frames, len(chunk)):
                 reduce_blocks(chunk, sensor, first, out=out)
 
-        return timed(work, 3).best_s
+        return repeated(work, 3).best_s
 
     return renderer.Scaling("frames reduced", list(map(float, counts)), [seconds(n) for n in counts])

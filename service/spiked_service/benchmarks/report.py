@@ -1,54 +1,15 @@
-"""Rows of a benchmark, and the machine that they were measured on."""
+"""The table of a benchmark, and the machine that it was measured on."""
 
 import os
 import platform
-import statistics
-import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from spiked.native._raster import multiply_adds
 
-
-@dataclass(frozen=True)
-class Row:
-    """One measurement."""
-
-    name: str
-    value: float
-    unit: str
-    ratio: float | None = None
-    """A number that can be compared between machines; `against` says with what."""
-    against: str = ""
-    target: str = ""
-    """What the ratio or the value should reach, where that is agreed."""
-    spread: float | None = None
-    """Half the distance between the quartiles over the median, where it was measured more than twice."""
-    threads: int = 1
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Seconds of one piece of work, measured a few times."""
-
-    best_s: float
-    median_s: float
-    spread: float
-
-
-def timed(work: Callable[[], object], repetitions: int = 7) -> Timing:
-    """After one run to warm up."""
-    work()
-    times = []
-    for _ in range(max(2, repetitions)):
-        begin = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - begin)
-    low, middle, high = statistics.quantiles(times, n=4)
-    return Timing(min(times), middle, (high - low) / 2 / middle)
+from spiked.render.benchmark import Row, peak_per_second, repeated
+from spiked.render.cpu import usable_cores
 
 
 @dataclass(frozen=True)
@@ -69,14 +30,11 @@ class Machine:
     def here(cls) -> "Machine":
         """This machine, with its peaks measured."""
         load = os.getloadavg()[0]
-        done = float(multiply_adds(1000))
-        peak = timed(lambda: multiply_adds(500_000), 5).best_s
         source = np.ones(64 << 20, np.uint8)
         target = np.empty_like(source)
-        copy = timed(lambda: np.copyto(target, source), 5).best_s
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        copy = repeated(lambda: np.copyto(target, source), 5).best_s
         system = f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"
-        return cls(_processor(), cores, system, load, done * 500 / peak, source.nbytes / copy)
+        return cls(_processor(), usable_cores(), system, load, peak_per_second(), source.nbytes / copy)
 
 
 def _processor() -> str:

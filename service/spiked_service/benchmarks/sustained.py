@@ -12,9 +12,9 @@ import numpy as np
 
 from spiked.blocks import reduce_blocks
 from spiked.recording import LIVE, RecordingWriter
+from spiked.render.benchmark import Row
 from spiked.ring import End, EndReason, Frames, Gap, Policy, RingError, RingReader, RingWriter
 from spiked.sensor import Sensor
-from spiked_service.benchmarks.report import Row
 
 _START_S = 30.0
 _PREVIEW_S = 1 / 30

@@ -10,10 +10,11 @@ from spiked_driver.pcie import benchmark_pcie
 
 from spiked import blocks
 from spiked.render import benchmark as renderer
+from spiked.render.benchmark import Row
 from spiked.ring import benchmark as ring
 from spiked.sensor import Sensor
 from spiked_service.benchmarks import files, growth, sustained
-from spiked_service.benchmarks.report import Machine, Row, document, text
+from spiked_service.benchmarks.report import Machine, document, text
 from spiked_service.console import output
 
 
@@ -31,11 +32,7 @@ def bench(
     with what was aimed at. Times are the best or the median of a few runs; their spread stands beside them.
     """
     machine = Machine.here()
-    rows = [*_kernels(), *files.rows(folder), *sustained.rows(seconds, folder)]
-    rows += [
-        Row(row.name, row.value, row.unit, row.ratio, row.against, row.target, row.spread, row.threads)
-        for row in renderer.measure()
-    ]
+    rows = [*_kernels(), *files.rows(folder), *sustained.rows(seconds, folder), *renderer.measure()]
     if scaling:
         rows += growth.rows()
     for line in text(machine, rows):

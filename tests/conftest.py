@@ -21,17 +21,7 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 START_S = 60.0
 
 
-UNSETTLED = (
-    "tests/usb/",
-    "tests/web/",
-    "tests/service/test_service.py",
-    "tests/service/test_captures.py",
-    "tests/service/test_soak.py",
-    "tests/service/test_chaos.py",
-    "tests/service/test_reconstructions.py",
-    "tests/service/api/test_schema.py",
-    "tests/service/api/test_uploads.py",
-)
+UNSETTLED = ("tests/web/",)
 """Suites of many processes that have not passed as a whole on a quiet machine yet: among the slow ones till then."""
 
 

@@ -259,6 +259,24 @@ def test_a_writer_that_can_wait_has_room_while_no_reader_would_lose(writer: Ring
     skipping.close()
 
 
+def test_a_successor_may_begin_before_what_a_killed_reader_gave_back(writer: RingWriter) -> None:
+    slots = writer.geometry.slots
+    recorder = attach(writer, Policy.PRIORITY)
+    for _ in range(slots):
+        put(writer, 8)
+        drain(recorder)
+    given_back = recorder.status().readers[0].next_frame
+    while writer.has_room():
+        put(writer, 8)
+    recorder.close()  # what it still had in its memory is lost with it
+    start = given_back - 8 * (slots // 4)
+    successor = RingReader.attach(writer.name, Policy.PRIORITY, "test", start)
+    before, *items = drain(successor)
+    assert before == Gap(0, start, Cause.RING)
+    assert items and [type(item) for item in items] == [Frames] * len(items)
+    successor.close()
+
+
 def test_status_is_visible_from_outside_and_outlives_the_name() -> None:
     with RingWriter.create(SENSOR, slots=8) as writer:
         ring = Ring.attach(writer.name)

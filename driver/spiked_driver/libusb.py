@@ -5,12 +5,15 @@ reason why the version is pinned. Layouts and codes are those of libusb 1.0's pu
 """
 
 import ctypes
+import time
 from collections.abc import Callable
 from enum import IntEnum
+from functools import cache
 from typing import Any
 
 import usb.backend.libusb1
 import usb.core
+import usb.libloader
 
 from spiked.errors import SourceError
 from spiked_driver.usb_cameras import UsbCamera
@@ -18,6 +21,8 @@ from spiked_driver.usb_cameras import UsbCamera
 Callback = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 _NO_MEMORY = -11
 _BULK = 2
+_ATTEMPTS = 5
+_AGAIN_S = 0.02
 
 
 class Status(IntEnum):
@@ -62,6 +67,28 @@ class OutOfUsbMemoryError(SourceError):
     """The kernel takes no more transfers: its limit is reached."""
 
 
+class NoContextError(SourceError):
+    """libusb is there but cannot begin now: it may in a moment."""
+
+
+@cache
+def load_libusb() -> Any:
+    """The library, prepared by pyusb. Raises SourceError if it is not installed.
+
+    pyusb's own `get_backend` answers None for every trouble, that of a moment too, and makes a context that nobody
+    uses.
+    """
+    try:
+        library = usb.backend.libusb1._load_library()
+    except usb.libloader.LibraryException as error:
+        raise SourceError(
+            f"libusb 1.0 is not installed ({error}): install it (Debian: apt install libusb-1.0-0)"
+        ) from error
+    usb.backend.libusb1._setup_prototypes(library)
+    usb.backend.libusb1._lib = library  # where pyusb looks for the texts of errors
+    return library
+
+
 class UsbContext:
     """A libusb context with nothing in it but one camera.
 
@@ -69,11 +96,9 @@ class UsbContext:
     """
 
     def __init__(self) -> None:
-        backend = usb.backend.libusb1.get_backend()
-        if backend is None:
-            raise SourceError("libusb 1.0 is not installed: install it (Debian: apt install libusb-1.0-0)")
-        self._lib: Any = backend.lib
-        self._backend: Any = type(backend)(backend.lib)
+        """Raises SourceError if there is no libusb, NoContextError if it does not begin, after a few attempts."""
+        self._lib: Any = load_libusb()
+        self._backend: Any = _begun(self._lib)
         self._device: usb.core.Device | None = None
         self._submit = self._function("libusb_submit_transfer", ctypes.c_int, ctypes.c_void_p)
         self._cancel = self._function("libusb_cancel_transfer", ctypes.c_int, ctypes.c_void_p)
@@ -139,3 +164,15 @@ class UsbContext:
         """A function object of our own: argument types set on pyusb's would be pyusb's too."""
         function: Callable[..., Any] = ctypes.CFUNCTYPE(result, *arguments)((name, self._lib))
         return function
+
+
+def _begun(library: Any) -> Any:
+    """pyusb's backend with a new context: where udev is just telling others of cameras, beginning can fail once."""
+    for attempt in range(_ATTEMPTS):
+        try:
+            return usb.backend.libusb1._LibUSB(library)
+        except usb.core.USBError as error:
+            if attempt == _ATTEMPTS - 1:
+                raise NoContextError(f"libusb does not begin: {error.strerror}") from error
+            time.sleep(_AGAIN_S * (attempt + 1))
+    raise AssertionError("unreachable")

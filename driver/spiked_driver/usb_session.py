@@ -20,7 +20,7 @@ from spiked_driver.ft60x import (
     SESSION_OUT,
     ChipConfiguration,
 )
-from spiked_driver.libusb import UsbContext
+from spiked_driver.libusb import NoContextError, UsbContext
 from spiked_driver.transfers import AsynchronousReads, Buffers, Reads, SynchronousReads
 from spiked_driver.usb_cameras import NotUsableError, UsbCamera
 
@@ -41,7 +41,10 @@ class UsbSession:
         problem = camera.speed_problem() or camera.permission_problem()
         if problem:
             raise NotUsableError(problem)
-        self._context = UsbContext()
+        try:
+            self._context = UsbContext()
+        except NoContextError as error:
+            raise NotThereError(f"the camera at {camera.port} cannot be opened: {error}") from error
         try:
             self._device = self._open()
             self.chip = self._read_configuration()

@@ -1,6 +1,6 @@
 """What can be chosen about a reconstruction, as it goes over HTTP and into workers; its JSON schema describes it."""
 
-from pydantic import BaseModel, ConfigDict, Field, StrictBool
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, StrictInt
 
 from spiked.recon import Options
 from spiked.sensor import Intrinsics
@@ -11,10 +11,10 @@ class IntrinsicsOption(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    fx: float = Field(gt=0)
-    fy: float = Field(gt=0)
-    cx: float
-    cy: float
+    fx: StrictFloat = Field(gt=0)
+    fy: StrictFloat = Field(gt=0)
+    cx: StrictFloat
+    cy: StrictFloat
 
     def intrinsics(self) -> Intrinsics:
         """The same for the library."""
@@ -26,17 +26,17 @@ class ReconstructionOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", json_schema_extra={"examples": [{"steps": 4000, "seed": 0}]})
 
-    steps: int = Field(
+    steps: StrictInt = Field(
         default=4000, ge=0, le=200_000, description="Gradient steps of the refinement after the last frame."
     )
-    seed: int = Field(default=0, ge=0, le=2**32 - 1, description="Same input, options and seed: same result.")
-    window_frames: int | None = Field(
+    seed: StrictInt = Field(default=0, ge=0, le=2**32 - 1, description="Same input, options and seed: same result.")
+    window_frames: StrictInt | None = Field(
         default=None, ge=2, le=256, description="Frames of a view; follows the motion (8 to 64) if not given."
     )
-    threads: int | None = Field(
+    threads: StrictInt | None = Field(
         default=None, ge=1, le=256, description="Threads of the rasteriser; all cores if not given."
     )
-    max_views: int = Field(
+    max_views: StrictInt = Field(
         default=400, ge=20, le=5000, description="Views kept for mapping; beyond it older ones thin out."
     )
     refine_poses: StrictBool = Field(default=True, description="Whether the map corrects the trajectory.")

@@ -83,8 +83,12 @@ class Reconstructions:
 
     def start(self) -> None:
         """Begin to work off the queue: to be called once, when interrupted recordings are whole again."""
-        self._thread = threading.Thread(target=self._run_queue, name="queue", daemon=True)
-        self._thread.start()
+        with self._lock:
+            if self._closing:  # the service has ended meanwhile
+                return
+            thread = threading.Thread(target=self._run_queue, name="queue", daemon=True)
+            thread.start()
+            self._thread = thread
 
     def _take_up(self) -> None:
         """What an earlier service left running begins again from its recording; what waited waits on."""
@@ -271,8 +275,10 @@ class Reconstructions:
         for child in children:
             if child is not None:
                 child.kill_after(timeout_s)
-        if self._thread is not None:
-            self._thread.join()
+        with self._lock:
+            thread = self._thread
+        if thread is not None:
+            thread.join()
 
     def retry_saving(self) -> None:
         """Write down what a full disk did not take."""

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, StrictInt, ValidationError
 
 from spiked.errors import ConfigurationError, RecordingError
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
@@ -21,9 +21,9 @@ class _Strict(BaseModel):
 class Gap(_Strict):
     """Frames of the capture that are missing from the file."""
 
-    first: int = Field(ge=0)
+    first: StrictInt = Field(ge=0)
     """Index in the capture, counted from the recording's first frame."""
-    count: int = Field(gt=0)
+    count: StrictInt = Field(gt=0)
     cause: str
     """Where they were lost: device, usb, ring or disk."""
 
@@ -31,17 +31,17 @@ class Gap(_Strict):
 class ClockPair(_Strict):
     """The host's clock when a frame arrived."""
 
-    frame: int = Field(ge=0)
-    unix_ns: int
+    frame: StrictInt = Field(ge=0)
+    unix_ns: StrictInt
 
 
 class Pinhole(_Strict):
     """Intrinsics as sidecars say them, in pixels."""
 
-    fx: float = Field(gt=0)
-    fy: float = Field(gt=0)
-    cx: float
-    cy: float
+    fx: StrictFloat = Field(gt=0)
+    fy: StrictFloat = Field(gt=0)
+    cx: StrictFloat
+    cy: StrictFloat
 
 
 class Sidecar(BaseModel):
@@ -50,22 +50,22 @@ class Sidecar(BaseModel):
     model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
 
     format: Layout
-    width: int = Field(gt=0, strict=True)
-    height: int = Field(gt=0, strict=True)
-    frame_rate: float = Field(gt=0)
+    width: StrictInt = Field(gt=0)
+    height: StrictInt = Field(gt=0)
+    frame_rate: StrictFloat = Field(gt=0)
     """Frames a second."""
-    frames: int | None = Field(ge=0)
+    frames: StrictInt | None = Field(ge=0)
     """Whole frames in the file; null while the recording runs, and so after a crash."""
     bit_order: BitOrder
-    flipped: bool = Field(strict=True)
+    flipped: StrictBool
     """Rows are stored bottom-up."""
     cfa: Mosaic | None = None
     """Colour pattern of the upright image."""
     intrinsics: Pinhole | None = None
-    pixel_centre: float = Field(0.5, ge=0, le=0.5)
+    pixel_centre: StrictFloat = Field(0.5, ge=0, le=0.5)
     """Where the intrinsics put the centre of the first pixel."""
     note: str = ""
-    first_frame: int = Field(default=0, ge=0)
+    first_frame: StrictInt = Field(default=0, ge=0)
     """Index in the capture of the file's first frame."""
     gaps: tuple[Gap, ...] = ()
     clock: tuple[ClockPair, ...] = ()

@@ -157,8 +157,11 @@ class RingWriter:
 
     def _holds_back(self, reader: ReaderPlace) -> bool:
         counters = reader.counters
+        # Half the ring: a reader that was killed may have given back slots that it had not dealt with (an eighth, say),
+        # and its successor needs to find them within the lease.
+        allowed = min(reader.lease_slots, self.geometry.slots // 2)
         return reader.policy is not Policy.LATEST and (
-            self._reserved - counters.next_slot >= reader.lease_slots
+            self._reserved - counters.next_slot >= allowed
             or self._counters.entries - counters.next_entry >= self.geometry.log_places // 2
         )
 

@@ -13,8 +13,8 @@ import time
 from typing import Any
 
 import numpy as np
-import usb.backend.libusb1
 from spiked_driver import Chunk, open_source
+from spiked_driver.libusb import load_libusb
 
 from spiked.errors import SpikedError
 from spiked.ring import Condition, Gap
@@ -34,7 +34,7 @@ def main() -> None:
     stop, slow = threading.Event(), threading.Event()
     threading.Thread(target=_listen, args=(stop, slow), daemon=True).start()
     if len(sys.argv) > 2:
-        usb.backend.libusb1.get_backend()  # nobody may not look for libraries everywhere
+        load_libusb()  # nobody may not look for libraries everywhere
         os.setuid(int(sys.argv[2]))
     try:
         source = open_source(sys.argv[1])

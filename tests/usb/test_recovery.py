@@ -1,6 +1,8 @@
 """Whatever befalls the camera, the driver says so, accounts for every frame, and goes on when the camera is back."""
 
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -237,3 +239,11 @@ def test_single_reads_deliver_the_same(cameras: Cameras, drive: Drive, pictures:
     driver.wait_for_frames(500)
     told = driver.stop()
     check_sent(told, rig.report())
+
+
+def test_programs_that_begin_at_once_all_begin(cameras: Cameras, pictures: Path) -> None:
+    """libusb_init fails now and then where another program registers with udev at the same moment."""
+    rig = cameras(settings(pictures), settings(pictures, port="2-2"))
+    code = "from spiked_driver.libusb import UsbContext\nfor _ in range(30): UsbContext().close()"
+    several = [subprocess.Popen([sys.executable, "-c", code], env=dict(rig.environment)) for _ in range(3)]
+    assert [one.wait(60) for one in several] == [0, 0, 0]

@@ -67,7 +67,7 @@ TRAJECTORY_RESPONSES: dict[int | str, dict[str, Any]] = {
         "content": {
             "application/json": _TRAJECTORY,
             "text/plain": TEXT,
-            "application/vnd.nerfstudio+json": TEXT,
+            "application/vnd.nerfstudio+json": {"schema": {"type": "object", "additionalProperties": True}},
             "application/zip": BINARY,
         },
     },

@@ -15,7 +15,10 @@ from spiked_service.worker import Link
 
 _BLOCK_FRAMES = 8
 _SLOTS_UNHURRIED = 64
-"""A source that waits stays this little ahead of the slowest consumer, so that what is seen live belongs together."""
+"""A source that waits stays this little ahead of the slowest consumer, so that what is seen live belongs together.
+
+Four times what the recorder holds at most and has not written (`_BATCH_BLOCKS`): its successor begins so far back.
+"""
 _MOURNING_S = 15.0
 """A source that waits holds its frames so long for the successor of a consumer that was killed."""
 _HISTORY_SHARE = 0.4

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,20 +35,33 @@ class Service:
         return self.client.wait_for_capture(started.id, 120)
 
 
-@pytest.fixture(scope="package")
-def service(tmp_path_factory: pytest.TempPathFactory, daemon_class: Any) -> Iterator[Service]:
-    """One for all tests of this folder."""
-    folder = tmp_path_factory.mktemp("service")
+@contextmanager
+def running(folder: Path, daemon_class: Any) -> Iterator[Service]:
+    """A daemon on that folder."""
     daemon = daemon_class(folder=folder)
     one = Service(daemon)
-    yield one
-    one.client.close()
-    daemon.close()
+    try:
+        yield one
+    finally:
+        one.client.close()
+        daemon.close()
+
+
+@pytest.fixture(scope="package")
+def service(tmp_path_factory: pytest.TempPathFactory, daemon_class: Any) -> Iterator[Service]:
+    """One for all tests of this folder but those that leave it full of jobs."""
+    with running(tmp_path_factory.mktemp("service"), daemon_class) as one:
+        yield one
 
 
 @pytest.fixture(scope="package")
 def done(service: Service) -> CaptureOut:
     """A capture that is over, with a recording and a reconstruction."""
+    return reconstructed(service)
+
+
+def reconstructed(service: Service) -> CaptureOut:
+    """A capture that is over, once its reconstruction has published something."""
     capture = service.capture(name="by hand", notes="a first one")
     assert (capture.state, capture.reason) == ("complete", "")
     deadline = time.monotonic() + 60

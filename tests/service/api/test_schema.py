@@ -2,10 +2,32 @@
 
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from .conftest import Service, reconstructed, running
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, daemon_class: Any) -> Iterator[Service]:
+    """A daemon of its own: it is left with jobs that nobody else shall wait behind."""
+    with running(tmp_path_factory.mktemp("fuzzed"), daemon_class) as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def done(service: Service) -> Any:
+    """A capture in it that is over, with a reconstruction."""
+    return reconstructed(service)
+
+
+@pytest.fixture(scope="module")
+def job(done: Any) -> str:
+    """The id of its reconstruction."""
+    return str(done.reconstruction_ids[0])
 
 
 def fuzz(service: Any, folder: Path, known: dict[str, str], *options: str) -> None:

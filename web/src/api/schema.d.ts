@@ -3940,7 +3940,9 @@ export interface operations {
                 content: {
                     "application/json": components["schemas"]["TrajectoryOut"];
                     "text/plain": string;
-                    "application/vnd.nerfstudio+json": string;
+                    "application/vnd.nerfstudio+json": {
+                        [key: string]: unknown;
+                    };
                     "application/zip": string;
                 };
             };
@@ -4833,7 +4835,9 @@ export interface operations {
                 content: {
                     "application/json": components["schemas"]["TrajectoryOut"];
                     "text/plain": string;
-                    "application/vnd.nerfstudio+json": string;
+                    "application/vnd.nerfstudio+json": {
+                        [key: string]: unknown;
+                    };
                     "application/zip": string;
                 };
             };

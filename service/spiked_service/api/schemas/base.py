@@ -4,7 +4,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, Generic, TypeVar
 
 from fastapi import Query
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StrictFloat
 
 from spiked.sensor import Intrinsics
 
@@ -16,7 +16,10 @@ LARGEST_INTEGER = 2**53 - 1
 
 
 class In(BaseModel):
-    """What comes in: unknown fields and numbers that are not finite are refused."""
+    """What comes in: unknown fields and numbers that are not finite are refused.
+
+    Its numbers and truth values are Pydantic's strict ones: `"1"`, `true` and `1` are three different things.
+    """
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -52,7 +55,7 @@ def _one_line(text: str) -> str:
 Name = Annotated[str, Field(max_length=200), AfterValidator(_one_line)]
 Notes = Annotated[str, Field(max_length=20_000), AfterValidator(_printable)]
 Id = Annotated[str, Field(description="UUID version 7: ids sort by time.", examples=[ID_EXAMPLE])]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Finite = Annotated[StrictFloat, Field(allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
 Quaternion = tuple[Finite, Finite, Finite, Finite]
 
@@ -78,10 +81,10 @@ class IntrinsicsModel(In):
 
     model_config = example(fx=420.0, fy=420.0, cx=200.0, cy=125.0)
 
-    fx: float = Field(gt=0, le=1e6)
-    fy: float = Field(gt=0, le=1e6)
-    cx: float = Field(ge=-1e6, le=1e6)
-    cy: float = Field(ge=-1e6, le=1e6)
+    fx: StrictFloat = Field(gt=0, le=1e6)
+    fy: StrictFloat = Field(gt=0, le=1e6)
+    cx: StrictFloat = Field(ge=-1e6, le=1e6)
+    cy: StrictFloat = Field(ge=-1e6, le=1e6)
 
     def intrinsics(self) -> Intrinsics:
         """The same for the library."""

@@ -3,7 +3,7 @@
 from datetime import datetime
 from typing import Any, Self
 
-from pydantic import ConfigDict, Field, StrictBool, model_validator
+from pydantic import ConfigDict, Field, StrictBool, StrictFloat, StrictInt, model_validator
 
 from spiked.ring import DeviceState, Policy
 from spiked.sensor import Mosaic, Sensor
@@ -100,7 +100,9 @@ class ArmRequest(In):
 
     model_config = example(pretrigger_s=0.5)
 
-    pretrigger_s: float = Field(1.0, ge=0, le=60, description="How far back a capture shall be able to begin, seconds.")
+    pretrigger_s: StrictFloat = Field(
+        1.0, ge=0, le=60, description="How far back a capture shall be able to begin, seconds."
+    )
 
 
 class CaptureRequest(In):
@@ -121,11 +123,15 @@ class CaptureRequest(In):
     device: str | None = Field(
         None, min_length=1, max_length=4096, description="Id of a device, instead of a source; `GET devices`."
     )
-    frames: int | None = Field(
+    frames: StrictInt | None = Field(
         None, gt=0, le=LARGEST_INTEGER, description="Length; until the source ends or is stopped if not given."
     )
-    seconds: float | None = Field(None, gt=0, le=1e7, description="Length in seconds of the camera, instead of frames.")
-    pretrigger_s: float = Field(0.0, ge=0, le=60, description="Begin so much earlier, from an armed device's ring.")
+    seconds: StrictFloat | None = Field(
+        None, gt=0, le=1e7, description="Length in seconds of the camera, instead of frames."
+    )
+    pretrigger_s: StrictFloat = Field(
+        0.0, ge=0, le=60, description="Begin so much earlier, from an armed device's ring."
+    )
     name: Name = ""
     notes: Notes = ""
     record: StrictBool = Field(True, description="Keep the frames in the data folder.")

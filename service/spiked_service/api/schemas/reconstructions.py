@@ -2,7 +2,7 @@
 
 from datetime import datetime
 
-from pydantic import Field
+from pydantic import Field, StrictInt
 
 from spiked.recon import State
 from spiked_service.api.schemas.base import ID_EXAMPLE, Id, In, Out, PageOut, example
@@ -18,7 +18,7 @@ class ReconstructionRequest(In):
 
     capture_id: str = Field(min_length=1, max_length=64)
     options: ReconstructionOptions = Field(default_factory=ReconstructionOptions)
-    priority: int = Field(0, ge=-100, le=100, description="Higher ones run earlier; live captures go before all.")
+    priority: StrictInt = Field(0, ge=-100, le=100, description="Higher ones run earlier; live captures go before all.")
 
 
 class RestartRequest(In):

@@ -2,7 +2,7 @@
 
 from datetime import datetime
 
-from pydantic import ConfigDict, Field, StrictBool
+from pydantic import ConfigDict, Field, StrictBool, StrictFloat, StrictInt
 
 from spiked.recording.sidecar import Sidecar
 from spiked.sensor import BitOrder, Layout, Mosaic
@@ -14,9 +14,9 @@ MAX_UPLOAD_BYTES = 1 << 42
 class GeometryModel(In):
     """What the recording holds, where there is no sidecar."""
 
-    width: int | None = Field(None, ge=1, le=16384)
-    height: int | None = Field(None, ge=1, le=16384)
-    frame_rate_hz: float | None = Field(None, gt=0, le=1e7)
+    width: StrictInt | None = Field(None, ge=1, le=16384)
+    height: StrictInt | None = Field(None, ge=1, le=16384)
+    frame_rate_hz: StrictFloat | None = Field(None, gt=0, le=1e7)
     layout: Layout | None = None
     bit_order: BitOrder | None = None
     flipped: StrictBool | None = Field(None, description="Rows are stored bottom-up.")
@@ -49,7 +49,7 @@ class UploadRequest(In):
 
     name: Name = Field(min_length=1, description="What the capture will be called.")
     notes: Notes = ""
-    bytes: int = Field(ge=1, le=MAX_UPLOAD_BYTES, description="Size of the whole `.dat`.")
+    bytes: StrictInt = Field(ge=1, le=MAX_UPLOAD_BYTES, description="Size of the whole `.dat`.")
     sidecar: UploadSidecar | None = None
     geometry: GeometryModel | None = Field(None, description="Wins over the sidecar.")
     sha256: str | None = Field(

@@ -4,7 +4,7 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, StrictFloat, StrictInt, model_validator
 
 from spiked.pose import rotation_of
 from spiked_service.api.schemas.base import Finite, In, IntrinsicsModel, Quaternion, Vector, examples
@@ -29,7 +29,9 @@ class CameraModel(In):
     c2w: tuple[Row, Row, Row, Row] | None = Field(None, description="4x4, rows.")
     position: Vector | None = None
     quaternion_wxyz: Quaternion | None = Field(None, description="Of any length but zero.")
-    frame: int | None = Field(None, ge=0, le=2**53 - 1, description="As the reconstructed camera was at this frame.")
+    frame: StrictInt | None = Field(
+        None, ge=0, le=2**53 - 1, description="As the reconstructed camera was at this frame."
+    )
 
     @model_validator(mode="after")
     def _one_pose(self) -> Self:
@@ -64,9 +66,9 @@ class PathModel(In):
 
     model_config = examples({"count": 24}, {"from_s": 0.01, "to_s": 0.05, "count": 8})
 
-    count: int = Field(ge=1, le=MAX_VIEWS)
-    from_s: float | None = Field(None, ge=0, le=1e9, description="From its beginning if not given.")
-    to_s: float | None = Field(None, ge=0, le=1e9, description="To its end if not given.")
+    count: StrictInt = Field(ge=1, le=MAX_VIEWS)
+    from_s: StrictFloat | None = Field(None, ge=0, le=1e9, description="From its beginning if not given.")
+    to_s: StrictFloat | None = Field(None, ge=0, le=1e9, description="To its end if not given.")
 
 
 class ViewRequest(In):
@@ -81,14 +83,14 @@ class ViewRequest(In):
     camera: CameraModel | None = None
     cameras: list[CameraModel] | None = Field(None, min_length=1, max_length=MAX_VIEWS)
     path: PathModel | None = None
-    width: int | None = Field(None, ge=1, le=MAX_SIDE, description="Pixels; the sensor's own if not given.")
-    height: int | None = Field(None, ge=1, le=MAX_SIDE)
+    width: StrictInt | None = Field(None, ge=1, le=MAX_SIDE, description="Pixels; the sensor's own if not given.")
+    height: StrictInt | None = Field(None, ge=1, le=MAX_SIDE)
     intrinsics: IntrinsicsModel | None = Field(
         None,
         description="Optics of the pictures; if not given the capture's own, scaled to the width, the height taken "
         "from or added to the middle.",
     )
-    background: tuple[float, float, float] = Field(
+    background: tuple[StrictFloat, StrictFloat, StrictFloat] = Field(
         (0.0, 0.0, 0.0), description="Red, green and blue behind the scene; 1 is white."
     )
     output: Output = Field(
@@ -96,7 +98,7 @@ class ViewRequest(In):
         description="color; depth along the camera's axis in the scene's unit of length, 0 where nothing is; "
         "alpha, 0 to 1.",
     )
-    white: float | None = Field(
+    white: StrictFloat | None = Field(
         None,
         gt=0,
         le=1e9,

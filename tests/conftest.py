@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -37,9 +38,14 @@ class Daemon:
     """`spiked serve` as a process of its own, and a client to talk to it."""
 
     def __init__(
-        self, *arguments: str, folder: Path, token: str | None = None, seen: VirtualCameras | None = None
+        self,
+        *arguments: str,
+        folder: Path,
+        token: str | None = None,
+        seen: VirtualCameras | None = None,
+        under: tuple[str, ...] = (),
     ) -> None:
-        command = [sys.executable, "-m", "spiked_service", "serve", "--port", "0"]
+        command = [*under, sys.executable, "-m", "spiked_service", "serve", "--port", "0"]
         command += ["--runtime", str(folder / "runtime"), "--data", str(folder / "data")]
         command += ["--set", f"source_folders={folder.parent}"]
         self.process = subprocess.Popen(
@@ -81,11 +87,14 @@ def daemon_class() -> type[Daemon]:
 
 @pytest.fixture
 def daemon(tmp_path: Path) -> Iterator[Callable[..., Daemon]]:
-    """Starts daemons with the given arguments, and ends them after the test; `seen` are cameras that they find."""
+    """Starts daemons with the given arguments, and ends them after the test.
+
+    `seen` are cameras that they find, `under` is a command that starts another, as `nice` does.
+    """
     started: list[Daemon] = []
 
-    def start(*arguments: str, token: str | None = None, seen: VirtualCameras | None = None) -> Daemon:
-        started.append(Daemon(*arguments, folder=tmp_path, token=token, seen=seen))
+    def start(*arguments: str, **more: Any) -> Daemon:
+        started.append(Daemon(*arguments, folder=tmp_path, **more))
         return started[-1]
 
     yield start

@@ -277,6 +277,70 @@ def test_a_successor_may_begin_before_what_a_killed_reader_gave_back(writer: Rin
     successor.close()
 
 
+_DYING = """
+import os, signal, sys
+from spiked.ring import RingWriter
+from spiked.sensor import Sensor
+writer = RingWriter.create(Sensor(64, 8, 20_000.0), slots=16)
+for count in (8, 8, 5):
+    writer.acquire()[:] = 1
+    writer.commit(count)
+writer.acquire()[:] = 2
+print(writer.name, flush=True)
+sys.stdin.readline()
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.fixture
+def dying() -> Iterator["subprocess.Popen[str]"]:
+    """A writer that has published 21 frames, begun a slot, and is killed when it reads a line."""
+    command = [sys.executable, "-c", _DYING]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        yield process
+        process.kill()
+    clean_stale()
+
+
+def test_a_ring_that_is_held_is_gone_on_with(dying: "subprocess.Popen[str]") -> None:
+    assert dying.stdout is not None
+    name = dying.stdout.readline().strip()
+    outside, reader = Ring.attach(name), RingReader.attach(name, Policy.LOSSLESS, "test", 0)
+    dying.communicate("die\n")
+    assert outside.hold("it died")
+    assert clean_stale() == []
+    counts = []
+    while isinstance(item := reader.next(0.7), Frames):
+        counts.append(item.count)
+    assert (counts, item) == ([8, 8, 5], None)
+    assert outside.status().writer.condition == Condition(DeviceState.LOST, "it died")
+    successor = RingWriter.take_over(name)
+    successor.gap(16, Cause.USB)
+    successor.acquire()[:] = 3
+    successor.commit(3)
+    assert reader.next(0) == Gap(21, 16, Cause.USB)
+    item = reader.next(0)
+    assert isinstance(item, Frames) and (item.first, item.count) == (37, 3) and (item.data == 3).all()
+    successor.close(EndReason.FINISHED)
+    assert reader.next(0) == End(40, EndReason.FINISHED)
+    assert not outside.hold("it ended")
+    with pytest.raises(RingError):
+        RingWriter.take_over(name)
+
+
+def test_a_ring_that_is_given_up_ends_at_once(dying: "subprocess.Popen[str]") -> None:
+    assert dying.stdout is not None
+    name = dying.stdout.readline().strip()
+    outside, reader = Ring.attach(name), RingReader.attach(name, Policy.LATEST, "test")
+    dying.communicate("die\n")
+    assert outside.hold("it died")
+    while reader.next(0) is not None:
+        pass
+    outside.give_up()
+    assert reader.next(0.3) == End(21, EndReason.WRITER_DIED)
+    assert clean_stale() == [name]
+
+
 def test_status_is_visible_from_outside_and_outlives_the_name() -> None:
     with RingWriter.create(SENSOR, slots=8) as writer:
         ring = Ring.attach(writer.name)

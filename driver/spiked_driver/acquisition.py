@@ -1,5 +1,6 @@
 """The loop between a source and a ring: it fills slots and publishes them, and does nothing else."""
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
@@ -8,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.errors import SourceError
-from spiked.ring import Condition, DeviceState, End, EndReason, Gap, RingWriter
+from spiked.ring import Cause, Condition, DeviceState, End, EndReason, Gap, RingWriter
 from spiked_driver.source import READ_WAIT_S, Chunk, Source
 
 
@@ -27,15 +28,19 @@ def acquire(
     *,
     limit_frames: int | None = None,
     consumers: int = 0,
+    died_s: float | None = None,
 ) -> EndReason:
     """Open the source, move its frames and gaps into the ring until it ends, and close it.
+
+    With `died_s`, by the monotonic clock, it goes on for a process that died then: what its source, which had indices
+    of its own, did not deliver up to the first frame is a loss of the host by the clock.
 
     Ends after `limit_frames` frames, lost ones included, or within a moment after `stop` is set. Waits for `consumers`
     readers before it opens the source, so that they miss none. Ends the capture in the ring in every case; the writer
     stays open. Errors of the source end the capture as failed, are published as the reason of the condition, and are
     raised.
     """
-    filler = _Filler(writer, limit_frames)
+    filler = _Filler(writer, limit_frames, died_s)
     try:
         # A camera sends from the moment it is open: what came while nobody is there to take it would be lost.
         reason = _wait_for_consumers(source, writer, stop, consumers)
@@ -56,9 +61,11 @@ def acquire(
 class _Filler:
     """Packs chunks of any length into slots that end at multiples of the block's length, after a loss as before it."""
 
-    def __init__(self, writer: RingWriter, limit_frames: int | None) -> None:
+    def __init__(self, writer: RingWriter, limit_frames: int | None, died_s: float | None = None) -> None:
         self.writer = writer
         self._limit = limit_frames
+        self._died_s = died_s
+        self._zero = 0  # index in the capture of what the source counts from
         self._slot: NDArray[np.uint8] | None = None
         self._filled = 0
         self._published: Condition | None = None
@@ -86,22 +93,45 @@ class _Filler:
         return self._slot[self._filled : stop]
 
     def add(self, chunk: Chunk) -> None:
-        if chunk.first > self.next_frame:
-            raise SourceError(
-                f"the source jumped from frame {self.next_frame} to {chunk.first} without telling of a gap"
-            )
-        if chunk.first < self.next_frame:
-            raise SourceError(f"the source delivered frame {chunk.first} again, {self.next_frame} was next")
+        if self._died_s is not None:
+            self._bridge(chunk.frames)
+            if self.full:
+                return
+        first = self._zero + chunk.first
+        if first > self.next_frame:
+            raise SourceError(f"the source jumped from frame {self.next_frame} to {first} without telling of a gap")
+        if first < self.next_frame:
+            raise SourceError(f"the source delivered frame {first} again, {self.next_frame} was next")
         self._filled += chunk.frames
         if self._filled == self._capacity():
             self.flush()
 
     def lose(self, gap: Gap) -> None:
-        if gap.first != self.next_frame:
-            raise SourceError(f"the source told of a gap from frame {gap.first} when {self.next_frame} was next")
+        if self._died_s is not None:
+            self._bridge(gap.count)
+            if self.full:
+                return
+        first = self._zero + gap.first
+        if first != self.next_frame:
+            raise SourceError(f"the source told of a gap from frame {first} when {self.next_frame} was next")
         self.flush()
         left = gap.count if self._limit is None else min(gap.count, self._limit - self.next_frame)
         self.writer.gap(left, gap.cause)
+
+    def _bridge(self, come: int) -> None:
+        """Tell of what a process that died, and the time without one, have cost; `come` frames have come since.
+
+        Whole blocks, so that what lies in the slot in hand stays in its place; at least one, as nobody knows what the
+        other had in hand.
+        """
+        assert self._died_s is not None
+        geometry = self.writer.geometry
+        lost = (time.monotonic() - self._died_s) * geometry.sensor.frame_rate_hz - come
+        lost = geometry.block_frames * max(1, round(lost / geometry.block_frames))
+        left = lost if self._limit is None else min(lost, self._limit - self.next_frame)
+        self._died_s = None
+        self.writer.gap(left, Cause.USB)
+        self._zero = self.next_frame
 
     def flush(self) -> None:
         if self._filled:

@@ -112,6 +112,8 @@ class LiveCapture:
             self._stream = stream
             self._first_frame, self._stop_frame = first_frame, stop_frame
             stream.follow(self)
+            if stream.warnings:
+                self._row = replace(self._row, warnings=(*self._row.warnings, *stream.warnings))
             self._begin(stream.opened, recorder, reconstructor)
 
     def change(self, **fields: object) -> CaptureRow:

@@ -43,6 +43,10 @@ class AcquisitionOrder(_Order):
     """Readers to wait for before the first frame."""
     history_s: float
     """What the ring shall hold for readers that begin in the past."""
+    ring: str | None = None
+    """Go on in this ring, whose writer has died."""
+    died_s: float | None = None
+    """When it did, by the monotonic clock."""
 
 
 class RecorderOrder(_Order):
@@ -126,6 +130,13 @@ class RingOpened(BaseModel):
     sensor: Sensor
     frames: int | None
     unhurried: bool
+
+
+class Warned(BaseModel):
+    """Something that the user should know, and that the worker does without."""
+
+    news: Literal["warned"] = "warned"
+    text: str
 
 
 class RecordingEnded(BaseModel):
@@ -260,6 +271,7 @@ class Refused(BaseModel):
 
 News = Annotated[
     RingOpened
+    | Warned
     | RecordingEnded
     | ReconstructionStatus
     | Posed

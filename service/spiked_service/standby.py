@@ -56,6 +56,11 @@ class Standby:
         return self._stream.counters()
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """What went wrong so far and was mended or done without."""
+        return self._stream.warnings
+
+    @property
     def picture(self) -> PreviewTaken | None:
         """The newest pictures."""
         return self._stream.picture

@@ -1,13 +1,25 @@
 """A source flowing into a ring, with pictures of it: what a capture needs, and what can stand by before one."""
 
 import threading
+import time
 from pathlib import Path
 from typing import Protocol
+
+from spiked_driver.spec import is_camera
 
 from spiked.ring import Ring, clean_stale
 from spiked_service.backoff import Backoff
 from spiked_service.child import Child, Spare
-from spiked_service.messages import AcquisitionOrder, News, PreviewOrder, PreviewTaken, Refused, RingOpened, Role
+from spiked_service.messages import (
+    AcquisitionOrder,
+    News,
+    PreviewOrder,
+    PreviewTaken,
+    Refused,
+    RingOpened,
+    Role,
+    Warned,
+)
 from spiked_service.store.rows import Counters
 
 
@@ -45,14 +57,15 @@ class Stream:
         self._picture: PreviewTaken | None = None
         self._refusal: str | None = None
         self._closing = False
+        self._stopping = False
         self._ended = False
         self._final: Counters | None = None
         self._backoff = Backoff()
+        self._acquisition_backoff = Backoff()
+        self._warnings: list[str] = []
         self._children: dict[Role, Child] = {}
         with self._lock:
-            self._children[Role.ACQUISITION] = Child(
-                order, logs / "acquisition.log", self._hear, self._acquisition_ended
-            )
+            self._acquire(order)
 
     @property
     def opened(self) -> RingOpened | None:
@@ -63,6 +76,11 @@ class Stream:
     def picture(self) -> PreviewTaken | None:
         """The newest picture."""
         return self._picture
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What went wrong so far and was mended or done without."""
+        return tuple(self._warnings)
 
     @property
     def ended(self) -> bool:
@@ -101,9 +119,13 @@ class Stream:
     def stop(self) -> None:
         """End the acquisition in good order."""
         with self._lock:
+            self._stopping = True
             child = self._children.get(Role.ACQUISITION)
+            waiting = child is None and not self._ended
         if child is not None:
             child.stop()
+        elif waiting:
+            self._give_up("the acquisition had died when it was stopped")
 
     def dismiss(self) -> None:
         """Tell the workers to leave at once."""
@@ -111,8 +133,11 @@ class Stream:
             self._closing = True
             self._backoff.cancel()
             children = list(self._children.values())
+            waiting = Role.ACQUISITION not in self._children and not self._ended
         for child in children:
             child.dismiss()
+        if waiting:
+            self._give_up(None)
 
     def join(self, timeout_s: float) -> None:
         """Wait for dismissed workers, and kill those that stay."""
@@ -137,13 +162,59 @@ class Stream:
             case PreviewTaken():
                 self._picture = news
                 self._listener.picture_taken(news)
+            case Warned() if news.text not in self._warnings:  # each acquisition notes the same
+                self._warn(news.text)
             case Refused():
                 self._refusal = news.reason
 
+    def _warn(self, text: str) -> None:
+        self._warnings.append(text)
+        self._listener.warned(text)
+
+    def _acquire(self, order: AcquisitionOrder) -> None:
+        self._children[Role.ACQUISITION] = Child(
+            order, self._logs / "acquisition.log", self._hear, self._acquisition_ended
+        )
+
     def _acquisition_ended(self, trouble: str | None) -> None:
-        clean_stale()  # a killed acquisition leaves its ring
+        died_s = time.monotonic()
         with self._lock:
             self._children.pop(Role.ACQUISITION, None)
+            follows = trouble is not None and self._hold(trouble)
+        if follows and self._acquisition_backoff.again(lambda: self._succeed(died_s)) is not None:
+            self._warn(f"{trouble}; another goes on, and what came meanwhile is lost")
+            return
+        if follows:
+            trouble = f"{trouble}, again and again"
+        self._give_up(trouble)
+
+    def _hold(self, trouble: str) -> bool:
+        """Whether an acquisition that has died is to be followed: a camera cannot be asked again for what it saw."""
+        if self._closing or self._stopping or self._ring is None or not is_camera(self._order.source):
+            return False
+        return self._refusal is None and self._ring.hold(f"{trouble}: another is being started")
+
+    def _succeed(self, died_s: float) -> None:
+        with self._lock:
+            if self._closing or self._stopping or self._ended or self._opened is None:
+                return
+            again = {"ring": self._opened.name, "died_s": died_s}
+            try:
+                self._acquire(self._order.model_copy(update=again))
+                return
+            except OSError as error:
+                trouble = f"the acquisition cannot be started again: {error}"
+        self._give_up(trouble)
+
+    def _give_up(self, trouble: str | None) -> None:
+        """No more frames will come."""
+        with self._lock:
+            if self._ended:
+                return
+            self._acquisition_backoff.cancel()
+            if self._ring is not None:
+                self._ring.give_up()
+            clean_stale()  # a killed acquisition leaves its ring
             self._ended = True
             if self._opened is None:
                 self._backoff.cancel()
@@ -172,6 +243,6 @@ class Stream:
             else:
                 trouble = None
         if trouble is not None:
-            self._listener.warned(f"{trouble}; {how}")
+            self._warn(f"{trouble}; {how}")
         if settled:
             self._listener.stream_settled()

@@ -837,6 +837,10 @@ class DeviceOut(BaseModel):
     description: str
     state: DeviceState
     reason: Annotated[str, Field(description="Why it is absent or lost.")]
+    warnings: Annotated[
+        list[str],
+        Field(description="What its capture, or it while armed, does without."),
+    ]
     serial: str | None
     port: str | None
     speed: str | None

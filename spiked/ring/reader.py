@@ -16,6 +16,8 @@ from spiked.ring.status import RingStatus, read_status
 
 _LOOK_AGAIN_S = 0.1
 """A writer that was killed does not ring the bell: readers look after it this often while nothing comes."""
+_MOURNING_S = 0.5
+"""For somebody to hold the ring of a writer that has died for its successor."""
 
 
 class Frames:
@@ -74,6 +76,7 @@ class RingReader:
         self._jumped = False  # the entry at the position was told of by a gap, so it is taken even if it is late again
         self._held: Frames | None = None
         self._end: End | None = None
+        self._orphaned_s: float | None = None
         writer = self._control.writer()
         self._counters.next_entry = (
             self._position_to_take(writer) if start_frame is None else self._position_of(start_frame, writer)
@@ -106,7 +109,8 @@ class RingReader:
     def next(self, timeout_s: float) -> Item | None:
         """The next item, or None if none comes in time. After the end, the end again.
 
-        A writer that dies ends the capture with EndReason.WRITER_DIED, after all that it had published.
+        A writer that dies ends the capture with EndReason.WRITER_DIED, after all that it had published and half a
+        second in which another process may hold the ring for a successor.
         """
         if self._held is not None:
             self._held.release()
@@ -119,10 +123,20 @@ class RingReader:
             remaining_s = deadline - time.monotonic()
             if self._control.committed.wait(seen, min(max(remaining_s, 0.0), _LOOK_AGAIN_S)):
                 continue
-            if not is_alive(self._segment.owner):
+            if self._orphaned():
                 return self._take() or self._finish(self._control.writer(), EndReason.WRITER_DIED)
             if remaining_s <= 0:
                 return None
+
+    def _orphaned(self) -> bool:
+        """Whether nobody writes, nor will."""
+        owner = self._segment.owner
+        if is_alive(owner):
+            self._orphaned_s = None
+            return False
+        now_s = time.monotonic()
+        self._orphaned_s = self._orphaned_s or now_s
+        return not owner or now_s - self._orphaned_s > _MOURNING_S
 
     def status(self) -> RingStatus:
         """Counters of the writer and of every reader."""

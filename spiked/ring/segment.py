@@ -30,6 +30,7 @@ MIN_SLOTS = 8
 
 _HEADER = struct.Struct("<8sQI")  # magic with the layout's version, identity of the creator, bytes of JSON that follow
 _MAGIC = b"spkring1"
+_OWNER_OFFSET = len(_MAGIC)
 _CONTROL_OFFSET = mmap.PAGESIZE
 _ENTRIES_A_SLOT = 4
 
@@ -76,11 +77,10 @@ _GEOMETRY = TypeAdapter(Geometry)
 class Segment:
     """The mapped memory of a ring. It stays mapped while any view of it lives, also after the file is unlinked."""
 
-    def __init__(self, name: str, owner: int, geometry: Geometry, memory: NDArray[np.uint8]) -> None:
+    def __init__(self, name: str, geometry: Geometry, memory: NDArray[np.uint8]) -> None:
         self.name = name
-        self.owner = owner
-        """Identity of the process that writes."""
         self.geometry = geometry
+        self._owner = memory[_OWNER_OFFSET : _OWNER_OFFSET + 8].view("<u8")  # aligned: written and read in one piece
         control_bytes = Control.bytes(geometry.log_places)
         self.control = Control(memory[_CONTROL_OFFSET : _CONTROL_OFFSET + control_bytes], geometry.log_places)
         self._data = memory[geometry.data_offset :].reshape(geometry.slots, geometry.slot_stride)
@@ -89,6 +89,15 @@ class Segment:
         """The first frames of a slot, uint8 [frames, frame_bytes], writable; slot numbers are absolute."""
         size = self.geometry.sensor.frame_bytes
         return self._data[number % self.geometry.slots, : frames * size].reshape(frames, size)
+
+    @property
+    def owner(self) -> int:
+        """Identity of the process that writes, or holds the ring for the one that is to go on writing; 0: nobody."""
+        return int(self._owner[0])
+
+    @owner.setter
+    def owner(self, identity: int) -> None:
+        self._owner[0] = identity
 
     def unlink(self) -> None:
         """Remove the name; processes that are attached keep the memory. Fine if it is gone already."""
@@ -109,7 +118,7 @@ def create_segment(geometry: Geometry, ring_id: str | None) -> Segment:
         _reserve_memory(file, geometry.total_bytes, name)
         os.pwrite(file, _HEADER.pack(_MAGIC, owner, len(text)) + text, 0)
         os.link(f"/proc/self/fd/{file}", name, dst_dir_fd=folder, follow_symlinks=True)
-        return Segment(name, owner, geometry, _map(file, geometry))
+        return Segment(name, geometry, _map(file, geometry))
     except FileExistsError as error:
         raise RingError(
             f"there is a ring {name} already: choose another id, or end the process that made it"
@@ -122,8 +131,8 @@ def create_segment(geometry: Geometry, ring_id: str | None) -> Segment:
 def attach_segment(name: str) -> Segment:
     """The ring of that name. Raises RingError if there is none, or if the file is not a ring of this version."""
     with _opened(FOLDER / name) as file:
-        owner, geometry = _read_header(file, name)
-        return Segment(name, owner, geometry, _map(file, geometry))
+        _, geometry = _read_header(file, name)
+        return Segment(name, geometry, _map(file, geometry))
 
 
 def clean_stale() -> list[str]:

@@ -6,7 +6,7 @@ from typing import Self
 
 from spiked.native._ring import READER_PLACES, ReaderCounters
 from spiked.ring.items import Cause, Condition, DeviceState, EndReason, Policy, decode, encode
-from spiked.ring.process import is_alive, pid_of
+from spiked.ring.process import is_alive, own_identity, pid_of
 from spiked.ring.segment import Geometry, Segment, attach_segment
 
 
@@ -93,6 +93,22 @@ class Ring:
     def status(self) -> RingStatus:
         """Counters of the writer and of every reader."""
         return read_status(self._segment)
+
+    def hold(self, reason: str) -> bool:
+        """Hold the ring of a writer that has died for its successor: readers wait, and nobody cleans it up.
+
+        False if there is nothing to go on with, as the capture has ended.
+        """
+        if self._segment.control.writer().end:
+            return False
+        self._segment.owner = own_identity()
+        self._segment.control.publish_condition(encode(DeviceState.LOST), reason)
+        return True
+
+    def give_up(self) -> None:
+        """There will be no successor: readers are told that the writer has died."""
+        self._segment.owner = 0
+        self._segment.control.committed.ring()
 
     def bury(self, consumer: str) -> None:
         """Take dead readers of that name off the list, so that no writer holds frames for a successor."""

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from spiked.native._ring import Entry, WriterCounters
 from spiked.ring.items import Cause, Condition, DeviceState, EndReason, Policy, RingError, encode
-from spiked.ring.process import is_alive
-from spiked.ring.segment import MIN_SLOTS, Geometry, Segment, create_segment
+from spiked.ring.process import is_alive, own_identity
+from spiked.ring.segment import MIN_SLOTS, Geometry, Segment, attach_segment, create_segment
 from spiked.ring.status import ReaderPlace, RingStatus, read_places, read_status
 from spiked.sensor import Sensor
 
@@ -32,8 +32,9 @@ class RingWriter:
         self._mourning_s = mourning_s
         self._dead_since: dict[int, float] = {}
         self._control = segment.control
-        self._counters = WriterCounters()
-        self._reserved = 0
+        self._counters: WriterCounters = self._control.writer()
+        self._reserved = int(self._counters.slots)
+        self._spoilt = int(self._control.reserved())  # a writer before this one may have begun slots beyond
         self.publish_condition(Condition(DeviceState.ABSENT))
 
     @classmethod
@@ -62,6 +63,18 @@ class RingWriter:
         count = max(MIN_SLOTS, DEFAULT_BYTES // (block_frames * compact.frame_bytes)) if slots is None else slots
         return cls(create_segment(Geometry(compact, count, block_frames), ring_id), mourning_s)
 
+    @classmethod
+    def take_over(cls, name: str, *, mourning_s: float = 0.0) -> Self:
+        """Go on in a ring whose writer has died, behind what it had published; its readers notice nothing.
+
+        Raises RingError if there is no such ring, or its capture has ended.
+        """
+        segment = attach_segment(name)
+        if segment.control.writer().end:
+            raise RingError(f"the capture of ring {name} has ended: nobody can go on with it")
+        segment.owner = own_identity()
+        return cls(segment, mourning_s)
+
     @property
     def name(self) -> str:
         """Name by which readers attach."""
@@ -87,7 +100,7 @@ class RingWriter:
             raise RingError(f"{ahead} slots of ring {self.name} are acquired and not committed: no more than an eighth")
         number = self._reserved
         self._reserved += 1
-        self._control.reserve(self._reserved)
+        self._control.reserve(max(self._reserved, self._spoilt))
         return self._segment.slot(number, self.geometry.block_frames)
 
     def commit(self, frames: int) -> None:

@@ -1,5 +1,8 @@
 """The whole way: a virtual camera on a mocked machine, the daemon, a capture over REST, bytes and a reconstruction."""
 
+import os
+import shutil
+import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -104,3 +107,60 @@ def test_a_capture_goes_on_when_the_camera_is_back(
     assert after["device"].startswith("streaming")
     assert after["lost"]["device"] > 0
     assert after["received"] + sum(after["lost"].values()) == after["next_frame"]
+
+
+def test_a_killed_acquisition_is_followed_and_the_capture_goes_on(
+    cameras: Callable[..., VirtualCameras], daemon: Callable[..., Any], room: Path, tmp_path: Path
+) -> None:
+    rig = cameras(CameraSettings(str(room), rate_hz=RATE, buffer_frames=2 * RATE))
+    spec = f"usb0?fov={FOV_DEG:g}&rate={RATE}&transfer_kib=256"
+    service = daemon("--device", spec, "--no-capture", seen=rig)
+    http = service.http
+    capture_id = http.post("captures", json={"source": spec, "reconstruct": False}).json()["id"]
+
+    def capture() -> dict[str, Any]:
+        found: dict[str, Any] = http.get(f"captures/{capture_id}").json()
+        return found
+
+    def received() -> int:
+        return int((capture()["counters"] or {}).get("received", 0))
+
+    for _ in range(2):
+        before = received()
+        wait_for(lambda: received() > before + 500, "frames come")  # noqa: B023
+        acquisition = service.workers()["acquisition"].pid
+        os.kill(acquisition, signal.SIGKILL)
+        wait_for(lambda: service.workers().get("acquisition") not in (None, acquisition), "another")  # noqa: B023
+    before = received()
+    wait_for(lambda: received() > before + 500, "frames come again")
+    http.post(f"captures/{capture_id}:stop")
+    wait_for(lambda: capture()["state"] in ("complete", "failed"), "it ends")
+    over = capture()
+    told = "the acquisition worker was killed by signal 9; another goes on, and what came meanwhile is lost"
+    assert [warning for warning in over["warnings"] if "killed" in warning] == [told] * 2
+    assert (over["state"], over["reason"], over["verdict"]["grade"]) == ("complete", "", "degraded")
+    counters = over["counters"]
+    assert counters["lost"]["usb"] > 0
+    assert counters["received"] + sum(counters["lost"].values()) == counters["next_frame"]
+    assert over["recording"]["frames"] == counters["received"]
+    assert over["recording"]["lost"] == sum(counters["lost"].values())
+    path = tmp_path / "data" / "captures" / capture_id / "recording.dat"
+    recorded = np.fromfile(path, np.uint8).reshape(-1, 12_500)
+    numbers = recorded[:, :8].copy().view("<i8")[:, 0]
+    assert (np.diff(numbers) > 0).all() and rig.report().runs(int(numbers[-1]))
+    assert len([step for step in np.diff(numbers) if step > 1]) >= 1
+    assert not list(Path("/dev/shm").glob(f"spiked-{capture_id}*"))
+
+
+def test_what_is_not_permitted_is_a_warning_of_capture_and_device(
+    cameras: Callable[..., VirtualCameras], daemon: Callable[..., Any], room: Path
+) -> None:
+    if os.geteuid() or shutil.which("setpriv") is None:
+        pytest.skip("needs root, to give up its privileges")
+    rig = cameras(CameraSettings(str(room), rate_hz=RATE, buffer_frames=2 * RATE))
+    less = ("setpriv", "--bounding-set=-sys_nice,-ipc_lock", "prlimit", "--rtprio=0:0", "--memlock=65536:65536")
+    http = daemon("--device", f"usb0?fov={FOV_DEG:g}&rate={RATE}", seen=rig, under=less).http
+    wait_for(lambda: len(http.get("captures").json()["items"][0]["warnings"]) == 2, "it is told")
+    warnings = http.get("captures").json()["items"][0]["warnings"]
+    assert "real-time priority" in warnings[0] and "paged out" in warnings[1]
+    assert http.get("devices").json()["items"][0]["warnings"] == warnings

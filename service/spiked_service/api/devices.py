@@ -71,11 +71,12 @@ def shown(captures: Captures, device: Device) -> DeviceOut:
     live = next((one for one in captures.live() if device_of(one.row.source) == name), None)
     standby = captures.armed().get(name)
     state, reason, counters = device.state, device.reason, None
+    warnings: tuple[str, ...] = ()
     if live is not None:
-        counters = live.counters
+        counters, warnings = live.counters, live.row.warnings
         state, reason = DeviceState.STREAMING, ""
     elif standby is not None:
-        counters = standby.counters()
+        counters, warnings = standby.counters(), standby.warnings
         state, reason = DeviceState.ARMED, ""
     if counters is not None and (live is not None or counters.device is not DeviceState.STREAMING):
         state, reason = counters.device, counters.device_reason
@@ -86,6 +87,7 @@ def shown(captures: Captures, device: Device) -> DeviceOut:
         description=device.description,
         state=state,
         reason=reason,
+        warnings=list(warnings),
         serial=device.serial,
         port=device.port,
         speed=device.speed,

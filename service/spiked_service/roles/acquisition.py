@@ -1,16 +1,16 @@
 """The acquisition worker: a source into a ring, and nothing else."""
 
-import logging
 import math
 
 from spiked_driver.acquisition import acquire
 from spiked_driver.realtime import take_priority
+from spiked_driver.source import Source
 from spiked_driver.spec import is_camera, open_source
 
 from spiked.ring import RingWriter
 from spiked.ring.writer import DEFAULT_BYTES
 from spiked.sensor import Sensor
-from spiked_service.messages import AcquisitionOrder, RingOpened
+from spiked_service.messages import AcquisitionOrder, RingOpened, Warned
 from spiked_service.worker import Link
 
 _BLOCK_FRAMES = 8
@@ -30,22 +30,31 @@ def run_acquisition(order: AcquisitionOrder, link: Link) -> None:
     source = open_source(order.source)
     sensor = source.sensor
     limit = order.frames if order.seconds is None else max(1, round(order.seconds * sensor.frame_rate_hz))
-    slots = _slots(sensor, order.history_s, source.waits)
-    with RingWriter.create(
-        sensor, slots=slots, block_frames=_BLOCK_FRAMES, ring_id=order.ring_id, mourning_s=_MOURNING_S
-    ) as writer:
-        link.tell(
-            RingOpened(
-                name=writer.name,
-                sensor=sensor,
-                frames=limit if limit is not None else source.frames,
-                unhurried=source.waits,
+    with _ring(order, source) as writer:
+        if order.ring is None:
+            link.tell(
+                RingOpened(
+                    name=writer.name,
+                    sensor=sensor,
+                    frames=limit if limit is not None else source.frames,
+                    unhurried=source.waits,
+                )
             )
-        )
         if is_camera(order.source):
             for note in take_priority():
-                logging.getLogger(__name__).warning("%s", note)
-        acquire(source, writer, link.stop, limit_frames=limit, consumers=order.consumers)
+                link.tell(Warned(text=note))
+        consumers = order.consumers if order.ring is None else 0
+        acquire(source, writer, link.stop, limit_frames=limit, consumers=consumers, died_s=order.died_s)
+
+
+def _ring(order: AcquisitionOrder, source: Source) -> RingWriter:
+    """A new one, or that of a process that died. Raises RingError."""
+    if order.ring is not None:
+        return RingWriter.take_over(order.ring, mourning_s=_MOURNING_S)
+    slots = _slots(source.sensor, order.history_s, source.waits)
+    return RingWriter.create(
+        source.sensor, slots=slots, block_frames=_BLOCK_FRAMES, ring_id=order.ring_id, mourning_s=_MOURNING_S
+    )
 
 
 def _slots(sensor: Sensor, history_s: float, waits: bool) -> int | None:

@@ -1243,6 +1243,11 @@ export interface components {
              * @description Why it is absent or lost.
              */
             reason: string;
+            /**
+             * Warnings
+             * @description What its capture, or it while armed, does without.
+             */
+            warnings: string[];
             /** Serial */
             serial: string | null;
             /** Port */

@@ -80,6 +80,7 @@ class DeviceOut(Out):
     description: str
     state: DeviceState
     reason: str = Field(description="Why it is absent or lost.")
+    warnings: list[str] = Field(default_factory=list, description="What its capture, or it while armed, does without.")
     serial: str | None = None
     port: str | None = None
     speed: str | None = None

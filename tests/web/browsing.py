@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 Picture = NDArray[np.float64]
-PATIENCE_S = 120.0
+PATIENCE_S = 60.0
 DESKTOP = {"width": 1280, "height": 800}
 PHONE = {"width": 390, "height": 844}
 
@@ -57,6 +57,19 @@ def picture(page: Any) -> Picture:
     return decoded(base64.b64decode(url.split(",")[1]))
 
 
+def still(page: Any) -> Picture:
+    """What the canvas shows when it has stopped changing."""
+    pictures = [picture(page)]
+
+    def same() -> bool:
+        page.wait_for_timeout(300)
+        pictures.append(picture(page))
+        return bool(np.array_equal(*pictures[-2:]))
+
+    until(same, "the canvas is still")
+    return pictures[-1]
+
+
 def decoded(content: bytes) -> Picture:
     """An encoded picture, [H, W, 3], 0 to 1."""
     return np.asarray(Image.open(io.BytesIO(content)).convert("RGB"), np.float64) / 255
@@ -65,6 +78,17 @@ def decoded(content: bytes) -> Picture:
 def psnr_db(a: Picture, b: Picture) -> float:
     """Likeness of two pictures of one size."""
     return float(-10 * np.log10(max(float(np.mean((a - b) ** 2)), 1e-12)))
+
+
+def choose(page: Any, label: str) -> None:
+    """Press one of a row of keys, which are radio buttons."""
+    page.get_by_role("radio", name=label, exact=True).check()
+
+
+def address(page: Any) -> str:
+    """The address as it is now; `page.url` is brought up to date only while Playwright is asked for something."""
+    found: str = page.evaluate("() => location.href")
+    return found
 
 
 def shown_version(page: Any) -> int:

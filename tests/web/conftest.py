@@ -32,6 +32,8 @@ FLAGS = [
 ]
 """WebGL without a GPU; root needs no sandbox; nothing is asked of the network."""
 FRAMES = 1024
+STEPS = 2000 if "SPIKED_SCREENSHOTS" in os.environ else 150
+"""Of refinement: a scene to be looked at, or one to be tested with."""
 
 
 @pytest.fixture(scope="session")
@@ -66,6 +68,7 @@ def visit(browser: Any) -> Iterator[Visit]:
             message.type == "error"
             and "Failed to load resource" not in message.text
             and "WebSocket" not in message.text
+            and "Error creating WebGL context" not in message.text  # the page itself says so
         ):
             faults.append(message.text)
 
@@ -108,7 +111,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def studied(daemon_class: Any, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studied]:
     """A replayed recording, reconstructed, in a daemon that waits for more."""
     with running(daemon_class, room.parent / "daemon", "--device", "sim:") as daemon:
-        plan = {"source": f"replay:{room}", "name": "desk, by hand", "options": {"steps": 300}}
+        plan = {"source": f"replay:{room}", "name": "desk, by hand", "options": {"steps": STEPS}}
         answer = daemon.http.post("captures", json=plan)
         assert answer.status_code == 201, answer.text
         capture = finished(daemon.http, answer.json()["id"])

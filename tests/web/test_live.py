@@ -6,11 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browsing import PATIENCE_S, Studied, until
+from browsing import PATIENCE_S, Studied, address, choose, until
 from virtual_camera.host import CameraSettings
 from virtual_camera.rig import VirtualCameras
 
 FIRST_PAINT_MS = 1000
+FIRST_PAINT = """() => new Promise((tell) =>
+    new PerformanceObserver((list) => {
+        for (const entry of list.getEntriesByName('first-contentful-paint')) tell(entry.startTime);
+    }).observe({ type: 'paint', buffered: true }))"""
 
 
 def number(text: str | None) -> int:
@@ -66,13 +70,12 @@ def test_what_is_refused_is_said(daemon: Callable[..., Any], visit: Callable[...
     assert "missing.dat" in told.inner_text()
 
 
-@pytest.mark.slow
 def test_kinds_of_pictures_and_gain(studied: Studied, visit: Callable[..., Any]) -> None:
     page = visit(studied.address)
     image = page.locator(".picture img")
     sources = set()
     for kind in ("Interval", "Accumulation", "Render"):
-        page.get_by_text(kind, exact=True).click()
+        choose(page, kind)
         until(lambda: image.count() and image.get_attribute("src") not in sources, f"the picture {kind}")
         sources.add(image.get_attribute("src"))
 
@@ -93,7 +96,6 @@ def test_kinds_of_pictures_and_gain(studied: Studied, visit: Callable[..., Any])
     until(lambda: mean() < 0.5 * before, "the picture is darker")
 
 
-@pytest.mark.slow
 def test_the_page_recovers_when_the_daemon_dies(daemon_class: Any, tmp_path: Path, visit: Callable[..., Any]) -> None:
     one = daemon_class("--no-capture", "--device", "sim:", folder=tmp_path)
     port = one.address.rsplit(":", 1)[1].strip("/")
@@ -138,21 +140,18 @@ def test_a_camera_is_unplugged_and_comes_back(
     page.locator("[data-grade='degraded']").wait_for()
 
 
-@pytest.mark.slow
 def test_the_first_paint_comes_within_a_second(studied: Studied, visit: Callable[..., Any]) -> None:
     measured = []
-    for _ in range(5):  # the machine may be busy; the page is judged by its best
+    for _ in range(3):  # the machine may be busy; the page is judged by its best
         page = visit(studied.address)
         page.locator(".live").wait_for()
-        measured.append(page.evaluate("performance.getEntriesByName('first-contentful-paint')[0].startTime"))
-        if measured[-1] < FIRST_PAINT_MS:
-            break
+        measured.append(page.evaluate(FIRST_PAINT))
+    print("first contentful paint, ms:", [round(at_ms) for at_ms in measured])
     assert min(measured) < FIRST_PAINT_MS, measured
 
 
-@pytest.mark.slow
 def test_a_token_in_the_address_is_kept_out_of_sight(daemon: Callable[..., Any], visit: Callable[..., Any]) -> None:
     one = daemon("--token", "sesame-open-the-door", "--no-capture", token="sesame-open-the-door")
     page = visit(f"{one.address}?token=sesame-open-the-door")
     page.get_by_text("connected", exact=True).wait_for(timeout=1000 * PATIENCE_S)
-    assert "token" not in page.url
+    assert "token" not in address(page)

@@ -8,11 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browsing import PHONE, Studied, decoded, picture, psnr_db, shown_version, until
+from browsing import PHONE, Studied, address, choose, decoded, picture, psnr_db, shown_version, still, until
 
 from spiked.scene import Scene
-
-pytestmark = pytest.mark.slow  # WebGL is drawn by the CPU here
 
 MANY = 500_000
 
@@ -65,7 +63,7 @@ def test_the_scene_grows_while_the_camera_moves(
 
 def test_the_canvas_shows_what_the_service_renders(studied: Studied, visit: Callable[..., Any]) -> None:
     page = open_scene(visit, f"{studied.address}?page=scene&ride=1&frame=320")
-    page.get_by_text("Rendered", exact=True).click()
+    choose(page, "Rendered")
     size = page.evaluate("() => { const c = document.querySelector('.stage canvas'); return [c.width, c.height]; }")
     frame = int(page.get_by_label("Frame", exact=True).input_value())
     body = {"camera": {"frame": frame}, "width": size[0], "height": size[1]}
@@ -77,9 +75,10 @@ def test_the_canvas_shows_what_the_service_renders(studied: Studied, visit: Call
     until(lambda: psnr_db(picture(page), served) > 30, f"30 dB, not {psnr_db(picture(page), served):.1f}", 20)
 
 
+@pytest.mark.slow
 def test_spz_previews_lie_where_the_whole_scene_lies(studied: Studied, visit: Callable[..., Any]) -> None:
     whole = open_scene(visit, f"{studied.address}?page=scene&ride=1&frame=320")
-    whole.get_by_text("Rendered", exact=True).click()
+    choose(whole, "Rendered")
     page = visit("about:blank")
     # The page is told of a scene too large to be shown at once, and shows a sample of it: here all of it, as SPZ.
     page.route(
@@ -91,35 +90,37 @@ def test_spz_previews_lie_where_the_whole_scene_lies(studied: Studied, visit: Ca
     )
     page.goto(f"{studied.address}?page=scene&ride=1&frame=320")
     until(lambda: shown_version(page) > 0, "a preview is on the canvas")
-    page.get_by_text("Rendered", exact=True).click()
+    choose(page, "Rendered")
     assert page.get_by_role("button", name="Show all").count() == 1
     until(lambda: psnr_db(picture(page), picture(whole)) > 30, "the preview looks like the whole", 20)
     page.get_by_role("button", name="Show all").click()
     page.get_by_role("button", name="all splats").wait_for(state="detached")
 
 
+@pytest.mark.slow
 def test_scrubbing_moves_the_camera_and_is_kept_in_the_url(studied: Studied, visit: Callable[..., Any]) -> None:
     page = open_scene(visit, f"{studied.address}?page=scene&ride=1")
     slider = page.get_by_label("Frame", exact=True)
     until(lambda: int(slider.get_attribute("max") or 0) > 500, "the path is there")
-    page.get_by_text("Rendered", exact=True).click()
+    choose(page, "Rendered")
     slider.fill("100")
     early = picture(page)
     slider.fill("500")
     until(lambda: np.abs(picture(page) - early).mean() > 0.01, "another view")
-    assert "frame=500" in page.url
+    assert "frame=500" in address(page)
     slider.press("ArrowRight")
-    until(lambda: "frame=501" in page.url, "a frame on")
+    until(lambda: "frame=501" in address(page), "a frame on")
     page.reload()
     until(lambda: shown_version(page) > 0, "the scene is back")
     assert until(lambda: slider.input_value() == "501", "the same frame")
     page.get_by_role("button", name="End").click()
-    until(lambda: "frame" not in page.url, "it follows the newest")
+    until(lambda: "frame" not in address(page), "it follows the newest")
     page.get_by_role("button", name="Play").click()
-    until(lambda: "frame" in page.url, "it plays")
+    until(lambda: "frame" in address(page), "it plays")
     page.get_by_role("button", name="Pause").click()
 
 
+@pytest.mark.slow
 def test_riding_along_compares_observed_and_rendered(studied: Studied, visit: Callable[..., Any]) -> None:
     page = open_scene(visit, f"{studied.address}?page=scene&frame=320")
     page.get_by_role("button", name="Ride along").click()
@@ -132,37 +133,38 @@ def test_riding_along_compares_observed_and_rendered(studied: Studied, visit: Ca
     def shown() -> Any:
         return decoded(stage.screenshot())[40:-80]  # without the names above and the buttons below
 
-    page.get_by_text("Rendered", exact=True).click()
+    choose(page, "Rendered")
     rendered = shown()
-    page.get_by_text("Observed", exact=True).click()
+    choose(page, "Observed")
     until(lambda: 15 < psnr_db(shown(), rendered) < 60, "the camera has seen what is rendered", 20)
     seen = shown()
-    page.get_by_text("Wipe", exact=True).click()
+    choose(page, "Wipe")
     page.locator("input.wipe").fill("0.25")
     wiped = shown()
     quarter = wiped.shape[1] // 4
     assert psnr_db(wiped[:, : quarter - 4], seen[:, : quarter - 4]) > 40
     assert psnr_db(wiped[:, quarter + 4 :], rendered[:, quarter + 4 :]) > 40
-    page.get_by_text("Difference", exact=True).click()
+    choose(page, "Difference")
     page.wait_for_timeout(100)
     difference = shown()
     assert psnr_db(difference, np.clip(4 * np.abs(seen - rendered), 0, 1)) > 30
 
 
+@pytest.mark.slow
 def test_views_are_bookmarked_and_linked(studied: Studied, visit: Callable[..., Any]) -> None:
     page = open_scene(visit, f"{studied.address}?page=scene")
     canvas = page.locator(".stage canvas")
-    at_first = picture(page)
+    at_first = still(page)
     page.get_by_role("button", name="Add").click()
     box = canvas.bounding_box()
     page.mouse.move(box["x"] + 300, box["y"] + 300)
     page.mouse.down()
     page.mouse.move(box["x"] + 420, box["y"] + 330, steps=4)
     page.mouse.up()
-    until(lambda: "camera=" in page.url, "the view is in the URL")
+    until(lambda: "camera=" in address(page), "the view is in the URL")
     until(lambda: np.abs(picture(page) - at_first).mean() > 0.005, "the view has turned")
-    turned = picture(page)
-    elsewhere = open_scene(visit, page.url)
+    turned = still(page)
+    elsewhere = open_scene(visit, address(page))
     until(lambda: psnr_db(picture(elsewhere), turned) > 30, "the link shows the same view", 20)
     page.get_by_role("button", name="View 1", exact=True).click()
     until(lambda: psnr_db(picture(page), at_first) > 30, "the bookmark brings the first view back", 20)
@@ -171,18 +173,20 @@ def test_views_are_bookmarked_and_linked(studied: Studied, visit: Callable[..., 
     assert decoded(Path(download.value.path()).read_bytes()).shape == at_first.shape
 
 
+@pytest.mark.slow
 def test_keys_fly_through_the_scene_only_while_it_has_the_focus(studied: Studied, visit: Callable[..., Any]) -> None:
     page = open_scene(visit, f"{studied.address}?page=scene")
-    page.get_by_text("Fly", exact=True).click()
+    choose(page, "Fly")
     page.keyboard.press("w")
     page.wait_for_timeout(300)
-    assert "camera=" not in page.url
+    assert "camera=" not in address(page)
     page.locator(".stage canvas").focus()
     page.keyboard.down("w")
-    until(lambda: "camera=" in page.url, "it flies")
+    until(lambda: "camera=" in address(page), "it flies")
     page.keyboard.up("w")
 
 
+@pytest.mark.slow
 def test_half_a_million_splats(studied: Studied, visit: Callable[..., Any]) -> None:
     random = np.random.default_rng(5)
     scene = Scene(

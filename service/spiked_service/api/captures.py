@@ -199,9 +199,11 @@ def capture_routes(
         """The newest frames as a picture, or those around a recorded frame; or what the scene looks like from there."""
         wished = image_format(format, accept)
         if kind is PictureKind.RENDER:
-            camera = {"frame": _newest_pose(capture_id) if frame is None else frame}
-            request = ViewRequest.model_validate({"camera": camera, "white": None if white is None else white / gain})
-            return views_response(_result(capture_id), request, wished, views)
+            result = _result(capture_id)
+            camera = {"frame": _newest_pose(result) if frame is None else frame}
+            shown_white = (result.published.white if white is None else white) / gain
+            request = ViewRequest.model_validate({"camera": camera, "white": shown_white})
+            return views_response(result, request, wished, views)
         if frame is None and captures.get(capture_id).row.state in _LIVE:
             return _live(capture_id, kind)
         shown = picture(_shot(capture_id, frame), kind, white)
@@ -297,8 +299,7 @@ def capture_routes(
         newest = next((row for row in reversed(reconstructions) if row.version), reconstructions[-1])
         return results.of(newest, version)
 
-    def _newest_pose(capture_id: str) -> int:
-        result = _result(capture_id)
+    def _newest_pose(result: Result) -> int:
         rate = 1.0 if result.sensor is None else result.sensor.frame_rate_hz
         return round(float(result.trajectory().times_s[-1]) * rate - 0.5)
 

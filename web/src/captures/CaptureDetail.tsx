@@ -4,7 +4,7 @@ import { type JSX, useEffect, useState } from "react";
 
 import * as calls from "../api/calls";
 import type { Capture, OptionValues, Reconstruction } from "../api/types";
-import { lengthOf, nameOf } from "../state/capture";
+import { lengthOf, nameOf, sourceOf } from "../state/capture";
 import { bytes, count, decibel, duration, rate, small, when } from "../state/format";
 import { adjust, go, useRoute } from "../state/route";
 import {
@@ -130,7 +130,7 @@ function Head({ capture }: { capture: Capture }): JSX.Element {
         className="title"
         aria-label="Name of the capture"
         value={name}
-        placeholder={capture.source}
+        placeholder={sourceOf(capture)}
         maxLength={200}
         onChange={(event) => setName(event.target.value)}
         onBlur={() => void rename()}
@@ -191,7 +191,7 @@ function Recording({ capture }: { capture: Capture }): JSX.Element {
         <dt>Started</dt>
         <dd>{when(capture.started_at)}</dd>
         <dt>Source</dt>
-        <dd>{capture.origin === "upload" ? "uploaded" : capture.source}</dd>
+        <dd title={capture.source}>{sourceOf(capture)}</dd>
         <dt>Length</dt>
         <dd>
           {lengthOf(capture)}
@@ -266,93 +266,95 @@ function Reconstructions({
       {jobs.length === 0 ? (
         <Empty icon="scene" title="None yet" />
       ) : (
-        <table className="grid jobs">
-          <thead>
-            <tr>
-              <th scope="col">Show</th>
-              <th scope="col">Compare</th>
-              <th scope="col">Begun</th>
-              <th scope="col">State</th>
-              <th scope="col" className="number">
-                Poses
-              </th>
-              <th scope="col" className="number">
-                Splats
-              </th>
-              <th scope="col" className="number">
-                PSNR
-              </th>
-              <th scope="col">
-                <span className="hidden">Actions</span>
-              </th>
-            </tr>
-          </thead>
-          <tbody>
-            {jobs.map((one) => {
-              const name = `reconstruction ${nameOf(one)}`;
-              return (
-                <tr key={one.id}>
-                  <td>
-                    <input
-                      type="radio"
-                      name="shown"
-                      aria-label={`Show the ${name}`}
-                      checked={one.id === job?.id}
-                      onChange={() => adjust({ reconstruction: one.id })}
-                    />
-                  </td>
-                  <td>
-                    <input
-                      type="checkbox"
-                      aria-label={`Compare with the ${name}`}
-                      disabled={one.id === job?.id}
-                      checked={one.id === other?.id}
-                      onChange={(event) => onOther(event.target.checked ? one.id : null)}
-                    />
-                  </td>
-                  <td>
-                    {nameOf(one)} {when(one.created_at)} {one.live && <span className="dim">live</span>}
-                  </td>
-                  <td>
-                    <Badge tone={jobTone[one.state]}>
-                      {one.state === "running" ? `${one.stage} ${Math.round(100 * one.progress)} %` : one.state}
-                    </Badge>
-                    {one.reason !== "" && <span className="dim"> {one.reason}</span>}
-                  </td>
-                  <td className="number">{count(one.poses)}</td>
-                  <td className="number">{count(one.splats)}</td>
-                  <td className="number">{decibel(one.psnr_db)}</td>
-                  <td className="number">
-                    {isEnded(one) ? (
-                      <button
-                        type="button"
-                        className="bare"
-                        disabled={one.version === 0}
-                        aria-label={`Scene of the ${name}`}
-                        onClick={() =>
-                          go({
-                            page: "scene",
-                            capture: one.capture_id,
-                            reconstruction: one.id,
-                            frame: null,
-                            camera: null,
-                            ride: false,
-                          })
-                        }
-                      >
-                        <Icon name="scene" />
-                      </button>
-                    ) : (
-                      <button type="button" onClick={() => void cancel(one.id)}>
-                        Cancel
-                      </button>
-                    )}
-                  </td>
-                </tr>
-              );
-            })}
-          </tbody>
-        </table>
+        <div className="scroll" role="region" aria-label="Table of reconstructions" tabIndex={0}>
+          <table className="grid jobs">
+            <thead>
+              <tr>
+                <th scope="col">Show</th>
+                <th scope="col">Compare</th>
+                <th scope="col">Begun</th>
+                <th scope="col">State</th>
+                <th scope="col" className="number">
+                  Poses
+                </th>
+                <th scope="col" className="number">
+                  Splats
+                </th>
+                <th scope="col" className="number">
+                  PSNR
+                </th>
+                <th scope="col">
+                  <span className="hidden">Actions</span>
+                </th>
+              </tr>
+            </thead>
+            <tbody>
+              {jobs.map((one) => {
+                const name = `reconstruction ${nameOf(one)}`;
+                return (
+                  <tr key={one.id}>
+                    <td>
+                      <input
+                        type="radio"
+                        name="shown"
+                        aria-label={`Show the ${name}`}
+                        checked={one.id === job?.id}
+                        onChange={() => adjust({ reconstruction: one.id })}
+                      />
+                    </td>
+                    <td>
+                      <input
+                        type="checkbox"
+                        aria-label={`Compare with the ${name}`}
+                        disabled={one.id === job?.id}
+                        checked={one.id === other?.id}
+                        onChange={(event) => onOther(event.target.checked ? one.id : null)}
+                      />
+                    </td>
+                    <td>
+                      {nameOf(one)} {when(one.created_at)} {one.live && <span className="dim">live</span>}
+                    </td>
+                    <td>
+                      <Badge tone={jobTone[one.state]}>
+                        {one.state === "running" ? `${one.stage} ${Math.round(100 * one.progress)} %` : one.state}
+                      </Badge>
+                      {one.reason !== "" && <span className="dim reason">{one.reason}</span>}
+                    </td>
+                    <td className="number">{count(one.poses)}</td>
+                    <td className="number">{count(one.splats)}</td>
+                    <td className="number">{decibel(one.psnr_db)}</td>
+                    <td className="number">
+                      {isEnded(one) ? (
+                        <button
+                          type="button"
+                          className="bare"
+                          disabled={one.version === 0}
+                          aria-label={`Scene of the ${name}`}
+                          onClick={() =>
+                            go({
+                              page: "scene",
+                              capture: one.capture_id,
+                              reconstruction: one.id,
+                              frame: null,
+                              camera: null,
+                              ride: false,
+                            })
+                          }
+                        >
+                          <Icon name="scene" />
+                        </button>
+                      ) : (
+                        <button type="button" onClick={() => void cancel(one.id)}>
+                          Cancel
+                        </button>
+                      )}
+                    </td>
+                  </tr>
+                );
+              })}
+            </tbody>
+          </table>
+        </div>
       )}
     </Panel>
   );

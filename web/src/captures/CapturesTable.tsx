@@ -4,7 +4,7 @@ import { type JSX, useEffect, useState } from "react";
 
 import { address, captures as ask } from "../api/calls";
 import type { Capture } from "../api/types";
-import { lengthOf, nameOf } from "../state/capture";
+import { lengthOf, nameOf, sourceOf } from "../state/capture";
 import { bytes, when } from "../state/format";
 import { adjust, go, useRoute } from "../state/route";
 import { newestReconstruction, useService, wordsOf } from "../state/store";
@@ -161,7 +161,7 @@ function Row({
           {nameOf(capture)}
         </a>
         <span className="dim">
-          {capture.origin === "upload" ? "uploaded" : capture.source}
+          <span title={capture.source}>{sourceOf(capture)}</span>
           {capture.keep && " · kept"}
         </span>
       </th>

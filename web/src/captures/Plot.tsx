@@ -14,6 +14,8 @@ const SYNC = uPlot.sync("captures");
 /** uPlot's `Scale.Distr`: a constant enum, which has no values that isolated modules could import. */
 const LINEAR = 1;
 const LOGARITHMIC = 3;
+/** So many values make no line that could be seen. */
+const FEW = 24;
 const DASHES = [[], [6, 4]];
 
 export interface PlotProps {
@@ -51,6 +53,8 @@ export function Plot({ title, unit, hint, log, data, names, gaps }: PlotProps): 
           {
             ...axis,
             size: 58,
+            // A logarithmic axis has a line for each power of ten, not for each of its nine parts.
+            grid: log ? { ...axis.grid, filter: (_, ticks) => ticks.map((t) => (isPower(t) ? t : null)) } : axis.grid,
             values: (_, ticks) => ticks.map((t) => ((t as number | null) === null ? "" : short(t))),
           },
         ],
@@ -61,7 +65,7 @@ export function Plot({ title, unit, hint, log, data, names, gaps }: PlotProps): 
             stroke: strokes[i] ?? colour("ink"),
             dash: DASHES[i] ?? [],
             width: 1.4,
-            points: { show: false },
+            points: { show: known(data[i + 1] ?? []) < FEW, size: 5 },
             spanGaps: names.length > 1,
             value: (_: uPlot, v: number | null) => (v === null ? "–" : `${short(v)} ${unit}`),
           })),
@@ -92,14 +96,17 @@ export function Plot({ title, unit, hint, log, data, names, gaps }: PlotProps): 
   );
 }
 
+const known = (column: Column): number => column.filter((value) => value !== null).length;
+const isPower = (x: number): boolean => Math.abs(Math.log10(x) - Math.round(Math.log10(x))) < 1e-6;
+
 const short = (x: number): string =>
   x === 0 ? "0" : Math.abs(x) >= 0.001 && Math.abs(x) < 10_000 ? String(Number(x.toPrecision(3))) : x.toExponential(1);
 
 /** The plot in words. */
 function summary(column: Column, unit: string): string {
-  const known = column.filter((value) => value !== null);
-  if (known.length === 0) return "No values.";
-  const told = [Math.min(...known), Math.max(...known), known.at(-1) ?? 0].map((x) => `${short(x)} ${unit}`.trim());
+  const values = column.filter((value) => value !== null);
+  if (values.length === 0) return "No values.";
+  const told = [Math.min(...values), Math.max(...values), values.at(-1) ?? 0].map((x) => `${short(x)} ${unit}`.trim());
   return `From ${told[0] ?? ""} to ${told[1] ?? ""}, at the end ${told[2] ?? ""}.`;
 }
 

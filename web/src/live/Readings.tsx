@@ -50,51 +50,53 @@ export function Frames({ capture, rateHz }: { capture: Capture; rateHz: number |
               </tr>
             </tbody>
           </table>
-          <table className="grid consumers">
-            <caption className="hidden">Consumers of the ring</caption>
-            <thead>
-              <tr>
-                <th scope="col">Consumer</th>
-                <th scope="col">Ring fill</th>
-                <th scope="col" className="number">
-                  Lag
-                </th>
-                <th scope="col" className="number">
-                  Missed
-                </th>
-              </tr>
-            </thead>
-            <tbody>
-              {counters.consumers.map((one) => {
-                const skips = one.policy === "latest";
-                return (
-                  <tr key={one.name}>
-                    <th scope="row">
-                      {one.name}
-                      {one.lagging && !skips && <span className="problem"> lagging</span>}
-                    </th>
-                    <td>
-                      <Meter
-                        share={one.fill}
-                        label={`Ring fill of ${one.name}`}
-                        tone={skips ? "active" : one.lagging ? "problem" : one.fill > 0.8 ? "warning" : "active"}
-                      />
-                    </td>
-                    <td className="number">
-                      {sensor === null ? count(one.lag_frames) : duration(one.lag_frames / sensor.frame_rate_hz)}
-                    </td>
-                    <td
-                      className={`number ${one.lost > 0 && !skips ? "problem" : ""}`}
-                      title={skips ? "skips frames by intention" : undefined}
-                    >
-                      {count(one.lost)}
-                      {skips && one.lost > 0 ? " skipped" : ""}
-                    </td>
-                  </tr>
-                );
-              })}
-            </tbody>
-          </table>
+          {counters.consumers.length > 0 && (
+            <table className="grid consumers">
+              <caption className="hidden">Consumers of the ring</caption>
+              <thead>
+                <tr>
+                  <th scope="col">Consumer</th>
+                  <th scope="col">Ring fill</th>
+                  <th scope="col" className="number">
+                    Lag
+                  </th>
+                  <th scope="col" className="number">
+                    Missed
+                  </th>
+                </tr>
+              </thead>
+              <tbody>
+                {counters.consumers.map((one) => {
+                  const skips = one.policy === "latest";
+                  return (
+                    <tr key={one.name}>
+                      <th scope="row">
+                        {one.name}
+                        {one.lagging && !skips && <span className="problem"> lagging</span>}
+                      </th>
+                      <td>
+                        <Meter
+                          share={one.fill}
+                          label={`Ring fill of ${one.name}`}
+                          tone={skips ? "active" : one.lagging ? "problem" : one.fill > 0.8 ? "warning" : "active"}
+                        />
+                      </td>
+                      <td className="number">
+                        {sensor === null ? count(one.lag_frames) : duration(one.lag_frames / sensor.frame_rate_hz)}
+                      </td>
+                      <td
+                        className={`number ${one.lost > 0 && !skips ? "problem" : ""}`}
+                        title={skips ? "skips frames by intention" : undefined}
+                      >
+                        {count(one.lost)}
+                        {skips && one.lost > 0 ? " skipped" : ""}
+                      </td>
+                    </tr>
+                  );
+                })}
+              </tbody>
+            </table>
+          )}
         </>
       )}
       {capture.warnings.map((warning) => (

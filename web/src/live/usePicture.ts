@@ -28,7 +28,9 @@ export function usePicture(capture: Capture | null, kind: PreviewKind, gain: num
   const over = capture === null || isOver(capture);
   const begun = over || (capture.counters?.received ?? 0) > 0;
   const served = pushed !== undefined && !over;
-  const askedGain = served ? 1 : gain;
+  // Pictures of frames on their way are made once for everybody: their gain is the page's business.
+  const gained = over || kind === "render";
+  const askedGain = gained ? gain : 1;
 
   useEffect(() => {
     if (id === null || served || !begun) return;
@@ -45,7 +47,7 @@ export function usePicture(capture: Capture | null, kind: PreviewKind, gain: num
         if (response.ok) {
           const next = URL.createObjectURL(await response.blob());
           const frame = response.headers.get("X-Frame");
-          setAsked({ key, url: next, frame: frame === null ? null : Number(frame), gained: true });
+          setAsked({ key, url: next, frame: frame === null ? null : Number(frame), gained });
           if (url !== null) URL.revokeObjectURL(url);
           url = next;
         } else {
@@ -63,7 +65,7 @@ export function usePicture(capture: Capture | null, kind: PreviewKind, gain: num
       // The picture on show keeps its address until the next one has come.
       if (url !== null) setTimeout(() => URL.revokeObjectURL(url ?? ""), 2000);
     };
-  }, [id, kind, askedGain, over, served, begun]);
+  }, [id, kind, askedGain, gained, over, served, begun]);
 
   if (served) return { url: `data:image/webp;base64,${pushed.image}`, frame: pushed.frame, gained: false };
   return asked !== null && asked.key === `${id ?? ""} ${kind}` ? asked : null;

@@ -14,7 +14,7 @@ const CHOICES = [
   { value: "observed", label: "Observed" },
 ] as const;
 const LOOK_MS = 60;
-/** Differences are small; so much are they brightened. */
+/** Differences are small; so much are they brightened, by `.brightened` of the style sheet. */
 const DIFFERENCE_GAIN = 4;
 
 export function RideAlong({
@@ -41,11 +41,6 @@ export function RideAlong({
     style.clipPath = comparison === "wipe" ? `inset(0 ${100 * (1 - share)}% 0 0)` : "";
     style.mixBlendMode = comparison === "difference" ? "difference" : "normal";
     style.visibility = comparison === "rendered" ? "hidden" : "visible";
-    const box = stageOf(bar.current);
-    if (box !== null) box.style.filter = comparison === "difference" ? `brightness(${DIFFERENCE_GAIN})` : "";
-    return () => {
-      if (box !== null) box.style.filter = "";
-    };
   }, [comparison, share, observed.url]);
 
   return (
@@ -54,6 +49,7 @@ export function RideAlong({
         <img ref={image} className="observed" src={observed.url} alt="What the camera saw" data-frame={frame ?? ""} />
       )}
       {comparison === "wipe" && <Wipe share={share} onShare={setShare} />}
+      {comparison === "difference" && <span className="brightened" aria-hidden="true" />}
       <div className="compare" ref={bar}>
         <Segmented label="Comparison" value={comparison} choices={CHOICES} onChange={setComparison} />
         {comparison === "difference" && <span className="note">|observed − rendered| × {DIFFERENCE_GAIN}</span>}

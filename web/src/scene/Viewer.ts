@@ -121,7 +121,10 @@ export class Viewer {
     this.axes.visible = false;
     this.orbit = new OrbitControls(this.camera, canvas);
     this.orbit.addEventListener("change", () => this.draw());
-    this.orbit.addEventListener("end", () => this.onMoved());
+    this.orbit.addEventListener("end", () => {
+      this.placed = true;
+      this.onMoved();
+    });
     this.orbit.listenToKeyEvents(canvas);
     canvas.addEventListener("focus", this.flyWhileFocused);
     canvas.addEventListener("blur", this.flyWhileFocused);
@@ -340,6 +343,7 @@ export class Viewer {
       this.frustum.geometry = new LineSegmentsGeometry();
       this.frustum.geometry.setPositions(edges.flatMap((p) => p.toArray()));
     }
+    if (!this.placed && this.extent !== null) this.home();
     this.show();
   }
 
@@ -382,7 +386,7 @@ export class Viewer {
     const offset = new Vector3(0.22 * depth, 0.22 * depth, 0.6 * depth).applyQuaternion(at.quaternion);
     this.camera.position.copy(at.position).add(offset);
     this.orbit.target.copy(at.position).add(new Vector3(0, 0, -0.7 * depth).applyQuaternion(at.quaternion));
-    this.placed = true;
+    this.placed = this.placement !== null; // else once more when the path has come
     this.orbit.update();
     this.draw();
   }

@@ -22,18 +22,6 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 START_S = 60.0
 
 
-UNSETTLED = ("tests/web/",)
-"""Suites of many processes that have not passed as a whole on a quiet machine yet: among the slow ones till then."""
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Count the unsettled suites among the slow ones."""
-    root = Path(__file__).resolve().parents[1]
-    for item in items:
-        if item.path.relative_to(root).as_posix().startswith(UNSETTLED):
-            item.add_marker(pytest.mark.slow)
-
-
 class Daemon:
     """`spiked serve` as a process of its own, and a client to talk to it."""
 

@@ -5,14 +5,14 @@ import type { JSX } from "react";
 import type { Reconstruction } from "../api/types";
 import { count, decibel, duration, percent, small } from "../state/format";
 import { go } from "../state/route";
-import { Badge, jobTone, Meter, Panel, Stat, trackingTone } from "../ui/parts";
+import { Badge, jobTone, Meter, Panel, Stat, trackingHint, trackingTone } from "../ui/parts";
 import { Icon } from "../ui/icons";
 
 export function Progress({ job }: { job: Reconstruction | null }): JSX.Element {
   if (job === null)
     return (
       <Panel title="Reconstruction">
-        <p className="dim">None for this capture.</p>
+        <p className="dim">None for this capture. Start one with Reconstruct ticked, or run it later from Captures.</p>
       </Panel>
     );
   const running = job.state === "running" || job.state === "queued";
@@ -45,6 +45,9 @@ export function Progress({ job }: { job: Reconstruction | null }): JSX.Element {
             {job.eta_s !== null && `, ${duration(job.eta_s)} left`}
           </span>
         </div>
+      )}
+      {running && job.stage !== "refining" && job.tracking_state !== "track" && (
+        <p>{trackingHint[job.tracking_state]}</p>
       )}
       {job.reason !== "" && <p className={job.state === "failed" ? "problem" : "dim"}>{job.reason}</p>}
       <button

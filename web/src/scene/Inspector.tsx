@@ -6,7 +6,7 @@ import type { Capture, Reconstruction } from "../api/types";
 import { count, decibel, percent } from "../state/format";
 import { toast } from "../state/toasts";
 import { Icon } from "../ui/icons";
-import { Badge, jobTone, Meter, Segmented, Stat, trackingTone } from "../ui/parts";
+import { Badge, jobTone, Meter, Segmented, Stat, trackingHint, trackingTone } from "../ui/parts";
 import { type Bookmark, readBookmarks, writeBookmarks } from "./bookmarks";
 import { type Colouring, SPEED_COLOURS, STATE_COLOURS, STATES } from "./path";
 import type { Shown } from "./useScene";
@@ -57,7 +57,9 @@ export function Inspector(props: InspectorProps): JSX.Element {
       <header>
         <strong>{capture.name === "" ? capture.source : capture.name}</strong>
         {running ? (
-          <Badge tone={trackingTone[job.tracking_state]}>{job.tracking_state}</Badge>
+          <span title={trackingHint[job.tracking_state]}>
+            <Badge tone={trackingTone[job.tracking_state]}>{job.tracking_state}</Badge>
+          </span>
         ) : (
           <Badge tone={jobTone[job.state]}>{job.state}</Badge>
         )}
@@ -87,6 +89,7 @@ export function Inspector(props: InspectorProps): JSX.Element {
           <Icon name="home" /> Home
         </button>
       </div>
+      <p className="dim hint">{STEERINGS.find((one) => one.value === props.steering)?.hint}</p>
       <button type="button" aria-pressed={props.ride} onClick={() => props.onRide(!props.ride)}>
         <Icon name="eye" /> Ride along
       </button>
@@ -132,7 +135,7 @@ function Legend({ colouring }: { colouring: Colouring }): JSX.Element {
   return (
     <ul className="legend">
       {STATES.map((state) => (
-        <li key={state}>
+        <li key={state} title={trackingHint[state]}>
           <svg viewBox="0 0 14 6" aria-hidden="true">
             <rect width="14" height="4" y="1" rx="2" fill={STATE_COLOURS[state]} />
           </svg>

@@ -18,7 +18,7 @@ import {
 } from "../state/store";
 import { colour, useDark } from "../state/theme";
 import { toast } from "../state/toasts";
-import { Empty, Loading, Trouble } from "../ui/parts";
+import { Empty, Loading, trackingHint, Trouble } from "../ui/parts";
 import { Inspector } from "./Inspector";
 import { type Colouring, rowAt } from "./path";
 import { RideAlong } from "./RideAlong";
@@ -177,7 +177,8 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
               </Empty>
             ) : (
               <Empty icon="scene" title={loading ? "Loading the scene…" : "Waiting for the first version…"}>
-                {!loading && `The tracking is at ${job.tracking_state}. ${job.reason}`}
+                {!loading && trackingHint[job.tracking_state]}
+                {!loading && job.reason !== "" && <div className="dim">{job.reason}</div>}
               </Empty>
             )}
           </div>

@@ -56,6 +56,15 @@ export const trackingTone: Record<TrackingState, Tone> = {
   reloc: "warning",
 };
 
+/** What a state of the tracking means, and what to do with the camera then. */
+export const trackingHint: Record<TrackingState, string> = {
+  boot: "Looking for a first map: move the camera sideways, without turning it.",
+  track: "The camera is followed.",
+  degraded: "The camera is followed with more error than its noise explains: move more slowly.",
+  lost: "The camera is not followed: go back to what it has seen.",
+  reloc: "The camera is looked for in the map: hold it on what it has seen.",
+};
+
 /** A share of something, 0 to 1. */
 export function Meter({ share, label, tone = "active" }: { share: number; label: string; tone?: Tone }): JSX.Element {
   const value = Math.min(Math.max(share, 0), 1);

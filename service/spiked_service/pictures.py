@@ -16,6 +16,7 @@ from spiked_service.images import display_white
 
 _MOMENT_FRAMES = 32
 """As short as 1.5 % noise of the charge between spikes allows: what moves is blurred over them."""
+_COUNTED_FRAMES = 64
 _ACCUMULATED_FRAMES = 1024
 _EDGE_FRAMES = 64
 """Frames on either side in which the spikes that bound a window are looked for."""
@@ -123,7 +124,7 @@ def picture(shot: Shot, kind: PictureKind, white: float | None) -> Picture:
     if kind is PictureKind.INTERVAL:
         plane = shot.window(_MOMENT_FRAMES).rate(fill=True)
     else:
-        plane = _rate(shot.window(_MOMENT_FRAMES if kind is PictureKind.RATE else _ACCUMULATED_FRAMES))
+        plane = _rate(shot.window(_COUNTED_FRAMES if kind is PictureKind.RATE else _ACCUMULATED_FRAMES))
     channels = sensor.mosaic.channels(sensor.height, sensor.width) if sensor.mosaic else None
     image = fill_mosaic(plane, channels)
     return Picture(image, white or display_white(image), shot.frame)
@@ -131,7 +132,7 @@ def picture(shot: Shot, kind: PictureKind, white: float | None) -> Picture:
 
 def statistics(shot: Shot) -> Statistics:
     """Rates of the pixels over a moment."""
-    rate = _rate(shot.window(_MOMENT_FRAMES))
+    rate = _rate(shot.window(_COUNTED_FRAMES))
     levels = (rate * 255).clip(0, 255).astype(np.uint8)
     excess = levels.astype(np.int16) - cv2.medianBlur(levels, 5)
     rows, columns = np.nonzero(excess > _HOT_RATE * 255)

@@ -32,7 +32,7 @@ FLAGS = [
 ]
 """WebGL without a GPU; root needs no sandbox; nothing is asked of the network."""
 FRAMES = 1024
-STEPS = 2000 if "SPIKED_SCREENSHOTS" in os.environ else 150
+STEPS = 600 if "SCREENSHOTS" in os.environ else 150
 """Of refinement: a scene to be looked at, or one to be tested with."""
 
 
@@ -121,8 +121,8 @@ def studied(daemon_class: Any, room: Path, tmp_path_factory: pytest.TempPathFact
 
 @pytest.fixture(scope="session")
 def pictures_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where screenshots go: SPIKED_SCREENSHOTS, or a folder that is thrown away."""
-    wanted = os.environ.get("SPIKED_SCREENSHOTS")
+    """Where screenshots go: SCREENSHOTS, or a folder that is thrown away."""
+    wanted = os.environ.get("SCREENSHOTS")
     folder = Path(wanted) if wanted else tmp_path_factory.mktemp("screenshots")
     folder.mkdir(parents=True, exist_ok=True)
     return folder

@@ -17,6 +17,7 @@ PAGES = {
     "capture": "?page=captures&capture={capture_id}",
     "setup": "?page=setup",
 }
+NOBODY = "00000000-0000-7000-8000-000000000000"
 MOST_BYTES = 300_000
 
 
@@ -65,6 +66,32 @@ def test_each_page_on_a_phone(studied: Studied, visit: Callable[..., Any], pictu
     assert page.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
     if AXE.is_file():
         assert violations(page) == []
+
+
+def test_a_first_visit_and_a_service_that_is_gone(
+    daemon: Callable[..., Any], visit: Callable[..., Any], pictures_folder: Path
+) -> None:
+    """What is empty, missing or disconnected says so and what to do."""
+    one = daemon("--device", "sim:", "--no-capture")
+    said = {
+        "live": ("", "No capture yet"),
+        "scene": ("?page=scene", "No scene yet"),
+        "captures": ("?page=captures", "No captures yet"),
+        "capture-missing": (f"?page=captures&capture={NOBODY}", "Try again"),
+        "scene-missing": (f"?page=scene&capture={NOBODY}", "Newest scene"),
+    }
+    for name, (query, words) in said.items():
+        page = visit(one.address + query)
+        page.get_by_text(words).first.wait_for()
+        keep(page, pictures_folder / f"{name}-empty.webp")
+        assert violations(page) == []
+    page = visit(one.address)
+    page.get_by_text("connected", exact=True).wait_for()
+    one.process.kill()
+    page.get_by_text("What is shown below may be old").wait_for()
+    keep(page, pictures_folder / "live-disconnected.webp")
+    assert violations(page) == []
+    page.goto("about:blank")
 
 
 def keep(page: Any, path: Path) -> None:

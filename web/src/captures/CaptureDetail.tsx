@@ -41,10 +41,14 @@ export function CaptureDetail({ id }: { id: string }): JSX.Element {
     return one;
   });
   if (capture === null)
-    return asked.problem === null ? (
-      <Loading what="the capture" />
-    ) : (
-      <Trouble text={asked.problem} again={asked.again} />
+    return (
+      <div className="detail">
+        <h1 className="hidden">Capture</h1>
+        <button type="button" onClick={() => go({ page: "captures", capture: null, reconstruction: null })}>
+          <Icon name="back" /> All captures
+        </button>
+        {asked.problem === null ? <Loading what="the capture" /> : <Trouble text={asked.problem} again={asked.again} />}
+      </div>
     );
   return <Detail capture={capture} />;
 }

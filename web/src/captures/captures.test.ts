@@ -3,6 +3,7 @@ import { expect, it } from "vitest";
 import type { Timeline } from "../api/types";
 import { fieldsOf, valuesOf } from "./OptionsForm";
 import { flicker, joined } from "./series";
+import { merged } from "../live/Histogram";
 
 const SCHEMA = {
   $defs: { Mode: { type: "string", enum: ["fast", "exact"] } },
@@ -60,4 +61,15 @@ it("finds the swing of mains light and nothing in steady light", () => {
   expect(Math.max(...middle)).toBeCloseTo(0.1, 1);
   const steady = flicker(line(times.map(() => 0.3)));
   expect(Math.max(...steady.map((x) => Math.abs(x ?? 0)))).toBeLessThan(1e-9);
+});
+
+it("joins the bins of a histogram of few frames", () => {
+  const comb = {
+    edges: Array.from({ length: 17 }, (_, i) => i / 16),
+    counts: [1, 0, 4, 0, 9, 0, 6, 0, 2, 0, 1, 0, 0, 0, 0, 0],
+  };
+  expect(merged(comb).counts).toEqual([1, 4, 9, 6, 2, 1, 0, 0]);
+  expect(merged(comb).edges[8]).toBe(1);
+  const full = { edges: comb.edges, counts: comb.counts.map(() => 2) };
+  expect(merged(full)).toEqual(full);
 });

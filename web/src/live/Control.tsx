@@ -93,8 +93,13 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
               spellCheck={false}
               autoComplete="off"
               placeholder="replay:/path/recording.dat"
+              aria-describedby={`${ids}-sources`}
               onChange={(event) => setOther(event.target.value)}
             />
+            <p id={`${ids}-sources`} className="dim note">
+              <code>replay:FILE</code> plays a recording, <code>usb0?fov=40</code> is a camera, <code>sim:</code> a
+              simulated one
+            </p>
           </>
         )}
         <label htmlFor={`${ids}-name`}>Name</label>
@@ -133,7 +138,10 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
           )}
         </span>
         <span className="checks">
-          <label className="check">
+          <label
+            className="check"
+            title="Keep the frames on disk: for downloads, another reconstruction, pictures of any moment"
+          >
             <input
               type="checkbox"
               checked={record}
@@ -142,7 +150,7 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
             />
             Record
           </label>
-          <label className="check">
+          <label className="check" title="Follow the camera and let the scene grow while it runs">
             <input
               type="checkbox"
               checked={reconstruct}
@@ -153,7 +161,12 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
           </label>
         </span>
         <span className="buttons">
-          <button type="submit" className="primary" disabled={running || busy}>
+          <button
+            type="submit"
+            className="primary"
+            disabled={running || busy}
+            title={running ? "One capture at a time: this one is not over yet" : undefined}
+          >
             <Icon name="start" /> Start
           </button>
           <button

@@ -14,6 +14,18 @@ export function trimmed(histogram: RateHistogram): RateHistogram {
   return { edges: histogram.edges.slice(0, kept + 1), counts: histogram.counts.slice(0, kept) };
 }
 
+/** Few frames give few different rates: bins are joined by two until hardly any lies empty between others. */
+export function merged(histogram: RateHistogram): RateHistogram {
+  const { edges, counts } = histogram;
+  const used = counts.slice(0, counts.findLastIndex((n) => n > 0) + 1);
+  const empty = used.filter((n) => n === 0).length;
+  if (counts.length <= 8 || counts.length % 2 === 1 || empty <= used.length / 4) return histogram;
+  return merged({
+    edges: edges.filter((_, i) => i % 2 === 0),
+    counts: counts.filter((_, i) => i % 2 === 0).map((n, i) => n + (counts[2 * i + 1] ?? 0)),
+  });
+}
+
 /** Bars of a histogram: square root of the counts, so that the few bright pixels are seen too. */
 export function bars(counts: readonly number[]): number[] {
   const most = Math.max(1, ...counts);
@@ -29,7 +41,7 @@ export function Histogram({
   meanRate: number | null;
   frameRateHz: number | null;
 }): JSX.Element {
-  const histogram = all === null ? null : trimmed(all);
+  const histogram = all === null ? null : trimmed(merged(all));
   const heights = histogram === null ? [] : bars(histogram.counts);
   const first = histogram?.edges[0] ?? 0;
   const last = histogram?.edges.at(-1) ?? 1;

@@ -130,7 +130,8 @@ function NoPicture({ capture, kind }: { capture: Capture | null; kind: PreviewKi
   if (capture === null)
     return (
       <Empty icon="camera" title="No capture yet">
-        Choose a device on the right and press <b>Start</b>.
+        Choose a device and press <b>Start</b>. Without a camera, <b>sim:</b> is a simulated one and <b>replay:</b>{" "}
+        plays a recording.
       </Empty>
     );
   if (capture.state === "failed")

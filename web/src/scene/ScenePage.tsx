@@ -31,6 +31,15 @@ const LAYERS: Layers = { splats: true, path: true, frustum: true, grid: true, ax
 const URL_MS = 300;
 
 export function ScenePage(): JSX.Element {
+  return (
+    <>
+      <h1 className="hidden">Scene</h1>
+      <Wanted />
+    </>
+  );
+}
+
+function Wanted(): JSX.Element {
   const at = useRoute();
   const capture = useService((state) =>
     at.capture === null ? newestCapture(state.captures) : (state.captures[at.capture] ?? null),
@@ -42,7 +51,8 @@ export function ScenePage(): JSX.Element {
   );
   const loaded = useService((state) => state.loaded);
   const problem = useWanted(at.capture, capture);
-  if (problem !== null) return <Trouble text={problem} />;
+  if (problem !== null)
+    return <Trouble text={problem} again={() => go({ capture: null, reconstruction: null })} called="Newest scene" />;
   if (!loaded && capture === null) return <Loading what="the scene" />;
   if (capture === null)
     return (
@@ -146,7 +156,6 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   };
   return (
     <div className="scene">
-      <h1 className="hidden">Scene</h1>
       <div className={at.ride ? "viewport ride" : "viewport"}>
         <div className="stage">
           <canvas

@@ -1,7 +1,8 @@
 import { beforeEach, expect, it } from "vitest";
 
 import type { Capture, Message, Reconstruction } from "../api/types";
-import { newestCapture, newestReconstruction, takeMessage, useService } from "./store";
+import { ApiError } from "../api/http";
+import { newestCapture, newestReconstruction, takeMessage, useService, wordsOf } from "./store";
 
 const initial = useService.getInitialState();
 beforeEach(() => useService.setState(initial, true));
@@ -36,4 +37,16 @@ it("forgets the pictures of the capture before", () => {
   takeMessage(message("preview", { kind: "interval", image: "2" }, { capture_id: "b" }));
   expect(Object.keys(useService.getState().previews)).toEqual(["interval"]);
   expect(useService.getState().previewOf).toBe("b");
+});
+
+it("puts what the service says into sentences for a person", () => {
+  const gone = new ApiError(
+    404,
+    "there is no capture 12; GET captures lists them",
+    "look for the id with the GET of the list",
+  );
+  expect(wordsOf(gone)).toBe("There is no capture 12. It may have been deleted.");
+  const full = new ApiError(507, "the disk is full", "remove recordings");
+  expect(wordsOf(full)).toBe("The disk is full. Remove recordings.");
+  expect(wordsOf(new ApiError(422, "/data/a.dat: cannot be read"))).toBe("/data/a.dat: cannot be read.");
 });

@@ -151,12 +151,19 @@ export function takeMessage(message: Message): void {
   }
 }
 
+/** With a capital and a full stop, unless it begins with a path or ends with a sign already. */
+export const sentence = (text: string): string =>
+  text.replace(/^[a-z](?=[a-z]* )/, (c) => c.toUpperCase()).replace(/([^.!?…])$/, "$1.");
+
 /** Why asking failed, in words for a person. */
 export function wordsOf(error: unknown): string {
   if (error instanceof ApiError) {
     if (error.status === 401)
       return "This service needs its token. Open the address that `spiked serve` printed, or add ?token=… to this one.";
-    return error.whatToDo === null ? error.message : `${error.message} ${error.whatToDo}`;
+    // What the service advises then is written for callers of its API.
+    if (error.status === 404 && error.message.startsWith("there is no "))
+      return `${sentence(error.message.split(";")[0] ?? "")} It may have been deleted.`;
+    return error.whatToDo === null ? sentence(error.message) : `${sentence(error.message)} ${sentence(error.whatToDo)}`;
   }
   if (error instanceof UnreachableError) return error.message;
   return error instanceof Error ? error.message : String(error);

@@ -164,14 +164,22 @@ export function Empty({ icon, title, children }: { icon: IconName; title: string
 }
 
 /** Something went wrong, in the service's words, with a way to try again. */
-export function Trouble({ text, again }: { text: string; again?: () => void }): JSX.Element {
+export function Trouble({
+  text,
+  again,
+  called = "Try again",
+}: {
+  text: string;
+  again?: () => void;
+  called?: string;
+}): JSX.Element {
   return (
     <div className="trouble" role="alert">
       <Icon name="warning" />
       <span>{text}</span>
       {again !== undefined && (
         <button type="button" onClick={again}>
-          Try again
+          {called}
         </button>
       )}
     </div>

@@ -18,6 +18,8 @@ KINKED_SPACINGS = (16, 8)
 """Frames between the knots of straight pieces: interpolated video has a kink every few frames."""
 PHASES = 4
 """Places of the first kink that are tried for each of these."""
+MOST_KNOTS = 128
+"""Of a spline over many seconds, or over long gaps, which gets wider spacings: all is solved densely."""
 FINE_PX = 0.03
 """A departure in the image that needs no finer spline."""
 NO_WORSE = 1.5
@@ -41,14 +43,18 @@ def coarsest(
     """
     found: list[_Candidate] = []
     kinked = [(s, 1, p * s / PHASES) for s, p in product(KINKED_SPACINGS, range(PHASES))]
-    for spacing, degree, phase in [*((s, 3, 0.0) for s in SPACINGS), *kinked]:
+    widest = max(SPACINGS[0], (span[1] - span[0]) / MOST_KNOTS)
+    for spacing, degree, phase in [(widest, 3, 0.0), *((s, 3, 0.0) for s in SPACINGS[1:]), *kinked]:
         begin = (span[0] - phase, span[1])
-        spline = Spline.fit(times, rotations, centres, spacing, degree, span=begin)
-        left = len(times) - len(spline.centres)
+        knots = np.ceil((span[1] - begin[0]) / spacing) + degree + 1
+        left = len(times) - knots
         if found and left < len(times) / 4:
             continue
+        spline = Spline.fit(times, rotations, centres, spacing, degree, span=begin)
         spline, square = _fit_weighted(spline, times, rotations, centres, hessians)
-        one = _Candidate(spline, float(np.sqrt(square / max(observations, 1))), square / max(left, 1))
+        one = _Candidate(
+            spline, float(np.sqrt(square / max(observations, 1))), square / max(len(times) - len(spline.centres), 1)
+        )
         found.append(one)
         if one.rms_px < FINE_PX:
             break

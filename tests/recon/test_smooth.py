@@ -3,7 +3,7 @@
 import numpy as np
 
 from spiked.pose import exp_so3
-from spiked.recon.smooth import coarsest
+from spiked.recon.smooth import MOST_KNOTS, coarsest
 
 TIMES = np.arange(2.0, 322.0, 4.0)
 FOCAL_PX = 500.0
@@ -48,3 +48,11 @@ def test_a_direction_that_was_hardly_seen_does_not_pull() -> None:
     wild[:, 0] += rng.normal(scale=3 / FOCAL_PX, size=len(TIMES))
     spline = follow(phi + noise(rng), wild, hessians)
     assert spline.spacing >= 32
+
+
+def test_a_path_of_a_minute_has_a_bounded_number_of_knots() -> None:
+    """A live capture with a long gap once took minutes and gigabytes here."""
+    times = np.concatenate([TIMES, TIMES + 1_200_000.0])
+    phi = 0.05 * np.sin(times / 150)[:, None] * [0.3, 1.0, 0.1]
+    spline = coarsest(times, exp_so3(phi), phi, weights(len(times)), 100 * len(times), (0.0, 1_200_322.0))
+    assert len(spline.centres) <= MOST_KNOTS + 4

@@ -4,11 +4,13 @@
 
 The recording is replayed at `--pace` times its rate as a camera that does not wait (1 is 20 kHz for most). A frame's
 light ends when it is committed to the ring, which this program watches every half millisecond; its pose counts as told
-when the WebSocket message has come here.
+when the WebSocket message has come here. A recording that is shorter than `--seconds` is repeated: let it end where it
+begins, or the tracker meets jumps.
 """
 
 import argparse
 import json
+import math
 import platform
 import re
 import subprocess
@@ -85,7 +87,9 @@ def measure(recording: Path, pace: float, seconds: float, steps: int) -> str:
             address = found[0].rstrip("/")
             stream = f"{address.replace('http', 'ws')}/api/v1/events?topics=pose,capture,job"
             with connect(stream, compression=None, max_queue=None) as events:
-                source = f"replay:{recording}?pace={pace:g}"
+                sensor, frames = (whole := open_recording(recording)).sensor, whole.frames
+                repeat = math.ceil(seconds * sensor.frame_rate_hz / frames)
+                source = f"replay:{recording}?pace={pace:g}&repeat={repeat}"
                 body = {"source": source, "seconds": seconds, "options": {"steps": steps}}
                 started = httpx.post(f"{address}/api/v1/captures", json=body, timeout=60)
                 started.raise_for_status()

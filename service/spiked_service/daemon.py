@@ -148,11 +148,17 @@ class _Server(uvicorn.Server):
             self._notifier.watch(self._daemon.lives)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """The workers learn of the end at once, not when the last response is sent."""
-        self._notifier.stopping()
-        _log.info("stopping", signal=signal.Signals(sig).name)
-        threading.Thread(target=self._daemon.services.captures.dismiss, name="dismissal").start()
+        """The workers learn of the end at once, not when the last response is sent.
+
+        On a thread: the signal may have come while this one held a lock of the log or of the events.
+        """
+        threading.Thread(target=self._dismiss, args=(signal.Signals(sig).name,), name="dismissal").start()
         super().handle_exit(sig, frame)
+
+    def _dismiss(self, name: str) -> None:
+        self._notifier.stopping()
+        _log.info("stopping", signal=name)
+        self._daemon.services.captures.dismiss()
 
     def handle_reload(self, sig: int, frame: FrameType | None) -> None:
         """On a thread: files are read."""

@@ -58,6 +58,7 @@ class Stream:
         self._refusal: str | None = None
         self._closing = False
         self._stopping = False
+        self._orphaned = False  # the acquisition has died, and another is about to be started
         self._ended = False
         self._final: Counters | None = None
         self._backoff = Backoff()
@@ -121,7 +122,7 @@ class Stream:
         with self._lock:
             self._stopping = True
             child = self._children.get(Role.ACQUISITION)
-            waiting = child is None and not self._ended
+            waiting = self._orphaned
         if child is not None:
             child.stop()
         elif waiting:
@@ -133,7 +134,7 @@ class Stream:
             self._closing = True
             self._backoff.cancel()
             children = list(self._children.values())
-            waiting = Role.ACQUISITION not in self._children and not self._ended
+            waiting = self._orphaned
         for child in children:
             child.dismiss()
         if waiting:
@@ -180,7 +181,7 @@ class Stream:
         died_s = time.monotonic()
         with self._lock:
             self._children.pop(Role.ACQUISITION, None)
-            follows = trouble is not None and self._hold(trouble)
+            follows = self._orphaned = trouble is not None and self._hold(trouble)
         if follows and self._acquisition_backoff.again(lambda: self._succeed(died_s)) is not None:
             self._warn(f"{trouble}; another goes on, and what came meanwhile is lost")
             return
@@ -201,6 +202,7 @@ class Stream:
             again = {"ring": self._opened.name, "died_s": died_s}
             try:
                 self._acquire(self._order.model_copy(update=again))
+                self._orphaned = False
                 return
             except OSError as error:
                 trouble = f"the acquisition cannot be started again: {error}"

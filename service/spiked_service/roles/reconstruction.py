@@ -15,7 +15,6 @@ from spiked.recording import open_recording
 from spiked.ring import End, Frames, Gap, Policy, RingReader
 from spiked.sensor import Intrinsics, Sensor
 from spiked_service.chronicle import Chronicle
-from spiked_service.haste import Haste
 from spiked_service.messages import Posed, ReconstructionOrder, ReconstructionStatus, Stage, VersionPublished
 from spiked_service.offline import pieces
 from spiked_service.payloads import PosePayload
@@ -65,10 +64,9 @@ class _Work:
     herald: "_Herald"
     link: Link
 
-    def feed(self, first: int, frames: NDArray[np.uint8], latency_frames: int | None = None) -> int:
-        """How many views it made."""
+    def feed(self, first: int, frames: NDArray[np.uint8], latency_frames: int | None = None) -> None:
         self.reconstructor.feed(first, frames)
-        return self.herald.tracked(latency_frames)
+        self.herald.tracked(latency_frames)
 
     def lose(self, first: int, count: int, cause: str) -> None:
         self.reconstructor.gap(first, count)
@@ -84,7 +82,6 @@ def _begin(order: ReconstructionOrder, sensor: Sensor, link: Link) -> _Work:
 def _follow(reader: RingReader, work: _Work, order: ReconstructionOrder) -> None:
     """Take frames and gaps until the capture's end."""
     mapped_to = 0
-    haste = None if order.unhurried else Haste(reader.geometry.sensor.frame_rate_hz)
     zero, stop = order.first_frame, order.stop_frame
     while not work.link.leave.is_set():
         item = reader.next(_WAIT_S)
@@ -95,17 +92,12 @@ def _follow(reader: RingReader, work: _Work, order: ReconstructionOrder) -> None
                 begin, end = _within(item.first, item.first + item.count, zero, stop)
                 if end > begin:
                     work.lose(begin - zero, end - begin, item.cause)
-            case Frames() if haste is not None and not haste.wants(item.first, item.count):
-                item.release()
             case Frames():
                 copied = np.array(item.data)
                 begin, end = _within(item.first, item.first + item.count, zero, stop)
                 if item.release() and end > begin:
-                    late = reader.status().writer.next_frame - end
-                    part = copied[begin - item.first : end - item.first]
-                    views = work.feed(begin - zero, part, late if haste else None)
-                    if haste is not None:
-                        haste.fed(end, views, reader.status().writer.next_frame - end)
+                    late = None if order.unhurried else reader.status().writer.next_frame - end
+                    work.feed(begin - zero, copied[begin - item.first : end - item.first], late)
                 if order.unhurried and item.first - mapped_to >= _UNHURRIED_FRAMES:
                     mapped_to = item.first
                     work.reconstructor.improve(_UNHURRIED_S)
@@ -161,18 +153,17 @@ class _Herald:
     def lost(self, first: int, count: int, cause: str) -> None:
         self._chronicle.lost(first, count, cause)
 
-    def tracked(self, latency_frames: int | None) -> int:
-        """Tell of the views that were tracked since the last call; how many there were."""
+    def tracked(self, latency_frames: int | None) -> None:
+        """Tell of the views that were tracked since the last call."""
         new = self._reconstructor.tracked(self._tracked)
         self._tracked += len(new)
         if not new:
-            return 0
+            return
         status = self._reconstructor.status()
         for view in new:
             self._chronicle.tracked(view, status, _psnr_db(status.loss))
             if view.rotation is not None and view.centre is not None:
                 self._link.mention(Posed(pose=self._pose(view, status, latency_frames)))
-        return len(new)
 
     def progress(self, status: Status) -> None:
         now_s = time.monotonic()

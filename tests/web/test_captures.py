@@ -13,6 +13,7 @@ def test_a_capture_is_found_and_looked_at(studied: Studied, visit: Callable[...,
     row.wait_for()
     assert "good" in row.inner_text()
     assert "51.2" in row.inner_text()  # milliseconds
+    row.get_by_text("complete").wait_for()  # its reconstruction
     until(lambda: row.locator("img").evaluate("image => image.naturalWidth") > 0, "a thumbnail")
     page.get_by_label("Search captures").fill("no such thing")
     page.get_by_text("Nothing is found").wait_for()

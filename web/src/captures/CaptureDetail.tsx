@@ -490,7 +490,10 @@ function Log({ job }: { job: Reconstruction }): JSX.Element {
   useEffect(() => {
     if (!open || ended) return;
     const timer = setInterval(again, 2000);
-    return () => clearInterval(timer);
+    return () => {
+      clearInterval(timer);
+      again(); // what came between the last look and the end
+    };
   }, [open, ended, again]);
   return (
     <details className="panel log" onToggle={(event) => setOpen(event.currentTarget.open)}>

@@ -7,7 +7,7 @@ import type { Capture } from "../api/types";
 import { lengthOf, nameOf, sourceOf } from "../state/capture";
 import { bytes, when } from "../state/format";
 import { adjust, go, useRoute } from "../state/route";
-import { newestReconstruction, useService, wordsOf } from "../state/store";
+import { loadReconstructions, newestReconstruction, useService, wordsOf } from "../state/store";
 import { Icon } from "../ui/icons";
 import { Badge, captureTone, Empty, gradeTone, jobTone, Loading, Trouble } from "../ui/parts";
 import { removeWithUndo } from "./remove";
@@ -143,6 +143,10 @@ function Row({
 }): JSX.Element {
   const job = useService((state) => newestReconstruction(state.reconstructions, capture.id));
   const jobs = capture.reconstruction_ids.length;
+  const unknown = job === null && jobs > 0;
+  useEffect(() => {
+    if (unknown) loadReconstructions(capture.id).catch(() => undefined); // the band at the top tells
+  }, [unknown, capture.id]);
   const href = `./?page=captures&capture=${capture.id}`;
   return (
     <tr>
@@ -177,11 +181,11 @@ function Row({
       </td>
       <td>
         {job === null ? (
-          <span className="dim">{jobs === 0 ? "none" : `${jobs}`}</span>
+          <span className="dim">{jobs === 0 ? "none" : "…"}</span>
         ) : (
           <Badge tone={jobTone[job.state]}>{job.state === "running" ? job.stage : job.state}</Badge>
         )}
-        {jobs > 1 && <span className="dim"> of {jobs}</span>}
+        {jobs > 1 && job !== null && <span className="dim"> of {jobs}</span>}
       </td>
       <td className="number">
         <button

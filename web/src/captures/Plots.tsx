@@ -30,7 +30,10 @@ export function Plots({
   useEffect(() => {
     if (ended) return;
     const timer = setInterval(again, LIVE_MS);
-    return () => clearInterval(timer);
+    return () => {
+      clearInterval(timer);
+      again(); // what came between the last look and the end
+    };
   }, [ended, again]);
 
   const rateHz = capture.sensor?.frame_rate_hz ?? null;

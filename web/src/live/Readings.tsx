@@ -13,6 +13,10 @@ export function Frames({ capture, rateHz }: { capture: Capture; rateHz: number |
   const sensor = capture.sensor;
   const lost = counters === null ? 0 : Object.values(counters.lost).reduce((sum, n) => sum + n, 0);
   const seconds = counters !== null && sensor !== null ? counters.next_frame / sensor.frame_rate_hz : null;
+  const waits =
+    capture.state === "streaming" &&
+    /^(sim|replay):/.test(capture.source) &&
+    counters?.consumers.some((one) => one.policy === "lossless" && one.fill > 0.9) === true;
   return (
     <Panel title="Frames" aside={<Badge tone={captureTone[capture.state]}>{capture.state}</Badge>}>
       <dl className="stats">
@@ -98,6 +102,11 @@ export function Frames({ capture, rateHz }: { capture: Capture; rateHz: number |
             </table>
           )}
         </>
+      )}
+      {waits && (
+        <p className="dim note">
+          The source waits for the reconstruction: no frame is lost, and the capture takes longer than its time.
+        </p>
       )}
       {capture.warnings.map((warning) => (
         <p key={warning} className="warning">

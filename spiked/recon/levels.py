@@ -20,7 +20,7 @@ class Target:
     values: Image
     """Rates [H, W], or [H, W, 3] where a mosaic's tiles have become pixels."""
     deviation: Image
-    """Their standard deviation, of the same shape."""
+    """Their standard deviation, of the same shape; infinite where nothing was seen."""
     windows: Image | None
     """[2, H, W] as in `Sight`."""
 
@@ -39,20 +39,31 @@ class Level:
         if sensor.mosaic is not None and factor == 1:
             self.channels = sensor.mosaic.channels(sensor.height, sensor.width)
 
-    def target(self, view: View, windows: Image | None) -> Target:
-        """A view at this size; what does not fill a large pixel at the right and lower edges is left out."""
+    def target(self, view: View, windows: Image | None, seen: NDArray[np.bool_] | None) -> Target:
+        """A view at this size; what does not fill a large pixel at the right and lower edges is left out.
+
+        A large pixel has seen what half of its pixels have. None for `seen` are all of them.
+        """
         if self.factor == 1:
-            return Target(view.rate, view.deviation, windows)
+            deviation = view.deviation if seen is None else np.where(seen, view.deviation, np.float32(np.inf))
+            return Target(view.rate, deviation, windows)
         small = None if windows is None else np.ascontiguousarray(np.stack([self._mean(w) for w in windows]))
+        values, deviation = self._small(view)
+        if seen is not None:
+            enough = self._mean(seen.astype(np.float32)) > 0.5
+            deviation[~enough] = np.inf
+        return Target(values, deviation, small)
+
+    def _small(self, view: View) -> tuple[Image, Image]:
+        """Rates and their deviations of large pixels."""
         if self._mosaic is None:
-            return Target(self._mean(view.rate), self._mean(view.deviation) / np.float32(self.factor), small)
+            return self._mean(view.rate), self._mean(view.deviation) / np.float32(self.factor)
         values = _tiles(view.rate, self._mosaic)
         deviation = np.sqrt(_tiles(view.deviation**2, self._mosaic)) * _GREEN_SHARE
         rest = self.factor // 2
-        return Target(
+        return (
             np.stack([_mean(values[..., c], rest) for c in range(3)], -1),
             np.stack([_mean(deviation[..., c], rest) / np.float32(rest) for c in range(3)], -1),
-            small,
         )
 
     def grey(self, image: Image) -> Image:

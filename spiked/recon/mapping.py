@@ -43,8 +43,10 @@ class Sight:
     """[S, 3, 3]"""
     centres: Array
     """[S, 3]"""
-    windows: Image | None
+    windows: Image | None = None
     """[2, H, W] for a camera that moves from pose to pose (`Rasteriser.forward_moving`); None: it stands still."""
+    seen: NDArray[np.bool_] | None = None
+    """[H, W], which pixels looked in these windows; None: all."""
 
 
 class Mapper:
@@ -121,8 +123,9 @@ class Mapper:
         return self.levels[int(np.ceil(coarse * (len(self.levels) - 1)))]
 
     def step(self, key: int, view: View, sight: Sight, decay: float, level: Level) -> Gradients:
-        """One gradient step on a view; `decay` scales the rate of the means. Returns the gradients (for the poses)."""
-        target = level.target(view, sight.windows)
+        """One gradient step on a view; `decay` scales the rate of the means, and its root the others.
+        Returns the gradients (for the poses)."""
+        target = level.target(view, sight.windows, sight.seen)
         # A background of any brightness: dark things have to be there, not to be holes.
         background = float(self._rng.uniform(0, self.options.background)) * self.white
         image = _look(level, self.scene, replace(sight, windows=target.windows), background)
@@ -130,7 +133,7 @@ class Mapper:
         factor: Image | None = None
         if level.factor == 1 and self.options.nuisances and self.steps >= NUISANCES_FROM:
             factor = self.nuisances.factor(key)
-            self.nuisances.observe(key, image.values, view.rate, view.deviation, self.steps >= GAINS_FROM)
+            self.nuisances.observe(key, image.values, view.rate, target.deviation, self.steps >= GAINS_FROM)
             expected = expected * factor
             if self.steps % NUISANCE_STEPS == NUISANCE_STEPS - 1:
                 self.nuisances.update()
@@ -140,9 +143,13 @@ class Mapper:
         gradients = level.rasteriser.backward(slope)
         self.steps += 1
         o = self.options
-        rates = (o.rate_means * decay, o.rate_quats, o.rate_scales, o.rate_opacities, o.rate_colours * self.white)
+        rest = float(np.sqrt(decay))
+        others = (o.rate_quats, o.rate_scales, o.rate_opacities, o.rate_colours * self.white)
+        rates = (o.rate_means * decay, *(rest * rate for rate in others))
         slopes = (gradients.means, gradients.quats, gradients.log_scales, gradients.opacity_logits, gradients.colours)
         self.adam.step(self.scene.arrays(), slopes, rates, gradients.radius_px > 0)
+        # Light taken away would fit as well, but viewers of the scene know none: they show such splats as black.
+        np.maximum(self.scene.colours, 0, out=self.scene.colours)
         return gradients
 
     def _slope(self, expected: Image, target: Target, level: Level) -> tuple[Image, float]:
@@ -194,7 +201,8 @@ class Mapper:
         image = self.look(sight)
         middle = len(sight.centres) // 2
         rotation, centre = sight.rotations[middle], sight.centres[middle]
-        error = (view.rate - self.nuisances.factor(key) * image.values) * self._certainty(view.deviation)
+        certainty = self._certainty(self.levels[0].target(view, sight.windows, sight.seen).deviation)
+        error = (view.rate - self.nuisances.factor(key) * image.values) * certainty
         badness = cv2.GaussianBlur(np.abs(cv2.GaussianBlur(error, (0, 0), 0.7)), (0, 0), 1.0)
         badness = np.maximum(badness - np.median(badness), 0)
         dead = np.flatnonzero(self.scene.opacity_logits < -4.0)

@@ -38,16 +38,20 @@ class Nuisances:
         return np.asarray(self.gain * np.float32(self.level(key)), np.float32)
 
     def observe(self, key: int, rendered: Image, observed: Image, deviation: Image, gains: bool = True) -> None:
-        """Take one view's render [H, W] (without nuisances), its rates and their deviations.
+        """Take one view's render [H, W] (without nuisances), its rates and their deviations
+        (infinite where nothing was seen).
 
         Without `gains` only the view's level is learnt from it.
         """
         expected = self.gain * rendered
-        precision = 1 / (deviation * deviation + np.square(MODEL_ERROR * (expected + observed)) + 1e-12)
+        error = MODEL_ERROR * (expected + observed)
+        precision = 1 / (deviation * deviation + error * error + 1e-12)
         # A ratio of means: a least-squares slope would come out low for as long as the map is rough, and drag it along.
-        total = float((precision * expected).sum())
+        # Nor may the dark pixels speak loudest, as weights by precision let them.
+        agree = (np.abs(observed - expected) < 3 * (deviation + error)) & np.isfinite(deviation)
+        total = float(expected[agree].sum())
         if total > 0:
-            self._levels[key] = float((precision * observed).sum()) / total
+            self._levels[key] = float(observed[agree].sum()) / total
             self._mean_level = float(np.mean(list(self._levels.values())))
         if not gains:
             return

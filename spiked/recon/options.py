@@ -20,9 +20,9 @@ class MapOptions:
     rate_means: float = 2e-3
     """Learning rates at the start, per step; those of the means and of colour are in units of depth and of white."""
     rate_quats: float = 8e-3
-    rate_scales: float = 1.2e-2
-    rate_opacities: float = 3e-2
-    rate_colours: float = 4e-3
+    rate_scales: float = 3e-2
+    rate_opacities: float = 8e-2
+    rate_colours: float = 1.5e-2
     ssim: float = 0.2
     """Share of structural similarity in the loss of grey views, as in 3D Gaussian splatting."""
     sub_frames: int | None = None
@@ -41,7 +41,7 @@ class Options:
 
     window_frames: int | None = None
     """Frames of a view; None follows the motion (8 to 64)."""
-    steps: int = 4000
+    steps: int = 2500
     """Gradient steps of the final refinement; images of more than 130,000 pixels get fewer, as each costs more."""
     seed: int = 0
     """Seed of everything random: the same input, options and seed give the same result."""

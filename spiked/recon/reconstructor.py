@@ -40,8 +40,10 @@ YOUNG_STEPS = 800
 SEED_VIEWS = 5
 """Views swept for depth when the map begins."""
 SWEEP_NEIGHBOURS = 5
-ALIGNMENTS = 8
-"""Times that the whole path is aligned with the map in a refinement, counting the one at its end, which is left out."""
+ALIGNMENTS = 7
+"""Times that the whole path is aligned with the map in a refinement."""
+ALIGNED_SHARE = 0.6
+"""Part of the refinement in which that happens; then the map settles on the path that was found."""
 ALIGNED_VIEWS = 160
 """Views looked at for it, at most."""
 
@@ -277,13 +279,13 @@ class Reconstructor:
         parts = self.options.mapping.sub_frames
         if parts == 0:
             rotations, centres = spline.poses([view.time])
-            return Sight(rotations, centres, None)
+            return Sight(rotations, centres)
         if parts is None:
-            times, _ = view.exposure(1)
+            times, _, _ = view.exposure(1)
             parts = int(np.clip(np.ceil(self._motion(spline, times) / (SUB_FRAME_PX * pixel)), 1, MAX_SUB_FRAMES))
-        times, windows = view.exposure(parts)
+        times, windows, seen = view.exposure(parts)
         rotations, centres = spline.poses(np.clip(times, spline.begin, spline.end))
-        return Sight(rotations, centres, windows)
+        return Sight(rotations, centres, windows, seen)
 
     def _motion(self, spline: Spline, times: Array) -> float:
         """How far the image moves between two times at a typical place, in pixels."""
@@ -365,7 +367,8 @@ class Reconstructor:
 
     def _aligns(self, done: int, steps: int) -> bool:
         wanted = self.options.refine_poses and self.options.poses is None
-        return wanted and (done + 1) % max(1, steps // ALIGNMENTS) == 0 and done < 0.9 * steps
+        interval = max(1, int(ALIGNED_SHARE * steps) // ALIGNMENTS)
+        return wanted and (done + 1) % interval == 0 and done < ALIGNED_SHARE * steps
 
     def _align(self) -> None:
         spline = self.spline

@@ -49,7 +49,7 @@ def _normal_equations(
 ) -> tuple[Array, Array]:
     """Hessian [6, 6] and gradient [6] of the view's weighted squared error, for (phi, centre) perturbed on the left."""
     level = mapper.alignment_level
-    target = level.target(view, sight.windows)
+    target = level.target(view, sight.windows, sight.seen)
     image = mapper.look(replace(sight, windows=target.windows), level)
     expected = image.values
     if level.factor == 1:

@@ -14,6 +14,11 @@ from spiked.sensor import Mosaic, Sensor
 
 Image = NDArray[np.float32]
 
+LATE_PERCENT = 10.0
+"""Pixels, of a hundred, that may begin before the span over which a view is rendered, or end after it: the darkest ones
+gather charge for so long that sub-frames over all of it would be too long to be straight."""
+LEAST_INSIDE = 0.7
+"""Part of a pixel's time that has to lie in that span."""
 MARGIN = 24
 """Frames looked at on both sides of a window for the spikes nearest to its edges."""
 PROBE = 16
@@ -56,20 +61,24 @@ class View:
         """The middle of the window in frames."""
         return 0.5 * (self.begin + self.end)
 
-    def exposure(self, parts: int) -> tuple[NDArray[np.float64], Image]:
+    def exposure(self, parts: int) -> tuple[NDArray[np.float64], Image, NDArray[np.bool_]]:
         """When each pixel gathered its charge, for `Rasteriser.forward_moving` with `parts` sub-frames.
 
         Returns the times [parts + 1] in frames at which the camera's poses are wanted, evenly spaced over what most
-        pixels looked at, and the pixels' windows [2, H, W] in units of these.
+        pixels looked at, the pixels' windows [2, H, W] in units of these, and which pixels [H, W] they describe: the
+        others looked much longer.
         """
         half = 0.5 * self.duration.astype(np.float32)
         start, stop = self.delay - half, self.delay + half
-        first, last = np.percentile(start[::4, ::4], 2), np.percentile(stop[::4, ::4], 98)
+        first = np.percentile(start[::4, ::4], LATE_PERCENT)
+        last = np.percentile(stop[::4, ::4], 100 - LATE_PERCENT)
         scale = np.float32(parts / max(last - first, 1e-3))
         windows = np.stack([(start - np.float32(first)) * scale, (stop - np.float32(first)) * scale])
+        whole = windows[1] - windows[0]
         np.clip(windows[0], 0, parts - 0.02, out=windows[0])
         np.clip(windows[1], windows[0] + 0.02, parts, out=windows[1])
-        return self.time + np.linspace(first, last, parts + 1), windows.astype(np.float32)
+        seen = windows[1] - windows[0] >= LEAST_INSIDE * whole
+        return self.time + np.linspace(first, last, parts + 1), windows.astype(np.float32), seen
 
 
 def make_view(

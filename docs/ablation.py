@@ -21,6 +21,7 @@ from unittest import mock
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 import spiked.recon.bootstrap as bootstrap
 from spiked.blocks import Window
@@ -69,7 +70,7 @@ def still_poses(parts: int) -> Callable[[Reconstructor, View, Spline, int], Sigh
         edges = np.linspace(view.begin, view.end, parts + 1)
         times = np.clip(0.5 * (edges[1:] + edges[:-1]), spline.begin, spline.end)
         rotations, centres = spline.poses(times)
-        return Sight(rotations, centres, None)
+        return Sight(rotations, centres)
 
     return sight
 
@@ -95,10 +96,12 @@ def pooled_binomial(self: Mapper, expected: Image, target: Target, level: Level)
 class Demosaiced(Level):
     """Full size with colours interpolated before the fit."""
 
-    def target(self, view: View, windows: Image | None) -> Target:
+    def target(self, view: View, windows: Image | None, seen: NDArray[np.bool_] | None) -> Target:
         assert self._mosaic is not None
         channels = self._mosaic.channels(*view.rate.shape)
         deviation = np.repeat(view.deviation[..., None], 3, -1)
+        if seen is not None:
+            deviation[~seen] = np.inf
         return Target(fill_mosaic(view.rate, channels), deviation, windows)
 
 

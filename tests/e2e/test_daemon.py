@@ -59,7 +59,7 @@ def test_a_recording_becomes_a_trajectory_and_novel_views(
     score = score_trajectory(truth, estimate, RATE_HZ)
     assert score.coverage > 0.98
     assert score.errors is not None
-    assert score.errors.ate_percent < 8  # a map begun while the path was still drifting holds it there: offline it is 3
+    assert score.errors.ate_percent < 4
     assert score.errors.rpe_r_deg < 0.1
 
     listed = http.get(f"captures/{capture_id}/trajectory").json()

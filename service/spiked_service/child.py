@@ -4,6 +4,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
@@ -121,7 +122,8 @@ class Child:
                     failure = failure or f"the service failed over news of the {self.role} worker: {error!r}"
                     self.dismiss()
         code = self._process.wait()
-        with self._writing:
+        # Closing sends what could not be sent before, and it is dead: that must not keep its end from being told.
+        with self._writing, suppress(BrokenPipeError):
             self._stdin.close()
         self._on_exit(failure or self._verdict(code))
 

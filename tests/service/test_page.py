@@ -24,6 +24,16 @@ def test_hashed_files_are_kept_and_the_index_is_asked_for_anew(tmp_path: Path) -
     assert http.get("/assets/gone.js").status_code == 404
 
 
+def test_below_the_page_a_wrong_method_of_the_api_is_told_as_one(tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text("<title>spiked</title>")
+    app = FastAPI()
+    app.add_api_route("/api/v1/captures", lambda: None, methods=["POST"])
+    mount_page(app, tmp_path)
+    http = TestClient(app)
+    assert http.get("/api/v1/captures").status_code == 405
+    assert http.get("/api/v1/nothing").status_code == 404
+
+
 def test_without_a_built_page_the_service_says_how_to_build_it(tmp_path: Path) -> None:
     http = client(tmp_path)
     assert "make page" in http.get("/").text

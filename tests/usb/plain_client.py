@@ -15,7 +15,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import usb.backend.libusb0
 import usb.backend.libusb1
+import usb.backend.openusb
 import usb.core
 import usb.util
 
@@ -159,6 +161,6 @@ def _read(device: Any, write: Callable[[bytes], Any], index: int | None, timeout
 if __name__ == "__main__":
     function, arguments = sys.argv[1], json.loads(sys.argv[2])
     if arguments["user"] is not None:
-        usb.backend.libusb1.get_backend()  # nobody may not look for libraries everywhere
+        usb.backend.libusb1.get_backend()  # nobody may not look for libraries everywhere, nor for modules
         os.setuid(arguments["user"])
     print(json.dumps(globals()[function](*arguments["args"], **arguments["kwargs"])))

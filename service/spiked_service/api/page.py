@@ -6,6 +6,7 @@ from fastapi import FastAPI
 from fastapi.responses import HTMLResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.responses import Response
+from starlette.routing import Match, Mount
 from starlette.types import Scope
 
 PAGE = Path(__file__).parents[1] / "page"
@@ -30,10 +31,19 @@ class _Page(StaticFiles):
         return response
 
 
+class _BesideApi(Mount):
+    """Leaves the API's addresses alone: there a wrong method is a wrong method (405), not a file that is missing."""
+
+    def matches(self, scope: Scope) -> tuple[Match, Scope]:
+        if scope["path"].startswith("/api/"):
+            return Match.NONE, {}
+        return super().matches(scope)
+
+
 def mount_page(app: FastAPI, folder: Path = PAGE) -> None:
     """Serve the built page below `/`, after all other routes; without one, say at `/` how to build it."""
     if (folder / "index.html").is_file():
-        app.mount("/", _Page(directory=folder, html=True))
+        app.router.routes.append(_BesideApi("/", _Page(directory=folder, html=True)))
         return
 
     @app.get("/", include_in_schema=False)

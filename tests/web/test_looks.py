@@ -4,8 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from browsing import DESKTOP, PHONE, Studied, shown_version, until
+from browsing import DESKTOP, PHONE, Studied, picture, shown_version, still, until
 from PIL import Image
 
 AXE = Path(__file__).resolve().parents[2] / "web" / "node_modules" / "axe-core" / "axe.min.js"
@@ -25,7 +26,8 @@ def settled(page: Any, name: str) -> None:
     """Wait until there is on the page what makes it that page."""
     if name in ("scene", "ride"):
         until(lambda: shown_version(page) > 0, "a scene")
-        page.wait_for_timeout(1500)  # SwiftShader draws the newest sorting after that
+        until(lambda: drawn(page) > 0.1, "the scene on the canvas")
+        still(page)
     if name == "ride":
         page.locator("img.observed").wait_for()
     if name == "live":
@@ -38,6 +40,12 @@ def settled(page: Any, name: str) -> None:
     if name == "setup":
         page.locator(".configuration tbody tr").first.wait_for()
         page.locator(".doctor li").first.wait_for()
+
+
+def drawn(page: Any) -> float:
+    """The share of the canvas that is not as its corner: lines alone take up little."""
+    seen = picture(page)
+    return float((np.abs(seen - seen[2, 2]).max(-1) > 0.1).mean())
 
 
 def violations(page: Any) -> list[str]:

@@ -1,6 +1,5 @@
 """What every request passes before it reaches a route: whose it is, where from, how much, how often."""
 
-import html
 import ipaddress
 import math
 from collections.abc import Awaitable, Callable, MutableMapping
@@ -12,10 +11,11 @@ from urllib.parse import parse_qs, urlencode, urlsplit
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.requests import Request, cookie_parser
-from starlette.responses import HTMLResponse, RedirectResponse, Response
+from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from spiked.errors import ConfigurationError
+from spiked_service import sign_in
 from spiked_service.api.problems import problem
 from spiked_service.limits import RateLimit
 from spiked_service.live import LiveSettings
@@ -24,7 +24,6 @@ from spiked_service.tokens import Tokens
 COOKIE = "spiked_token"
 _OPEN = frozenset({"/healthz", "/readyz"})
 """A supervisor asks these without a token; they tell nothing about anybody."""
-_SIGN_IN = "/sign-in"
 _EVENTS = "/api/v1/events"
 _CHANGING = frozenset({"POST", "PUT", "PATCH", "DELETE"})
 _POLICY = {
@@ -95,8 +94,8 @@ class Security:
         except ConfigurationError as error:
             await _refuse(problem(HTTPStatus.SERVICE_UNAVAILABLE, str(error)), scope, receive, _with_headers(send))
             return
-        if self._guarded and name is None and request.path not in _OPEN:
-            answer = await self._sign_in(request, scope, receive)
+        if self._guarded and (name is None or request.path == sign_in.PATH) and request.path not in _OPEN:
+            answer = await self._sign_in(request, name, scope, receive)
             await _refuse(answer, scope, receive, _with_headers(send))
             return
         if name is not None and request.path == "/" and "token" in request.query:
@@ -132,16 +131,20 @@ class Security:
         given = request.token()
         return self._tokens.name_of(given) if given else None
 
-    async def _sign_in(self, request: "_Asked", scope: Scope, receive: Receive) -> Response:
+    async def _sign_in(self, request: "_Asked", name: str | None, scope: Scope, receive: Receive) -> Response:
         """The answer to somebody without a token: a form for people, a problem for programs."""
-        if request.path == _SIGN_IN and request.method == "POST":
+        there = request.path == sign_in.PATH
+        wanted = request.query.get("then", [""])[0] if there else request.query_without_token()
+        if there and request.method == "POST":
             body = await Request(scope, self._limited(request, receive)).body()
             given = parse_qs(body.decode("latin-1")).get("token", [""])[0].strip()
             if self._tokens.name_of(given) is not None:
-                return _cookie(RedirectResponse("/", HTTPStatus.SEE_OTHER), given, request)
-            return _form("This token does not open the service.")
+                return _cookie(RedirectResponse(sign_in.landing(wanted), HTTPStatus.SEE_OTHER), given, request)
+            return sign_in.form(wrong=True, wanted=wanted)
+        if there and name is not None:
+            return RedirectResponse(sign_in.landing(wanted), HTTPStatus.SEE_OTHER)
         if request.method == "GET" and "text/html" in request.headers.get("accept", ""):
-            return _form("This service needs its token.")
+            return sign_in.form(wrong="token" in request.query, wanted=wanted)
         return problem(
             HTTPStatus.UNAUTHORIZED,
             "this service needs a token: send Authorization: Bearer TOKEN, or open / in a browser and enter it; "
@@ -191,6 +194,10 @@ class _Asked:
             return self.query["token"][0]
         return str(cookie_parser(self.headers.get("cookie", "")).get(COOKIE, ""))
 
+    def query_without_token(self) -> str:
+        """What of the address may be kept."""
+        return urlencode({name: values for name, values in self.query.items() if name != "token"}, doseq=True)
+
     def foreign(self) -> bool:
         """Whether a page of another site makes a browser ask for what only our own page may."""
         if self.method not in _CHANGING and not self.websocket:
@@ -237,19 +244,8 @@ def _cookie(response: Response, token: str, request: _Asked) -> Response:
 
 def _remember(request: _Asked) -> Response:
     """Keep the token in a cookie and take it out of the address."""
-    rest = {name: values for name, values in request.query.items() if name != "token"}
-    there = f"/?{urlencode(rest, doseq=True)}" if rest else "/"
+    there = sign_in.landing(request.query_without_token())
     return _cookie(RedirectResponse(there, HTTPStatus.SEE_OTHER), request.query["token"][0], request)
-
-
-def _form(sentence: str) -> Response:
-    page = (
-        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
-        f"<title>spiked</title><h1>spiked</h1><p>{html.escape(sentence)}</p>"
-        f"<form method=post action={_SIGN_IN}><label>Token <input type=password name=token autofocus></label> "
-        "<button>Open</button></form></html>"
-    )
-    return HTMLResponse(page, HTTPStatus.UNAUTHORIZED, {"WWW-Authenticate": "Bearer", "Cache-Control": "no-store"})
 
 
 async def _refuse(answer: Response, scope: Scope, receive: Receive, send: Send) -> None:

@@ -103,11 +103,20 @@ def test_a_token_opens_as_header_cookie_or_form_until_it_is_revoked(tmp_path: Pa
     assert http.get("/api/v1/system", headers={"authorization": f"bearer {secret}"}).json() == "laptop"
     assert http.get(f"/api/v1/system?token={secret}").status_code == 401  # only where a browser can do no other
 
-    asked = http.get("/", headers={"accept": "text/html"})
-    assert asked.status_code == 401 and "<form method=post action=/sign-in>" in asked.text
+    asked = http.get("/?page=captures&token=old", headers={"accept": "text/html"})
+    assert asked.status_code == 401 and "<form method=post action='/sign-in?then=page%3Dcaptures'>" in asked.text
+    assert "unsafe" not in asked.headers["content-security-policy"]
+    assert asked.headers["referrer-policy"] == "same-origin"  # with no-referrer a form is posted as `Origin: null`
     assert http.post("/sign-in", data={"token": "guess"}).status_code == 401
-    opened = http.post("/sign-in", data={"token": secret}, follow_redirects=False)
-    assert (opened.status_code, opened.headers["location"]) == (303, "/")
+    for wanted, there in (
+        ("page=captures", "/?page=captures"),
+        ("", "/"),
+        ("//evil.example", "/?//evil.example"),
+        ("#x", "/"),
+    ):
+        opened = http.post("/sign-in", params={"then": wanted}, data={"token": secret}, follow_redirects=False)
+        assert (opened.status_code, opened.headers["location"]) == (303, there)
+    assert http.get("/sign-in", follow_redirects=False).headers["location"] == "/"  # gone back to, with the cookie
     cookie = opened.headers["set-cookie"].lower()
     assert "httponly" in cookie and "samesite=strict" in cookie
     assert http.get("/api/v1/system").json() == "laptop"  # the client keeps the cookie

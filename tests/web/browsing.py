@@ -4,6 +4,7 @@ import base64
 import io
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,9 @@ Picture = NDArray[np.float64]
 PATIENCE_S = 60.0
 DESKTOP = {"width": 1280, "height": 800}
 PHONE = {"width": 390, "height": 844}
+AXE = Path(__file__).resolve().parents[2] / "web" / "node_modules" / "axe-core" / "axe.min.js"
+MOST_BYTES = 300_000
+"""Of a screenshot."""
 
 
 def until(condition: Callable[[], Any], what: str, patience_s: float = PATIENCE_S) -> Any:
@@ -95,3 +99,19 @@ def shown_version(page: Any) -> int:
     """Version of the scene on the canvas; 0 before the first."""
     canvas = page.locator(".stage canvas")
     return int(canvas.get_attribute("data-version") or 0) if canvas.count() else 0
+
+
+def violations(page: Any) -> list[str]:
+    """What axe finds wrong."""
+    page.evaluate(AXE.read_text())
+    found = page.evaluate("() => axe.run()")["violations"]
+    return [f"{one['id']}: {one['help']}: {[node['html'][:200] for node in one['nodes']]}" for one in found]
+
+
+def keep(page: Any, path: Path) -> None:
+    """A screenshot, small enough for documentation."""
+    raw = path.with_suffix(".png")
+    page.screenshot(path=raw)
+    Image.open(raw).convert("RGB").save(path, quality=82, method=6)
+    raw.unlink()
+    assert path.stat().st_size < MOST_BYTES

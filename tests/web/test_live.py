@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browsing import PATIENCE_S, Studied, address, choose, until
+from browsing import Studied, choose, until
 from virtual_camera.host import CameraSettings
 from virtual_camera.rig import VirtualCameras
 
@@ -148,10 +148,3 @@ def test_the_first_paint_comes_within_a_second(studied: Studied, visit: Callable
         measured.append(page.evaluate(FIRST_PAINT))
     print("first contentful paint, ms:", [round(at_ms) for at_ms in measured])
     assert min(measured) < FIRST_PAINT_MS, measured
-
-
-def test_a_token_in_the_address_is_kept_out_of_sight(daemon: Callable[..., Any], visit: Callable[..., Any]) -> None:
-    one = daemon("--token", "sesame-open-the-door", "--no-capture", token="sesame-open-the-door")
-    page = visit(f"{one.address}?token=sesame-open-the-door")
-    page.get_by_text("connected", exact=True).wait_for(timeout=1000 * PATIENCE_S)
-    assert "token" not in address(page)

@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browsing import DESKTOP, PHONE, Studied, picture, shown_version, still, until
-from PIL import Image
+from browsing import AXE, DESKTOP, PHONE, Studied, keep, picture, shown_version, still, until, violations
 
-AXE = Path(__file__).resolve().parents[2] / "web" / "node_modules" / "axe-core" / "axe.min.js"
 PAGES = {
     "live": "",
     "scene": "?page=scene",
@@ -19,7 +17,6 @@ PAGES = {
     "setup": "?page=setup",
 }
 NOBODY = "00000000-0000-7000-8000-000000000000"
-MOST_BYTES = 300_000
 
 
 def settled(page: Any, name: str) -> None:
@@ -46,12 +43,6 @@ def drawn(page: Any) -> float:
     """The share of the canvas that is not as its corner: lines alone take up little."""
     seen = picture(page)
     return float((np.abs(seen - seen[2, 2]).max(-1) > 0.1).mean())
-
-
-def violations(page: Any) -> list[str]:
-    page.evaluate(AXE.read_text())
-    found = page.evaluate("() => axe.run()")["violations"]
-    return [f"{one['id']}: {one['help']}: {[node['html'][:200] for node in one['nodes']]}" for one in found]
 
 
 @pytest.mark.parametrize("theme", ["dark", "light"])
@@ -100,15 +91,6 @@ def test_a_first_visit_and_a_service_that_is_gone(
     keep(page, pictures_folder / "live-disconnected.webp")
     assert violations(page) == []
     page.goto("about:blank")
-
-
-def keep(page: Any, path: Path) -> None:
-    """A screenshot, small enough for documentation."""
-    raw = path.with_suffix(".png")
-    page.screenshot(path=raw)
-    Image.open(raw).convert("RGB").save(path, quality=82, method=6)
-    raw.unlink()
-    assert path.stat().st_size < MOST_BYTES
 
 
 def test_the_theme_is_chosen_and_remembered(studied: Studied, visit: Callable[..., Any]) -> None:

@@ -94,7 +94,7 @@ _KINDS: dict[type[SpikedError], str] = {
 
 _WHAT_TO_DO: dict[int, str] = {
     400: "send a request as /openapi.json describes it",
-    401: "send Authorization: Bearer TOKEN; `spiked token add NAME` makes one",
+    401: "send Authorization: Bearer TOKEN; `spiked token create NAME` makes one",
     404: "look for the id with the GET of the list",
     405: "use a method that the Allow header names",
     408: "send the request again, without long pauses in its body",

@@ -26,9 +26,18 @@ export class UnreachableError extends Error {
   }
 }
 
-async function reach(input: RequestInfo | URL, init?: RequestInit): Promise<Response> {
+/** Called when the service refuses this page for want of a token. */
+let refused: () => void = () => undefined;
+export const whenRefused = (listener: () => void): void => {
+  refused = listener;
+};
+
+/** `fetch` for everything of the service: throws UnreachableError where nobody answers. */
+export async function reach(input: RequestInfo | URL, init?: RequestInit): Promise<Response> {
   try {
-    return await fetch(input, init);
+    const response = await fetch(input, init);
+    if (response.status === 401) refused();
+    return response;
   } catch (error) {
     if (error instanceof DOMException && error.name === "AbortError") throw error;
     throw new UnreachableError();
@@ -51,6 +60,17 @@ export async function request(path: string, init: RequestInit = {}): Promise<Res
   const response = await reach(`${API}/${path}`, init);
   if (response.ok) return response;
   throw errorOf(response, await response.json().catch(() => null));
+}
+
+/** Have the service remember a token in its cookie; false if it opens nothing. */
+export async function signIn(token: string): Promise<boolean> {
+  try {
+    // Followed by hand: where a token is right the service leads to the page, which is on show already.
+    const init: RequestInit = { method: "POST", body: new URLSearchParams({ token }), redirect: "manual" };
+    return (await fetch("sign-in", init)).type === "opaqueredirect";
+  } catch {
+    throw new UnreachableError();
+  }
 }
 
 function errorOf(response: Response, body: unknown): ApiError {

@@ -10,6 +10,7 @@ import { Icon, type IconName } from "../ui/icons";
 import { Loading } from "../ui/parts";
 import { Toasts } from "../ui/Toasts";
 import { Guard } from "./Guard";
+import { SignIn } from "./SignIn";
 
 const ScenePage = lazy(() => import("../scene/ScenePage").then((m) => ({ default: m.ScenePage })));
 const CapturesPage = lazy(() => import("../captures/CapturesPage").then((m) => ({ default: m.CapturesPage })));
@@ -29,7 +30,8 @@ const THEMES: Record<Theme, { next: Theme; icon: IconName; label: string }> = {
 
 export function App(): JSX.Element {
   const { page } = useRoute();
-  useEffect(follow, []);
+  const signedOut = useService((state) => state.signedOut);
+  useEffect(() => (signedOut ? undefined : follow()), [signedOut]);
   useEffect(() => {
     const tab = TABS.find((one) => one.page === page);
     document.title = `${tab?.label ?? ""} · spiked`;
@@ -74,19 +76,23 @@ export function App(): JSX.Element {
             </a>
           ))}
         </nav>
-        <LinkSign />
+        {!signedOut && <LinkSign />}
         <ThemeSwitch />
       </header>
-      <Disconnected />
+      {!signedOut && <Disconnected />}
       <main id="main" tabIndex={-1} className={`page-${page}`}>
-        <Guard key={page}>
-          <Suspense fallback={<Loading what="the page" />}>
-            {page === "live" && <LivePage />}
-            {page === "scene" && <ScenePage />}
-            {page === "captures" && <CapturesPage />}
-            {page === "setup" && <SetupPage />}
-          </Suspense>
-        </Guard>
+        {signedOut ? (
+          <SignIn />
+        ) : (
+          <Guard key={page}>
+            <Suspense fallback={<Loading what="the page" />}>
+              {page === "live" && <LivePage />}
+              {page === "scene" && <ScenePage />}
+              {page === "captures" && <CapturesPage />}
+              {page === "setup" && <SetupPage />}
+            </Suspense>
+          </Guard>
+        )}
       </main>
       <Toasts />
     </>

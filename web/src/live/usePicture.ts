@@ -3,6 +3,7 @@
 import { useEffect, useState } from "react";
 
 import { address } from "../api/calls";
+import { reach } from "../api/http";
 import type { Capture, PreviewKind } from "../api/types";
 import { isOver, useService } from "../state/store";
 
@@ -41,7 +42,7 @@ export function usePicture(capture: Capture | null, kind: PreviewKind, gain: num
     const ask = async (): Promise<void> => {
       let wait = PERIOD_MS;
       try {
-        const response = await fetch(address.preview(id, kind, { gain: askedGain === 1 ? undefined : askedGain }), {
+        const response = await reach(address.preview(id, kind, { gain: askedGain === 1 ? undefined : askedGain }), {
           signal: ended.signal,
         });
         if (response.ok) {

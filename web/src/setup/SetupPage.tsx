@@ -3,7 +3,7 @@
 import { type JSX, useState } from "react";
 
 import * as calls from "../api/calls";
-import type { Setting, Finding } from "../api/types";
+import type { Finding, Setting, Token } from "../api/types";
 import { bytes, duration, when } from "../state/format";
 import { useService, wordsOf } from "../state/store";
 import { toast } from "../state/toasts";
@@ -85,26 +85,33 @@ export function SetupPage(): JSX.Element {
             </dl>
           )}
         </Panel>
-        <Panel title="Tokens">
+        <Panel
+          title="Tokens"
+          aside={
+            <button type="button" aria-label="Look again for tokens" onClick={tokens.again} disabled={tokens.loading}>
+              <Icon name="again" /> Look again
+            </button>
+          }
+        >
           <Asking asked={tokens} what="the tokens">
             {(items) =>
               items.length === 0 ? (
-                <p className="dim">
-                  None. Only this machine can reach the service. <code>spiked token add NAME</code> makes one.
-                </p>
+                <p>None beside that of the settings, if there is one there.</p>
               ) : (
                 <table className="grid">
                   <thead>
                     <tr>
                       <th scope="col">Name</th>
-                      <th scope="col">Details</th>
+                      <th scope="col">Made</th>
+                      <th scope="col">Opens until</th>
                     </tr>
                   </thead>
                   <tbody>
                     {items.map((token) => (
                       <tr key={token.name}>
                         <th scope="row">{token.name}</th>
-                        <td className="dim">{details(token)}</td>
+                        <td className="dim">{when(token.created_at)}</td>
+                        <td>{until(token)}</td>
                       </tr>
                     ))}
                   </tbody>
@@ -112,6 +119,10 @@ export function SetupPage(): JSX.Element {
               )
             }
           </Asking>
+          <p className="dim note">
+            <code>spiked token create NAME --days 30</code> makes one and shows it once;{" "}
+            <code>spiked token revoke NAME</code> ends it at once, for this page too.
+          </p>
         </Panel>
         <Panel title="Elsewhere">
           <ul className="links">
@@ -143,14 +154,10 @@ export function SetupPage(): JSX.Element {
   );
 }
 
-const details = (token: Record<string, unknown>): string =>
-  Object.entries(token)
-    .filter(([key, value]) => key !== "name" && value !== null && value !== "")
-    .map(([key, value]) => {
-      const text = Array.isArray(value) ? value.join(", ") : String(value);
-      return key.endsWith("_at") ? `${key.slice(0, -3).replaceAll("_", " ")} ${when(text)}` : `${key}: ${text}`;
-    })
-    .join(" · ");
+function until({ expires_at: end }: Token): JSX.Element {
+  if (end === null) return <span className="dim">it is revoked</span>;
+  return Date.parse(end) <= Date.now() ? <Badge tone="warning">expired {when(end)}</Badge> : <>{when(end)}</>;
+}
 
 function Asking<T>({
   asked,

@@ -4,7 +4,7 @@ import { create } from "zustand";
 
 import * as calls from "../api/calls";
 import { Events, type Link } from "../api/events";
-import { ApiError, UnreachableError } from "../api/http";
+import { ApiError, UnreachableError, whenRefused } from "../api/http";
 import type { Capture, Device, Message, Preview, Reconstruction, SceneNews, System } from "../api/types";
 import { poses } from "./poses";
 
@@ -17,6 +17,8 @@ export interface ServiceState {
   link: Link;
   /** Why the service could not be asked; null while it answers. */
   trouble: string | null;
+  /** The service wants a token that this page has not: nothing is asked for until somebody signs in. */
+  signedOut: boolean;
   loaded: boolean;
   devices: Device[];
   /** Known captures by id; the table of all captures asks for its own pages. */
@@ -36,6 +38,7 @@ export interface ServiceState {
 export const useService = create<ServiceState>(() => ({
   link: { state: "connecting" },
   trouble: null,
+  signedOut: false,
   loaded: false,
   devices: [],
   captures: {},
@@ -158,8 +161,7 @@ export const sentence = (text: string): string =>
 /** Why asking failed, in words for a person. */
 export function wordsOf(error: unknown): string {
   if (error instanceof ApiError) {
-    if (error.status === 401)
-      return "This service needs its token. Open the address that `spiked serve` printed, or add ?token=… to this one.";
+    if (error.status === 401) return "This service needs its token.";
     // What the service advises then is written for callers of its API.
     if (error.status === 404 && error.message.startsWith("there is no "))
       return `${sentence(error.message.split(";")[0] ?? "")} It may have been deleted.`;
@@ -199,6 +201,9 @@ async function refreshSystem(): Promise<void> {
     set({ trouble: wordsOf(error) });
   }
 }
+
+whenRefused(() => set({ signedOut: true }));
+export const signedIn = (): void => set({ signedOut: false, trouble: null });
 
 /** Begin to follow the service; the function returned ends it. */
 export function follow(): () => void {

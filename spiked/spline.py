@@ -5,7 +5,7 @@ B-spline of the knots' centres. Degree 3 for smooth motion, degree 1 where motio
 (C. Sommer et al., "Efficient derivative computation for cumulative B-splines on Lie groups", CVPR 2020.)
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,16 +19,41 @@ _BASIS = {
 """Weights of the degree + 1 knots as polynomials of u in [0, 1): row k holds the coefficients of 1, u, u^2, ..."""
 
 
+@dataclass(frozen=True)
+class Clock:
+    """Where knots lie closer or wider: ticks as a function of frames, straight between the given moments and one tick
+    a frame outside. `frames` and `ticks` [n] both increase."""
+
+    frames: Array
+    ticks: Array
+
+    def ticked(self, times: ArrayLike) -> Array:
+        """Ticks at times in frames."""
+        return _straight(np.asarray(times, float), self.frames, self.ticks)
+
+    def framed(self, ticks: ArrayLike) -> Array:
+        """Times in frames at ticks."""
+        return _straight(np.asarray(ticks, float), self.ticks, self.frames)
+
+
+def _straight(x: Array, a: Array, b: Array) -> Array:
+    return np.asarray(np.interp(x, a, b) + np.minimum(x - a[0], 0) + np.maximum(x - a[-1], 0))
+
+
 @dataclass
 class Spline:
-    """Knots at `first + k * spacing` frames. `rotations` [n, 3, 3] camera-to-world, `centres` [n, 3], changed in place
-    by optimisers. Times are in frames; the pose of frame k is at k + 0.5."""
+    """Knots at `first + k * spacing` frames, or ticks of a `clock` where there is one.
+
+    `rotations` [n, 3, 3] camera-to-world, `centres` [n, 3], changed in place by optimisers. Times are in frames; the
+    pose of frame k is at k + 0.5.
+    """
 
     first: float
     spacing: float
     rotations: Array
     centres: Array
     degree: int = 3
+    clock: Clock | None = None
 
     @classmethod
     def fit(
@@ -39,18 +64,22 @@ class Spline:
         spacing: float,
         degree: int = 3,
         span: tuple[float, float] | None = None,
+        clock: Clock | None = None,
     ) -> "Spline":
         """A spline through poses at increasing `times` [m] (frames), knots every `spacing` frames, defined over `span`
         (default: the given times); where no pose is near it continues at constant velocity. Least squares."""
         t = np.asarray(times, float)
         low, high = (t[0], t[-1]) if span is None else (min(span[0], t[0]), max(span[1], t[-1]))
+        s = t
+        if clock is not None:
+            low, high, s = float(clock.ticked(low)), float(clock.ticked(high)), clock.ticked(t)
         pad = (degree - 1) / 2
         count = int(np.ceil(max(high - low, 1e-6) / spacing)) + degree + 1
         first = low - pad * spacing - 1e-6
         knots = first + spacing * np.arange(count)
-        spline = cls(first, spacing, interpolate_rotations(t, rotations, knots), np.zeros((count, 3)), degree)
+        spline = cls(first, spacing, interpolate_rotations(s, rotations, knots), np.zeros((count, 3)), degree, clock)
         basis = spline.basis_matrix(t)
-        guess = _interpolate_linear(t, centres, knots)
+        guess = _interpolate_linear(s, centres, knots)
         smooth = 1e-4 * np.diff(np.eye(count), 2, axis=0)
         lhs = np.vstack([basis, smooth])
         rhs = np.vstack([centres - basis @ guess, np.zeros((count - 2, 3))])
@@ -64,16 +93,24 @@ class Spline:
     @property
     def begin(self) -> float:
         """First time (frames) at which the spline is defined."""
-        return self.first + self.spacing * (self.degree - 1) / 2
+        return self._frames(self._begin)
 
     @property
     def end(self) -> float:
         """Last time (frames) at which the spline is defined."""
-        return self.begin + self.spacing * (len(self.centres) - self.degree)
+        return self._frames(self._begin + self.spacing * (len(self.centres) - self.degree))
+
+    @property
+    def _begin(self) -> float:
+        return self.first + self.spacing * (self.degree - 1) / 2
+
+    def _frames(self, tick: float) -> float:
+        return tick if self.clock is None else float(self.clock.framed(tick))
 
     def locate(self, times: ArrayLike) -> tuple[NDArray[np.int64], Array]:
         """First knot i [m] and weights [m, degree + 1] of the knots i.. at `times` (clamped to the defined range)."""
-        s = (np.asarray(times, float) - self.begin) / self.spacing
+        ticks = np.asarray(times, float) if self.clock is None else self.clock.ticked(times)
+        s = (ticks - self._begin) / self.spacing
         last = len(self.centres) - self.degree - 1
         i = np.clip(np.floor(s).astype(np.int64), 0, last)
         u = np.clip(s - i, 0.0, 1.0)
@@ -131,7 +168,7 @@ class Spline:
 
     def move(self, rotation: Array, centre: Array) -> "Spline":
         """The spline with knots perturbed: R <- Exp(rotation) R, c <- c + centre; both [knots, 3]."""
-        return Spline(self.first, self.spacing, exp_so3(rotation) @ self.rotations, self.centres + centre, self.degree)
+        return replace(self, rotations=exp_so3(rotation) @ self.rotations, centres=self.centres + centre)
 
 
 def interpolate_rotations(times: Array, rotations: Array, at: Array) -> Array:

@@ -71,7 +71,7 @@ class Hypothesis:
 
     def noise_px(self) -> float:
         """Standard deviation of a track's place in one view and one direction, from the median residual."""
-        return float(np.median(np.linalg.norm(self.bundle.residuals(), axis=1))) / 1.1774
+        return self.bundle.noise_px()
 
     def track_costs(self) -> Array:
         """Mean robust cost of each track, [P]."""

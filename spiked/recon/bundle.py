@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.pose import Array, exp_so3, hat
+from spiked.recon.inertia import Inertia
 from spiked.sensor import Intrinsics
 from spiked.spline import Spline
 
@@ -80,17 +81,19 @@ class Bundle:
         """As `optimise`, with the poses tied to a spline at `times` [C] (frames): returns spline and cost."""
         self.rotations, self.centres = spline.poses(times)
         blend = spline.basis_matrix(times)
+        inertia = Inertia.of(spline, blend, self.noise_px())
+        share = 2 / (scale_px**2 * len(self.camera))  # of the energy: the cost is a mean in units of the scale
         everything = np.ones(len(self.centres), bool)
-        damping, current = 1e-4, self.cost(scale_px)
+        damping, current = 1e-4, self.cost(scale_px) + share * inertia.energy(spline)
         for _ in range(iterations):
             system = self._linearise(scale_px, everything)
             while damping < 1e6:
-                step, points = system.solve(damping, blend)
+                step, points = system.solve(damping, blend, (inertia.hessian(), inertia.gradient(spline)))
                 moved = spline.move(step[:, :3], step[:, 3:])
                 trial = Bundle(
                     *moved.poses(times), self.points + points, self.camera, self.point, self.pixels, self.intrinsics
                 )
-                cost = trial.cost(scale_px)
+                cost = trial.cost(scale_px) + share * inertia.energy(moved)
                 if cost < current:
                     break
                 damping *= 8
@@ -102,6 +105,10 @@ class Bundle:
             if gain < tolerance:
                 break
         return spline, current
+
+    def noise_px(self) -> float:
+        """Standard deviation of a track's place in one view and one direction, from the median residual."""
+        return float(np.median(np.linalg.norm(self.residuals(), axis=1))) / 1.1774
 
     def pose_hessians(self, scale_px: float) -> Array:
         """How firmly each pose is held by the points where they are: [C, 6, 6] of (rotation, centre), in 1/px^2."""
@@ -169,10 +176,13 @@ class _System:
         blocks = self.cross.transpose(0, 2, 1, 3)
         np.add.at(blocks, (c, p), np.einsum("mki,mkj->mij", a, b))
 
-    def solve(self, damping: float, blend: Array | None = None) -> tuple[Array, Array]:
+    def solve(
+        self, damping: float, blend: Array | None = None, prior: tuple[Array, Array] | None = None
+    ) -> tuple[Array, Array]:
         """Steps of the free poses [c, 6] and of the points [P, 3].
 
-        With `blend` [c, knots] the poses move only as that blend of knots, and their steps [knots, 6] are returned.
+        With `blend` [c, knots] the poses move only as that blend of knots, and their steps [knots, 6] are returned;
+        `prior` is added to their Hessian [knots, 6, knots, 6] and gradient [knots, 6].
         """
         cameras, _, points, _ = self.cross.shape
         eye = np.eye(3)
@@ -192,9 +202,13 @@ class _System:
             knots = blend.shape[1]
             by_knot = np.tensordot(np.tensordot(blend, blocks, (0, 0)), blend, (2, 0))  # [k, 6, 6, k]
             square = by_knot.transpose(0, 1, 3, 2).reshape(knots * 6, knots * 6)
+            downhill = blend.T @ right.reshape(cameras, 6)
+            if prior is not None:
+                square += prior[0].reshape(knots * 6, knots * 6)
+                downhill -= prior[1]
             square[np.diag_indices(knots * 6)] *= 1 + damping
             square[np.diag_indices(knots * 6)] += 1e-9
-            steps = np.linalg.solve(square, (blend.T @ right.reshape(cameras, 6)).ravel()).reshape(knots, 6)
+            steps = np.linalg.solve(square, downhill.ravel()).reshape(knots, 6)
             poses = blend @ steps
         back = -self.points_gradient - (cross.T @ poses.ravel()).reshape(points, 3)
         return steps, np.einsum("Pij,Pj->Pi", v_inverse, back)

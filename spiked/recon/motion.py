@@ -211,6 +211,15 @@ def speed(frames: NDArray[np.uint8], sensor: Sensor) -> float:
     return 0.0 if field is None else float(np.median(np.linalg.norm(field, axis=2))) / n
 
 
+def drift(frames: NDArray[np.uint8], sensor: Sensor) -> float:
+    """Median image motion in px through stored frames [n, frame_bytes], from the halves' plain counts; 0 where nothing
+    can be followed."""
+    half = len(frames) // 2
+    a, b = (_small(aligned_window(frames[i : i + half], sensor, 0, 0, half).count) for i in (0, half))
+    field = _coarse_motion(a, b, sensor)
+    return 0.0 if field is None else 2 * float(np.median(np.linalg.norm(field, axis=2)))
+
+
 def _small(count: NDArray[np.uint16]) -> Picture:
     """Counts at half the size, every second pixel the mean of a whole cell of a mosaic, as an even 8-bit picture."""
     height, width = count.shape

@@ -4,16 +4,17 @@ It needs no map of Gaussians, so a trajectory exists within a second or two; map
 """
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spiked.pose import Array, exp_so3, hat, log_so3, mean_rotation
-from spiked.recon.bootstrap import INLIER_PX, MORE_MOTION, SCALE_PX, Views, bootstrap
+from spiked.recon.bootstrap import INLIER_PX, LEAST_INLIERS, MORE_MOTION, SCALE_PX, Views, bootstrap
 from spiked.recon.bundle import Bundle
-from spiked.recon.smooth import coarsest
+from spiked.recon.smooth import clock_of, coarsest
+from spiked.recon.stamps import Stamps, delays
 from spiked.recon.tracks import Picture, Tracks, search
 from spiked.sensor import Intrinsics
 from spiked.spline import Spline
@@ -42,6 +43,8 @@ class Posed:
     state: State
     rotation: Array | None = None
     centre: Array | None = None
+    unsure_px: float = 0.0
+    """Noise of the tracks in this view alone, see `Stamps.level`."""
     inliers: float = 0.0
     """Share of the known points in view that agree with its pose."""
     chi2: float | None = None
@@ -73,6 +76,10 @@ WORST_SIGMA_PX = 1.0
 WORST_INLIERS = 0.5
 WORST_OVERLAP = 0.25
 """Tracking counts as degraded beyond any of these; overlap is the share of the tracks whose points are known."""
+STILL_PX = 0.12
+"""Less motion from view to view than this is none: tracks are not better."""
+STOOD_PX = 0.3
+"""And so far from the first view of a bootstrap the camera has hardly moved: it may as well begin later."""
 KEY_EVERY = 8
 """Every eighth posed view is kept for relocalisation."""
 GLOBAL_VIEWS = 100
@@ -96,6 +103,7 @@ class Odometry:
 
     def __post_init__(self) -> None:
         self._tracks = Tracks()
+        self._stamps = Stamps()
         self._boot_start = 0
         self._boot_parallax = MIN_PARALLAX_PX
         self._boot_views = 0
@@ -103,10 +111,23 @@ class Odometry:
         self._next_global = 0
         self._keys: dict[int, Picture] = {}
 
-    def add(self, time: float, length: int, picture: Picture, known: tuple[Array, Array] | None = None) -> Posed:
-        """Track one view of `length` frames around `time` and pose it if possible; `known` gives its pose."""
+    def add(
+        self,
+        time: float,
+        length: int,
+        picture: Picture,
+        known: tuple[Array, Array] | None = None,
+        delay: NDArray[np.floating] | None = None,
+    ) -> Posed:
+        """Track one view of `length` frames around `time` and pose it if possible.
+
+        `known` gives its pose, `delay` [H, W] by how many frames each pixel's own time is later.
+        """
         motion = self._tracks.add(len(self.views), picture)
-        posed = Posed(time, length, self._tracks.ids.copy(), self._tracks.at.copy(), motion, self.state)
+        ids, at = self._tracks.ids.copy(), self._tracks.at.copy()
+        late = np.zeros(len(ids)) if delay is None else delays(picture, delay, at)
+        pixels, unsure = self._stamps.level(time, ids, at, late)
+        posed = Posed(time, length, ids, pixels, motion, self.state, unsure_px=unsure)
         self.views.append(posed)
         missing = self._tracks.next_id - len(self.points)
         self.points = np.concatenate([self.points, np.full((missing, 3), np.nan)])
@@ -136,6 +157,21 @@ class Odometry:
         elif self.state is State.BOOT:
             self._try_bootstrap(final=True)
         self.settle()
+        self._review()
+
+    def _review(self) -> None:
+        """Judge every pose by the path and the points as they are in the end."""
+        last: tuple[Fit, int] | None = None
+        for view in self.views:
+            if view.rotation is None or view.centre is None:
+                continue
+            fit = self._fit(view, view.rotation, view.centre, move=False)
+            view.inliers, view.chi2, view.sigma_px = fit.inliers, fit.chi2, fit.sigma_px
+            if view.state in (State.TRACK, State.DEGRADED):
+                view.state = State.TRACK if self._doubt(fit, len(view.ids)) is None else State.DEGRADED
+            last = fit, len(view.ids)
+        if last is not None and self.state in (State.TRACK, State.DEGRADED):
+            self._judge(*last)
 
     def _try_bootstrap(self, final: bool = False) -> None:
         newest = self.views[-1]
@@ -146,6 +182,10 @@ class Odometry:
             start = self.views[self._boot_start]
             common = np.intersect1d(start.ids, newest.ids)
             self._boot_views = 0
+        if len(common) >= 60 and self.views[self._boot_start + 1 :]:
+            moved = np.linalg.norm(_pick(newest, common) - _pick(start, common), axis=1)
+            if np.median(moved) < STOOD_PX:
+                self._boot_start, self._boot_views = len(self.views) - 1, 0
         count = len(self.views) - self._boot_start
         if count < BOOT_VIEWS:
             self.reason = f"{count} of {BOOT_VIEWS} views for a first map: {MORE_MOTION}"
@@ -178,7 +218,7 @@ class Odometry:
         """BOOT_VIEWS views from the first to the newest with about equal motion between them."""
         motion = np.array([v.motion_px for v in self.views[self._boot_start :]])
         motion[0] = 0
-        path = np.cumsum(motion + 1e-3)
+        path = np.cumsum(np.where(motion < STILL_PX, 0, motion) + 1e-3)
         at = np.searchsorted(path, np.linspace(path[0], path[-1], BOOT_VIEWS)).clip(0, len(path) - 1)
         return [self._boot_start + int(k) for k in np.unique(at)]
 
@@ -189,6 +229,13 @@ class Odometry:
                 near = self.views[chosen[int(np.argmin(np.abs(np.array(chosen) - k)))]]
                 assert near.rotation is not None and near.centre is not None
                 self._accept(view, self._fit(view, near.rotation, near.centre))
+        for k in range(self._boot_start - 1, -1, -1):
+            view, after = self.views[k], self.views[k + 1]
+            assert after.rotation is not None and after.centre is not None
+            fit = self._fit(view, after.rotation, after.centre)
+            if fit.points < MIN_POINTS or fit.inliers < LEAST_INLIERS:
+                break
+            self._accept(view, fit)
 
     def _accept(self, view: Posed, fit: Fit) -> None:
         view.rotation, view.centre, view.inliers = fit.rotation, fit.centre, fit.inliers
@@ -207,17 +254,26 @@ class Odometry:
                 return
             fit = found
         self._accept(view, fit)
-        if (why := self._doubt(fit, len(view.ids))) is not None:
-            self._become(State.DEGRADED, why)
-        elif self.state is not State.TRACK:
-            self._become(State.TRACK, "enough points agree again")
         count = len(self.views)
         if count % 4 == 0:
             self._triangulate(range(max(0, count - 48), count))
-        if count % 8 == 0:
-            self._adjust_recent()
+        # Points that were found lately lie where few views put them: that they are off is no news before they were
+        # adjusted together with the poses.
+        off = fit.chi2 > WORST_CHI2 and fit.inliers > WORST_INLIERS
         if count >= self._next_global:
             self.settle()
+        elif count % 8 == 0 or off:
+            self._adjust_recent()
+        if off and view.rotation is not None and view.centre is not None:
+            fit = self._fit(view, view.rotation, view.centre)
+            self._accept(view, fit)
+        self._judge(fit, len(view.ids))
+
+    def _judge(self, fit: Fit, tracks: int) -> None:
+        if (why := self._doubt(fit, tracks)) is not None:
+            self._become(State.DEGRADED, why)
+        elif self.state is not State.TRACK:
+            self._become(State.TRACK, "enough points agree again")
 
     def _doubt(self, fit: Fit, tracks: int) -> str | None:
         """Why a pose is to be taken with care, or None."""
@@ -231,8 +287,8 @@ class Odometry:
             return f"only {fit.points / tracks:.0%} of what is in view has been seen long enough to be known"
         return None
 
-    def _fit(self, view: Posed, rotation: Array, centre: Array) -> Fit:
-        """Robust Gauss-Newton of one pose on the known points."""
+    def _fit(self, view: Posed, rotation: Array, centre: Array, move: bool = True) -> Fit:
+        """Robust Gauss-Newton of one pose on the known points; without `move` it is only looked at."""
         points = self.points[view.ids]
         known = np.isfinite(points[:, 0])
         points, pixels = points[known], view.pixels[known]
@@ -240,7 +296,8 @@ class Odometry:
             return Fit(rotation, centre, 0.0, len(points))
         k = self.intrinsics
         error = np.zeros((len(points), 2))
-        for scale in (4.0, 2.0, 1.0, *[SCALE_PX] * 5):
+        scales = (4.0, 2.0, 1.0, *[SCALE_PX] * 5)
+        for scale in scales if move else scales[-1:]:
             local = (points - centre) @ rotation
             z = np.maximum(local[:, 2], 1e-6)
             error = np.stack([k.fx * local[:, 0] / z + k.cx, k.fy * local[:, 1] / z + k.cy], 1) - pixels
@@ -259,11 +316,13 @@ class Odometry:
             weighted = jacobian * weight[:, None, None]
             hessian = np.einsum("mki,mkj->ij", weighted, jacobian)
             gradient = np.einsum("mki,mk->i", weighted, error)
+            if not move:
+                break
             step = -np.linalg.solve(hessian + 1e-9 * np.eye(6) * np.trace(hessian), gradient)
             rotation, centre = exp_so3(step[:3]) @ rotation, centre + step[3:]
         size = np.linalg.norm(error, axis=1)
         inliers = float(np.mean(size < 1.5 * INLIER_PX))
-        noise = max(1.3 * self._noise_px, LEAST_NOISE_PX)
+        noise = float(np.hypot(max(1.3 * self._noise_px, LEAST_NOISE_PX), view.unsure_px))
         chi2 = float((np.median(size) / (1.1774 * noise)) ** 2)
         depth = float(np.median((points - centre) @ rotation[:, 2]))
         covariance = max(chi2, 1.0) * noise**2 * np.linalg.inv(hessian + 1e-9 * np.eye(6) * np.trace(hessian))
@@ -385,16 +444,20 @@ class Odometry:
         keep = np.isfinite(self.points[view.ids, 0])
         return view, view.ids[keep], view.pixels[keep]
 
-    def _adjust_recent(self, span: int = 14, fixed: int = 4) -> None:
-        numbers = [
-            n for n in range(max(0, len(self.views) - span), len(self.views)) if self.views[n].rotation is not None
+    def _adjust_recent(self, free: int = 10, fixed: int = 4, older: int = 4, reach: int = 40) -> None:
+        """Adjust the newest poses and what they see; some before them, near and far, hold place and scale."""
+        posed = [
+            n for n in range(max(0, len(self.views) - reach), len(self.views)) if self.views[n].rotation is not None
         ]
+        near = posed[-free - fixed :]
+        far = posed[: -free - fixed]
+        numbers = far[:: -(-len(far) // older) or 1] + near
         made = self._bundle(numbers) if len(numbers) > fixed + 2 else None
         if made is None:
             return
         bundle, ids = made
-        frozen = np.zeros(len(numbers), bool)
-        frozen[:fixed] = True
+        frozen = np.ones(len(numbers), bool)
+        frozen[max(fixed, len(numbers) - free) :] = False
         bundle.optimise(4, SCALE_PX, frozen)
         self._take(bundle, ids, numbers)
 
@@ -418,8 +481,7 @@ class Odometry:
         self._next_global = max(len(self.views) + 12, int(1.5 * len(self.views)))
         if len(posed) < BOOT_VIEWS:
             return
-        step = -(-len(posed) // GLOBAL_VIEWS)
-        numbers = sorted({*posed[::step], posed[-1]})
+        numbers = self._spread(posed)
         made = self._bundle(numbers)
         if made is None:
             return
@@ -428,7 +490,7 @@ class Odometry:
         times = np.array([self.views[n].time for n in numbers])
         start = self._coarsest(times, bundle)
         spline, _ = bundle.optimise_spline(start, times, 8, SCALE_PX / 2, tolerance=1e-3)
-        self._noise_px = float(np.median(np.linalg.norm(bundle.residuals(), axis=1))) / 1.1774
+        self._noise_px = bundle.noise_px()
         self.spline = self._in_old_frame(spline, bundle, numbers)
         self._take(bundle, ids, numbers)
         others = [n for n in posed if n not in set(numbers)]
@@ -437,6 +499,15 @@ class Odometry:
             for n, rotation, centre in zip(others, rotations, centres, strict=True):
                 self.views[n].rotation, self.views[n].centre = rotation, centre
         self._triangulate(range(max(0, len(self.views) - 200), len(self.views)))
+
+    def _spread(self, posed: list[int]) -> list[int]:
+        """At most GLOBAL_VIEWS of these views with the first and the last, fewer of them where little moves."""
+        if len(posed) <= GLOBAL_VIEWS:
+            return posed
+        motion = np.array([self.views[n].motion_px for n in posed])
+        path = np.cumsum(np.minimum(motion, 2 * np.median(motion)) + 0.3 * motion.mean() + 1e-3)
+        at = np.searchsorted(path, np.linspace(path[0], path[-1], GLOBAL_VIEWS)).clip(0, len(posed) - 1)
+        return [posed[int(k)] for k in np.unique(at)]
 
     def _in_old_frame(self, spline: Spline, bundle: Bundle, numbers: list[int]) -> Spline:
         """The adjusted path and points, carried by a similarity to where they were, so that a map stays valid."""
@@ -453,13 +524,15 @@ class Odometry:
 
         bundle.points, bundle.centres = carry(bundle.points), carry(bundle.centres)
         bundle.rotations = rotation @ bundle.rotations
-        return Spline(spline.first, spline.spacing, rotation @ spline.rotations, carry(spline.centres), spline.degree)
+        return replace(spline, rotations=rotation @ spline.rotations, centres=carry(spline.centres))
 
     def _coarsest(self, times: Array, bundle: Bundle) -> Spline:
         margin = 0.5 * max(v.length for v in self.views)
         span = (self.views[0].time - margin, self.views[-1].time + margin)
         hessians = bundle.pose_hessians(SCALE_PX)
-        return coarsest(times, bundle.rotations, bundle.centres, hessians, len(bundle.camera), span)
+        still = np.array([v.motion_px < STILL_PX for v in self.views])
+        clock = clock_of(np.array([v.time for v in self.views]), still)
+        return coarsest(times, bundle.rotations, bundle.centres, hessians, len(bundle.camera), span, clock)
 
 
 def _kind(reason: str) -> str:

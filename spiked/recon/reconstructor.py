@@ -163,7 +163,9 @@ class Reconstructor:
     def _add(self, view: View) -> None:
         grey = luminance(view.rate, self.sensor.mosaic) if view.sharp is None else view.sharp
         white = float(np.percentile(grey, 99.5))
-        posed = self._odometry.add(view.time, view.end - view.begin, picture(grey, max(white, 1e-6)), self._given(view))
+        delay = view.delay if view.sharp is None else None
+        image = picture(grey, max(white, 1e-6))
+        posed = self._odometry.add(view.time, view.end - view.begin, image, self._given(view), delay)
         self._views.append(view)
         if len(self._views) == 1:
             self._check_colour(view)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from spiked.blocks import Window, aligned_window
 from spiked.calibration import Calibration
-from spiked.recon.motion import Sharpener, speed
+from spiked.recon.motion import Sharpener, drift, speed
 from spiked.sensor import Mosaic, Sensor
 
 Image = NDArray[np.float32]
@@ -27,6 +27,8 @@ WINDOWS = (4, 8, 16, 32, 64)
 FIRST_WINDOW = 16
 WINDOW_MOTION_PX = (0.12, 0.6)
 """A view gets twice as long when the image moves less than the first in it, and half as long above twice the second."""
+STARTS_PX = 1.0
+"""Motion in a view longer than `FIRST_WINDOW` that cannot wait until the next view."""
 FAST_PX = (0.35, 0.5)
 """Motion a frame above the second is taken out of the pictures (until it falls below the first). Up to there windows of
 8 frames, smeared as they are, give better tracks: charge between spikes is far less noisy than carried spikes."""
@@ -155,6 +157,14 @@ class Windows:
             self.follow(speed_px, 1.0)
         self._probed = True
 
+    def _shorten(self) -> None:
+        """A camera that begins to move in what was to be a long view would smear it: take shorter ones from here."""
+        while self._follows and not self.sharpen and self.length > FIRST_WINDOW:
+            begin = self._next - self._first
+            if drift(self._frames[begin : begin + self.length], self.sensor) < STARTS_PX:
+                return
+            self.length = WINDOWS[WINDOWS.index(self.length) - 1]
+
     def _cut(self, final: bool) -> Iterator[View]:
         stop = self._first + len(self._frames)
         if not self._probed and (len(self._frames) >= PROBE or final):
@@ -162,6 +172,7 @@ class Windows:
         if not self._probed:
             return
         while self._next + self.length + (0 if final else MARGIN) <= stop:
+            self._shorten()
             begin, end = self._next, self._next + self.length
             low = max(self._first, begin - MARGIN)
             high = min(stop, end + MARGIN)

@@ -1,0 +1,68 @@
+"""Where no view says where the camera was, it went on evenly; and each track belongs to its own moment."""
+
+import cv2
+import numpy as np
+
+from spiked.pose import exp_so3
+from spiked.recon.inertia import Inertia
+from spiked.recon.smooth import clock_of
+from spiked.recon.stamps import Stamps, delays
+from spiked.spline import Clock, Spline
+
+
+def test_the_energy_has_the_gradient_that_it_says() -> None:
+    rng = np.random.default_rng(0)
+    spline = Spline(0.0, 8.0, exp_so3(0.02 * rng.normal(size=(12, 3))), 0.1 * rng.normal(size=(12, 3)))
+    inertia = Inertia.of(spline, spline.basis_matrix(np.arange(0, 70, 2.0)), 0.1)
+    gradient, step = inertia.gradient(spline), 1e-6
+    for knot, axis in ((0, 4), (5, 1), (11, 3)):
+        push = np.zeros((12, 6))
+        push[knot, axis] = step
+        ends = [inertia.energy(spline.move(s * push[:, :3], s * push[:, 3:])) for s in (1, -1)]
+        measured = (ends[0] - ends[1]) / (2 * step)
+        assert abs(measured - gradient[knot, axis]) < 0.05 * np.abs(gradient).max()
+
+
+def test_an_even_path_has_no_energy() -> None:
+    knots = np.arange(10.0)[:, None]
+    spline = Spline(0.0, 8.0, exp_so3(knots * [0.0, 0.01, 0.0]), knots * [0.1, 0.2, 0.0])
+    assert Inertia.of(spline, spline.basis_matrix(np.arange(0, 50, 4.0)), 0.1).energy(spline) < 1e-6
+
+
+def test_tracks_are_brought_to_the_time_of_their_view() -> None:
+    """The last view of a recording knows only what happened before its end: it once lagged behind by half a window."""
+    rng = np.random.default_rng(1)
+    start = rng.uniform(20, 200, (40, 2))
+    ids, speed = np.arange(40), np.array([0.2, -0.1])
+    stamps = Stamps()
+    for time, late in ((8.0, 0.0), (16.0, 0.3), (24.0, -3.0)):
+        seen = start + speed * (time + late)
+        at, unsure = stamps.level(time, ids, seen, np.full(40, late))
+    np.testing.assert_allclose(at, start + speed * 24.0, atol=1e-9)
+    assert 0 < unsure < np.linalg.norm(3 * speed)
+
+
+def test_the_delay_of_a_track_is_that_of_the_edges_around_it() -> None:
+    image = np.zeros((40, 40), np.uint8)
+    image[10:20, 10:20] = 200
+    image = cv2.GaussianBlur(image, (0, 0), 1.0)
+    delay = np.full((40, 40), 9.0, np.float32)
+    delay[6:24, 6:24] = 2.0
+    assert abs(delays(image, delay, np.array([[15.0, 15.0]]))[0] - 2.0) < 0.1
+
+
+def test_knots_are_not_spent_on_a_camera_that_stands_still() -> None:
+    times = np.concatenate([np.arange(32, 9600, 64.0), np.arange(9604, 10200, 8.0)])
+    clock = clock_of(times, times < 9600)
+    assert clock is not None
+    spline = Spline.fit(times, np.tile(np.eye(3), (len(times), 1, 1)), np.zeros((len(times), 3)), 16, clock=clock)
+    knots = clock.framed(spline.first + spline.spacing * np.arange(len(spline.centres)))
+    assert (knots > 9600).sum() > 30 and len(knots) < 130
+    assert spline.begin <= times[0] + 1e-3 and spline.end >= times[-1] - 1e-3
+    assert clock_of(times[times > 9600], np.zeros(75, bool)) is None
+
+
+def test_a_clock_can_be_read_both_ways() -> None:
+    clock = Clock(np.array([0.0, 100.0, 164.0]), np.array([0.0, 100.0, 108.0]))
+    times = np.array([-5.0, 30.0, 120.0, 170.0])
+    np.testing.assert_allclose(clock.framed(clock.ticked(times)), times)

@@ -118,7 +118,9 @@ def follow(events: object) -> tuple[list[tuple[int, float]], dict, dict]:
                 capture = message["data"]
             case "job":
                 job = message["data"]
-                if job["state"] in ("complete", "failed", "cancelled") or job["stage"] == "refining":
+                # One that was outpaced begins again from the recording, and is live no more.
+                ended = job["state"] in ("complete", "failed", "cancelled") or job["stage"] == "refining"
+                if ended or not job["live"]:
                     break
             case "lost":
                 raise SystemExit(f"this program was too slow: {message['data']}")

@@ -6,6 +6,7 @@ B-spline of the knots' centres. Degree 3 for smooth motion, degree 1 where motio
 """
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,6 +39,45 @@ class Clock:
 
 def _straight(x: Array, a: Array, b: Array) -> Array:
     return np.asarray(np.interp(x, a, b) + np.minimum(x - a[0], 0) + np.maximum(x - a[-1], 0))
+
+
+class Path(Protocol):
+    """Where a camera was at any time from `begin` to `end`, in frames."""
+
+    @property
+    def begin(self) -> float:
+        """First time (frames) at which it is defined."""
+
+    @property
+    def end(self) -> float:
+        """Last time (frames) at which it is defined."""
+
+    def poses(self, times: ArrayLike) -> tuple[Array, Array]:
+        """Rotations [m, 3, 3] and centres [m, 3] at `times` [m] in frames."""
+
+
+@dataclass(frozen=True)
+class Waypoints:
+    """Poses at increasing `times` [n] (frames), and even turns and ways from each to the next."""
+
+    times: Array
+    rotations: Array
+    centres: Array
+
+    @property
+    def begin(self) -> float:
+        """See `Path.begin`."""
+        return float(self.times[0])
+
+    @property
+    def end(self) -> float:
+        """See `Path.end`."""
+        return float(self.times[-1])
+
+    def poses(self, times: ArrayLike) -> tuple[Array, Array]:
+        """See `Path.poses`; at rest beyond both ends."""
+        at = np.clip(np.asarray(times, float), self.begin, self.end)
+        return interpolate_rotations(self.times, self.rotations, at), _interpolate_linear(self.times, self.centres, at)
 
 
 @dataclass

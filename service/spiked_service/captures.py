@@ -30,6 +30,8 @@ _CLOSE_S = 1.0
 _RECENT = 32
 """Captures whose last pictures and counters are remembered."""
 _TICK_S = 0.5
+_BACKLOG_S = 1.7
+"""A tracker pauses for about a second while it finds its first map; its reader may lag seven eighths of the ring."""
 
 
 class Captures:
@@ -330,6 +332,7 @@ class Captures:
             seconds=plan.seconds,
             consumers=1 + plan.record + plan.reconstruct,
             history_s=0.0,
+            backlog_s=_BACKLOG_S if plan.reconstruct else 0.0,
         )
         logs = self._folder.capture(capture.id) / "logs"
         capture.flow(Stream(order, logs, self._folder.thumbnail(capture.id), capture))

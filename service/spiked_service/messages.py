@@ -43,6 +43,8 @@ class AcquisitionOrder(_Order):
     """Readers to wait for before the first frame."""
     history_s: float
     """What the ring shall hold for readers that begin in the past."""
+    backlog_s: float = 0.0
+    """What it shall hold of a source that does not wait, for a reader that pauses and then catches up."""
     ring: str | None = None
     """Go on in this ring, whose writer has died."""
     died_s: float | None = None
@@ -80,6 +82,10 @@ class ReconstructionOrder(_Order):
     intrinsics: Intrinsics | None
     first_frame: int = 0
     stop_frame: int | None = None
+    recorded: bool = False
+    """A recording is made at the same time, from which all can be reconstructed once more."""
+    least_poses: int = 0
+    """A path of fewer is published only at the end: a longer one is there already."""
 
 
 class PreviewOrder(_Order):
@@ -191,6 +197,14 @@ class Posed(BaseModel):
     pose: PosePayload
 
 
+class Outpaced(BaseModel):
+    """A camera was faster than the tracker, which has passed over frames; all of them are recorded."""
+
+    news: Literal["outpaced"] = "outpaced"
+    frames: int
+    passed: int
+
+
 class VersionPublished(BaseModel):
     """A version lies in the folder."""
 
@@ -275,6 +289,7 @@ News = Annotated[
     | RecordingEnded
     | ReconstructionStatus
     | Posed
+    | Outpaced
     | VersionPublished
     | PreviewTaken
     | Logged

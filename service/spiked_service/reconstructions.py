@@ -17,6 +17,7 @@ from spiked_service.errors import BusyError
 from spiked_service.ids import new_id
 from spiked_service.messages import (
     News,
+    Outpaced,
     Posed,
     ReconstructionOrder,
     ReconstructionStatus,
@@ -46,6 +47,9 @@ class _Job:
     child: Child | None = None
     cancelled: bool = False
     refusal: str | None = None
+    early: bool = False
+    """Asked to be done with what it has."""
+    outpaced: Outpaced | None = None
     saved_s: float = field(default_factory=time.monotonic)
 
 
@@ -75,6 +79,7 @@ class Reconstructions:
         self._jobs: dict[str, _Job] = {}
         self._unsaved: dict[str, ReconstructionRow] = {}
         self._backoffs: dict[str, Backoff] = {}
+        self._least_poses: dict[str, int] = {}
         self._not_before_s: dict[str, float] = {}
         self._on_live_end: dict[str, Callable[[ReconstructionRow], None]] = {}
         self._closing = False
@@ -125,6 +130,7 @@ class Reconstructions:
             intrinsics=_intrinsics(options, capture),
             first_frame=first_frame,
             stop_frame=stop_frame,
+            recorded=capture.plan.record,
         )
         with self._lock:
             self._on_live_end[row.id] = on_end
@@ -208,6 +214,7 @@ class Reconstructions:
         with self._lock:
             job = self._jobs.get(reconstruction_id)
             if job is not None and job.child is not None:
+                job.early = True
                 job.child.stop()
 
     def restart(self, reconstruction_id: str, options: ReconstructionOptions | None = None) -> ReconstructionRow:
@@ -322,6 +329,7 @@ class Reconstructions:
             unhurried=True,
             options=row.options,
             intrinsics=_intrinsics(row.options, capture),
+            least_poses=self._least_poses.pop(row.id, 0),
         )
         now = datetime.now(UTC)
         begun = replace(
@@ -358,6 +366,8 @@ class Reconstructions:
                     self._announce.pose(job.row, news.pose)
                 case VersionPublished():
                     self._published(job, news)
+                case Outpaced():
+                    job.outpaced = news
                 case Refused():
                     job.refusal = news.reason
 
@@ -416,6 +426,13 @@ class Reconstructions:
 
     def _outcome(self, job: _Job, trouble: str | None) -> ReconstructionRow:
         row = replace(job.row, ended_at=datetime.now(UTC), eta_s=None)
+        if trouble is None and job.outpaced is not None and not (job.cancelled or job.early):
+            seen, passed = job.outpaced.frames, job.outpaced.passed
+            told = f"followed live at a glance, {passed} of {seen} frames passed over; all are taken from the recording"
+            self._least_poses[row.id] = row.poses
+            return replace(
+                row, live=False, state=JobState.QUEUED, stage=Stage.WAITING, progress=0.0, reason=told, ended_at=None
+            )
         if trouble is None:
             state = JobState.CANCELLED if job.cancelled else JobState.COMPLETE
             # A tracker that never began says why in its reason; of one that tracked to the end there is nothing to say.

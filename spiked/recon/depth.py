@@ -51,12 +51,18 @@ def neighbours(centres: Array, forward: Array, reference: int, count: int) -> ND
 
 
 def sweep(
-    reference: Shot, others: list[Shot], intrinsics: Intrinsics, near_far: tuple[float, float], noise: Image
+    reference: Shot,
+    others: list[Shot],
+    intrinsics: Intrinsics,
+    near_far: tuple[float, float],
+    noise: Image,
+    pixels: int = SWEPT_PIXELS,
 ) -> Sweep:
     """Inverse depth of `reference` between `near_far` (inverse depths: largest, smallest). `noise` [H, W] is the
-    standard deviation of a difference between two images. Large images are swept at a fraction of their size."""
+    standard deviation of a difference between two images. Images of more than about so many `pixels` are swept at a
+    fraction of their size."""
     height, width = reference.image.shape
-    fraction = max(1, round(float(np.sqrt(height * width / SWEPT_PIXELS))))
+    fraction = max(1, round(float(np.sqrt(height * width / pixels))))
     if fraction > 1:
         small = sweep(
             _smaller(reference, fraction),
@@ -64,6 +70,7 @@ def sweep(
             Intrinsics(*(v / fraction for v in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))),
             near_far,
             np.asarray(_shrunk(noise, fraction) / fraction, np.float32),
+            height * width,
         )
         size = (width, height)
         return Sweep(*(cv2.resize(image, size).astype(np.float32) for image in (small.inverse_depth, small.confidence)))

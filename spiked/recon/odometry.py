@@ -17,7 +17,7 @@ from spiked.recon.smooth import clock_of, coarsest
 from spiked.recon.stamps import Stamps, delays
 from spiked.recon.tracks import Picture, Tracks, search
 from spiked.sensor import Intrinsics
-from spiked.spline import Spline
+from spiked.spline import Spline, Waypoints
 
 
 class State(StrEnum):
@@ -98,6 +98,9 @@ class Odometry:
     points: Array = field(default_factory=lambda: np.full((0, 3), np.nan))
     """Position of every track by id, NaN where unknown."""
     spline: Spline | None = None
+    sparse: bool = False
+    """The views are so far apart that no spline can be tied to them: the path leads from each to the next, only the
+    newest are adjusted together, and nothing takes much longer than a view."""
     changes: list[tuple[float, State, str]] = field(default_factory=list)
     """(time in frames, state, reason) of each change of state."""
 
@@ -110,6 +113,10 @@ class Odometry:
         self._noise_px = 0.0
         self._next_global = 0
         self._keys: dict[int, Picture] = {}
+
+    def pass_over(self) -> None:
+        """From now on the views are far apart; see `sparse`."""
+        self.sparse = self._tracks.far = True
 
     def add(
         self,
@@ -475,8 +482,18 @@ class Odometry:
         """Positions for all tracks, for paths that are known from elsewhere."""
         self._triangulate(range(len(self.views)))
 
+    def waypoints(self) -> Waypoints | None:
+        """The path from each posed view to the next; None before the bootstrap."""
+        posed = [(v.time, v.rotation, v.centre) for v in self.views if v.rotation is not None and v.centre is not None]
+        if len(posed) < 2:
+            return None
+        times, rotations, centres = zip(*posed, strict=True)
+        return Waypoints(np.array(times), np.stack(rotations), np.stack(centres))
+
     def settle(self) -> None:
         """Adjust the whole path: freely first, then on the coarsest spline that follows it."""
+        if self.sparse:
+            return
         posed = [n for n, v in enumerate(self.views) if v.rotation is not None]
         self._next_global = max(len(self.views) + 12, int(1.5 * len(self.views)))
         if len(posed) < BOOT_VIEWS:

@@ -15,7 +15,7 @@ from threadpoolctl import ThreadpoolController
 from spiked.errors import ConfigurationError
 from spiked.pose import Array, log_so3
 from spiked.recon.colour import contradicts
-from spiked.recon.depth import Shot, neighbours, sweep
+from spiked.recon.depth import SWEPT_PIXELS, Shot, neighbours, sweep
 from spiked.recon.mapping import Mapper, Sight, fill_mosaic
 from spiked.recon.odometry import Odometry, State
 from spiked.recon.options import Options
@@ -25,7 +25,7 @@ from spiked.recon.views import Image, View, Windows, luminance
 from spiked.render import Camera
 from spiked.scene import Scene
 from spiked.sensor import Sensor
-from spiked.spline import Spline
+from spiked.spline import Path, Spline
 from spiked.trajectory import Trajectory
 
 SUB_FRAME_PX = 3.0
@@ -47,6 +47,8 @@ ALIGNED_SHARE = 0.6
 STALE_PX = 0.3
 """A map that was drawn along a path which then moved farther than this in the image, in a tenth of the views, is drawn
 anew: otherwise the aligned path gives way to it (7 % of error instead of 3 % in the daemon's end-to-end test)."""
+BRIDGED_S = 0.03
+"""The path between two views is taken to be smooth over so much time: a hand trembles ten times a second."""
 ALIGNED_VIEWS = 160
 """Views looked at for it, at most."""
 
@@ -125,12 +127,16 @@ class Reconstructor:
         self._queue: list[int] = []
         self._seeded: list[float] = []
         self._gaps: list[tuple[int, int]] = []
+        self._bridged: set[int] = set()  # views between which and the one before frames were only passed over
+        self._broken = True
         self._frames = 0
         self._version = 0
         self._stage = "waiting"
         self._progress = 0.0
         self._refined: Spline | None = None
-        self._mapped: Spline | None = None
+        self._mapped: Path | None = None
+        self._waypoints: Path | None = None
+        self._strung = -1
         self._unit = 1.0
         self._depth = 1.0
         self._spent = {"tracking": 0.0, "mapping": 0.0, "refining": 0.0}
@@ -156,9 +162,40 @@ class Reconstructor:
     def _one_blas_thread(self) -> AbstractContextManager[object]:
         return cast(AbstractContextManager[object], self._blas.limit(limits=1, user_api="blas"))
 
+    @property
+    def glance_frames(self) -> int:
+        """Frames that `glance` makes its next view of."""
+        return self._windows.glance_frames
+
+    @property
+    def speed_px(self) -> float | None:
+        """Image motion a frame between the two newest views; None where nothing could be followed."""
+        views = self._odometry.views
+        if len(views) < 2 or not views[-1].motion_px:
+            return None
+        return views[-1].motion_px / (views[-1].time - views[-2].time)
+
+    def glance(self, first_frame: int, frames: NDArray[np.uint8]) -> None:
+        """Take one view from the middle of stored frames, and nothing of what came between it and the view before: for
+        a camera that is faster than the tracker. The path is smooth in between, and has poses there."""
+        begin = time.perf_counter()
+        with self._one_blas_thread():
+            broken = self._broken
+            self._odometry.pass_over()
+            self._add(self._windows.glance(first_frame, frames))
+            if (
+                not broken
+                and self._odometry.views[-1].time - self._odometry.views[-2].time
+                < BRIDGED_S * self.sensor.frame_rate_hz
+            ):
+                self._bridged.add(len(self._odometry.views) - 1)
+        self._frames = first_frame + len(frames)
+        self._spent["tracking"] += time.perf_counter() - begin
+
     def gap(self, first_frame: int, count: int) -> None:
         """Frames [first_frame, first_frame + count) were lost."""
         self._gaps.append((first_frame, count))
+        self._broken = True
 
     def _add(self, view: View) -> None:
         grey = luminance(view.rate, self.sensor.mosaic) if view.sharp is None else view.sharp
@@ -167,6 +204,7 @@ class Reconstructor:
         image = picture(grey, max(white, 1e-6))
         posed = self._odometry.add(view.time, view.end - view.begin, image, self._given(view), delay)
         self._views.append(view)
+        self._broken = False
         if len(self._views) == 1:
             self._check_colour(view)
         if self._stage == "waiting":
@@ -207,9 +245,13 @@ class Reconstructor:
         self._mapper.forget_residuals()
 
     @property
-    def spline(self) -> Spline | None:
+    def path(self) -> Path | None:
         """The path so far in frames and map units; None before the bootstrap."""
-        return self._refined or self._odometry.spline
+        if not self._odometry.sparse:
+            return self._refined or self._odometry.spline
+        if self._strung != self._version:
+            self._waypoints, self._strung = self._odometry.waypoints(), self._version
+        return self._waypoints
 
     def improve(self, seconds: float) -> None:
         """Map for about this long: seed the map where the camera has been, then gradient steps."""
@@ -221,20 +263,20 @@ class Reconstructor:
             self._seed(self._newest_seed())
         while time.perf_counter() - begin < seconds:
             self._step(1.0, coarse=max(0.0, 1 - self._mapper.steps / YOUNG_STEPS))
-        self._mapped = self.spline
+        self._mapped = self.path
         self._spent["mapping"] += time.perf_counter() - begin
         self._note()
 
     def _ready(self) -> bool:
-        return self._odometry.spline is not None and len(self._mappable()) >= 10
+        return self.path is not None and len(self._mappable()) >= 10
 
     def _mappable(self) -> list[int]:
         """Views whose pose is known: inside the path, and seen while tracking was good."""
-        spline = self.spline
-        if spline is None:
+        path = self.path
+        if path is None:
             return []
         good = {v.time for v in self._odometry.views if v.rotation is not None and v.state is not State.LOST}
-        return [i for i, v in enumerate(self._views) if spline.begin <= v.time <= spline.end and v.time in good]
+        return [i for i, v in enumerate(self._views) if path.begin <= v.time <= path.end and v.time in good]
 
     def _wants_seed(self) -> bool:
         times = [self._views[i].time for i in self._mappable()]
@@ -246,9 +288,9 @@ class Reconstructor:
 
     def _seed(self, numbers: list[int]) -> None:
         """Sweep depth at some views and fill what the map does not cover."""
-        spline, usable = self.spline, self._mappable()
-        assert spline is not None and self.sensor.intrinsics is not None
-        rotations, centres = spline.poses([self._views[i].time for i in usable])
+        path, usable = self.path, self._mappable()
+        assert path is not None and self.sensor.intrinsics is not None
+        rotations, centres = path.poses([self._views[i].time for i in usable])
         points = self._odometry.points[np.isfinite(self._odometry.points[:, 0])]
         for number in numbers:
             reference = usable.index(number)
@@ -264,43 +306,44 @@ class Reconstructor:
                 return Shot(image, rotations[row], centres[row])
 
             others = [shot(r) for r in neighbours(centres, rotations[:, :, 2], reference, SWEEP_NEIGHBOURS)]
-            swept = sweep(
-                shot(reference), others, self.sensor.intrinsics, (1.3 * high, 0.5 * low), 1.5 * view.deviation
-            )
+            # A quarter of the pixels takes a tenth of a second, in which a fast camera is not lost.
+            pixels = SWEPT_PIXELS // 4 if self._odometry.sparse else SWEPT_PIXELS
+            planes = (1.3 * high, 0.5 * low)
+            swept = sweep(shot(reference), others, self.sensor.intrinsics, planes, 1.5 * view.deviation, pixels)
             self._mapper.seed_from(view, rotations[reference], centres[reference], swept)
             self._seeded.append(view.time)
         self._version += 1
 
     def _step(self, decay: float, densify: bool = True, coarse: float = 0.0) -> None:
         """One gradient step on the next view of a random order."""
-        spline = self.spline
-        assert spline is not None
+        path = self.path
+        assert path is not None
         if not self._queue:
             self._queue = [int(i) for i in self._rng.permutation(self._mappable())]
         view = self._views[number := self._queue.pop()]
         level = self._mapper.level(coarse)
-        sight = self._sight(view, spline, level.factor)
+        sight = self._sight(view, path, level.factor)
         self._mapper.step(number, view, sight, decay, level)
         if densify and self._mapper.steps % 100 == 0:
             self._mapper.densify(number, view, sight)
         self._version += self._mapper.steps % 20 == 0
 
-    def _sight(self, view: View, spline: Spline, pixel: int = 1) -> Sight:
+    def _sight(self, view: View, path: Path, pixel: int = 1) -> Sight:
         """The camera's way during a view, in pieces over which the image moves little; pixels may be larger ones."""
         parts = self.options.mapping.sub_frames
         if parts == 0:
-            rotations, centres = spline.poses([view.time])
+            rotations, centres = path.poses([view.time])
             return Sight(rotations, centres)
         if parts is None:
             times, _, _ = view.exposure(1)
-            parts = int(np.clip(np.ceil(self._motion(spline, times) / (SUB_FRAME_PX * pixel)), 1, MAX_SUB_FRAMES))
+            parts = int(np.clip(np.ceil(self._motion(path, times) / (SUB_FRAME_PX * pixel)), 1, MAX_SUB_FRAMES))
         times, windows, seen = view.exposure(parts)
-        rotations, centres = spline.poses(np.clip(times, spline.begin, spline.end))
+        rotations, centres = path.poses(np.clip(times, path.begin, path.end))
         return Sight(rotations, centres, windows, seen)
 
-    def _motion(self, spline: Spline, times: Array) -> float:
+    def _motion(self, path: Path, times: Array) -> float:
         """How far the image moves between two times at a typical place, in pixels."""
-        rotations, centres = spline.poses(np.clip(times, spline.begin, spline.end))
+        rotations, centres = path.poses(np.clip(times, path.begin, path.end))
         return self._apart(rotations[0], centres[0], rotations[-1], centres[-1])
 
     def _apart(self, rotation: Array, centre: Array, other: Array, other_centre: Array) -> float:
@@ -379,7 +422,7 @@ class Reconstructor:
 
     def _stale(self) -> bool:
         """Whether the path has left the one that the map was made along: such a map would hold it where it was."""
-        old, new = self._mapped, self.spline
+        old, new = self._mapped, self.path
         if old is None or new is None:
             return False
         times = [v.time for v in (self._views[i] for i in self._mappable()) if old.begin <= v.time <= old.end]
@@ -394,13 +437,13 @@ class Reconstructor:
         return round(self.options.steps * min(1.0, float(np.sqrt(SMALL_PIXELS / pixels))))
 
     def _aligns(self, done: int, steps: int) -> bool:
-        wanted = self.options.refine_poses and self.options.poses is None
+        wanted = self.options.refine_poses and self.options.poses is None and isinstance(self.path, Spline)
         interval = max(1, int(ALIGNED_SHARE * steps) // ALIGNMENTS)
         return wanted and (done + 1) % interval == 0 and done < ALIGNED_SHARE * steps
 
     def _align(self) -> None:
-        spline = self.spline
-        assert spline is not None
+        spline = self.path
+        assert isinstance(spline, Spline)
         numbered = [(i, self._views[i]) for i in self._mappable()]
         every = -(-len(numbered) // ALIGNED_VIEWS)
         pixel = self._mapper.alignment_level.factor
@@ -424,7 +467,8 @@ class Reconstructor:
 
     def tracked(self, since: int = 0) -> list[Tracked]:
         """The views tracked so far, in order, without the first `since`."""
-        rates = {view.time: float(view.rate.mean()) for view in self._views[-64:]}
+        new = self._odometry.views[since:]
+        rates = {view.time: float(view.rate.mean()) for view in self._views[-min(64, len(new) or 1) :]}
         return [
             Tracked(
                 view.time,
@@ -436,23 +480,28 @@ class Reconstructor:
                 view.sigma_px,
                 view.chi2,
             )
-            for view in self._odometry.views[since:]
+            for view in new
         ]
 
     def trajectory(self) -> Trajectory:
         """A pose for the middle of every frame whose surroundings were tracked; empty before the bootstrap."""
-        spline = self.spline
+        path = self.path
         frames = np.arange(self._frames) + 0.5
-        if spline is None:
+        if path is None:
             return Trajectory(np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
-        frames = frames[(frames >= spline.begin) & (frames <= spline.end)]
-        posed = [v for v in self._odometry.views if v.rotation is not None]
-        times = np.array([v.time for v in posed])
-        reach = np.array([v.length for v in posed])
-        near = np.clip(np.searchsorted(times, frames), 1, len(times) - 1)
-        near = np.where(np.abs(times[near - 1] - frames) < np.abs(times[near] - frames), near - 1, near)
-        frames = frames[np.abs(times[near] - frames) <= 1.5 * reach[near]]
-        rotations, centres = spline.poses(frames)
+        frames = frames[(frames >= path.begin) & (frames <= path.end)]
+        numbered = [(n, v) for n, v in enumerate(self._odometry.views) if v.rotation is not None]
+        numbers = np.array([n for n, _ in numbered])
+        times = np.array([v.time for _, v in numbered])
+        reach = np.array([v.length for _, v in numbered])
+        after = np.clip(np.searchsorted(times, frames), 1, len(times) - 1)
+        near = np.where(np.abs(times[after - 1] - frames) < np.abs(times[after] - frames), after - 1, after)
+        kept = np.abs(times[near] - frames) <= 1.5 * reach[near]
+        if self._bridged:
+            smooth = np.array([n in self._bridged for n in numbers]) & (np.diff(numbers, prepend=-2) == 1)
+            kept |= smooth[after] & (frames > times[after - 1]) & (frames < times[after])
+        frames = frames[kept]
+        rotations, centres = path.poses(frames)
         return Trajectory(frames / self.sensor.frame_rate_hz, rotations, centres * self._unit)
 
     def scene(self) -> Scene:
@@ -487,9 +536,9 @@ class Reconstructor:
         out = []
         for i in np.linspace(0, len(usable) - 1, count).round().astype(int):
             view = self._views[usable[i]]
-            spline = self.spline
-            assert spline is not None
-            rotation, centre = spline.poses([view.time])
+            path = self.path
+            assert path is not None
+            rotation, centre = path.poses([view.time])
             observed = fill_mosaic(view.rate, self._mapper.channels)
             rendered = self._mapper.render(rotation[0], centre[0])
             rendered = rendered[..., None] if rendered.ndim == 2 else rendered
@@ -531,7 +580,7 @@ class Reconstructor:
                 }
                 for v in odometry.views
             ],
-            "knot_spacing_frames": self.spline.spacing if self.spline else None,
+            "knot_spacing_frames": self.path.spacing if isinstance(self.path, Spline) else None,
             "splats": len(self._mapper.scene),
             "steps": self._mapper.steps,
             "loss": self._mapper.loss,

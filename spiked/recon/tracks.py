@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from spiked.pose import Array
 
 Picture = NDArray[np.uint8]
+SURE = 0.6
+"""With so many of the points found, no other place is tried."""
 
 
 def picture(rate: NDArray[np.float32], white: float) -> Picture:
@@ -27,6 +29,8 @@ class Tracks:
 
     target: int = 400
     """How many live tracks are kept."""
+    far: bool = False
+    """The image may move by dozens of pixels from one window to the next: it is looked for first."""
     reach_px: float = 0.6
     """Largest forward-backward distance of a good track."""
     next_id: int = 0
@@ -62,7 +66,10 @@ class Tracks:
 
     def _follow(self, image: Picture) -> float:
         before = self.pictures[self.newest]
-        moved, good = flow(before, image, self.at, self.at, self.reach_px, levels=4)
+        if self.far:
+            moved, good = search(before, image, self.at)
+        else:
+            moved, good = flow(before, image, self.at, self.at, self.reach_px, levels=4)
         motion = float(np.median(np.linalg.norm(moved - self.at, axis=1)[good])) if good.any() else 0.0
         for window in np.unique(self.born[good]):
             rows = np.flatnonzero(good & (self.born == window))
@@ -126,4 +133,6 @@ def search(a: Picture, b: Picture, points: Array) -> tuple[Array, NDArray[np.boo
         good &= (at > 4).all(1) & (at < np.array(b.shape[::-1]) - 4).all(1)
         if good.sum() > best[1].sum():
             best = at, good
+        if good.sum() > SURE * len(points):
+            break
     return best

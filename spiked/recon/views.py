@@ -128,6 +128,22 @@ class Windows:
         self._frames = np.concatenate([self._frames, frames]) if len(self._frames) else frames
         yield from self._cut(final=False)
 
+    @property
+    def glance_frames(self) -> int:
+        """Frames that `glance` needs."""
+        return self.length + 2 * MARGIN
+
+    def glance(self, first_frame: int, frames: NDArray[np.uint8]) -> View:
+        """One view in the middle of frames uint8 [n, frame_bytes]; what came before and waits is let go."""
+        stop = first_frame + len(frames)
+        length = min(self.length, len(frames))
+        begin = first_frame + (len(frames) - length) // 2
+        window = aligned_window(frames, self.sensor, first_frame, begin, begin + length)
+        view = make_view(window, self._gap, self._calibration)
+        self._frames, self._first, self._next, self._gap = frames[:0], stop, stop, False
+        self._probed, self._sharpener = True, None
+        return view
+
     def flush(self) -> Iterator[View]:
         """The last views, whose right margin never came."""
         yield from self._cut(final=True)

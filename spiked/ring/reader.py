@@ -96,10 +96,19 @@ class RingReader:
         """
         return cls(attach_segment(name), policy, consumer, start_frame)
 
+    def another(self, policy: Policy, consumer: str, start_frame: int) -> "RingReader":
+        """One more reader of the same ring, whose name may be gone meanwhile; see `attach`."""
+        return RingReader(self._segment, policy, consumer, start_frame)
+
     @property
     def geometry(self) -> Geometry:
         """Sensor, number of slots, and frames a slot."""
         return self._segment.geometry
+
+    @property
+    def newest_frame(self) -> int:
+        """One past the last frame that the writer has published, lost ones included; quicker than the whole status."""
+        return int(self._control.writer().next_frame)
 
     @property
     def overruns(self) -> int:

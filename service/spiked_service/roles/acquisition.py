@@ -24,6 +24,8 @@ _MOURNING_S = 15.0
 _HISTORY_SHARE = 0.4
 """Part of the ring that a lossless reader may begin in the past; it may lag half of it."""
 
+_MOST_BACKLOG_BYTES = 512 << 20
+
 
 def run_acquisition(order: AcquisitionOrder, link: Link) -> None:
     """Raises SourceError, RecordingError or RingError, which end the capture."""
@@ -51,16 +53,19 @@ def _ring(order: AcquisitionOrder, source: Source) -> RingWriter:
     """A new one, or that of a process that died. Raises RingError."""
     if order.ring is not None:
         return RingWriter.take_over(order.ring, mourning_s=_MOURNING_S)
-    slots = _slots(source.sensor, order.history_s, source.waits)
+    slots = _slots(source.sensor, order.history_s, order.backlog_s, source.waits)
     return RingWriter.create(
         source.sensor, slots=slots, block_frames=_BLOCK_FRAMES, ring_id=order.ring_id, mourning_s=_MOURNING_S
     )
 
 
-def _slots(sensor: Sensor, history_s: float, waits: bool) -> int | None:
+def _slots(sensor: Sensor, history_s: float, backlog_s: float, waits: bool) -> int | None:
     """Slots of the ring; None for the usual number."""
     if waits and not history_s:
         return _SLOTS_UNHURRIED
-    wanted = math.ceil(history_s * sensor.frame_rate_hz / _HISTORY_SHARE / _BLOCK_FRAMES)
-    usual = DEFAULT_BYTES // (_BLOCK_FRAMES * sensor.compact().frame_bytes)
-    return wanted if wanted > usual else None
+    slot_bytes = _BLOCK_FRAMES * sensor.compact().frame_bytes
+    slots_a_second = sensor.frame_rate_hz / _BLOCK_FRAMES
+    wanted = math.ceil(history_s * slots_a_second / _HISTORY_SHARE)
+    if not waits:
+        wanted = max(wanted, min(math.ceil(backlog_s * slots_a_second), _MOST_BACKLOG_BYTES // slot_bytes))
+    return wanted if wanted > DEFAULT_BYTES // slot_bytes else None

@@ -1,0 +1,51 @@
+"""A tracker that only glances at a fast camera: views far apart, and nothing of what lies between them."""
+
+import numpy as np
+import pytest
+
+from spiked.evaluate import score_trajectory
+from spiked.recon import Options, Reconstructor, State
+from spiked.sensor import Intrinsics, Sensor
+from spiked.simulate import MotionKind, SimulatedCamera
+from spiked.trajectory import Trajectory
+
+FRAMES, EVERY = 6000, 240
+SENSOR = Sensor(240, 160, 20_000.0, intrinsics=Intrinsics.from_fov(240, 160, 60))
+
+
+@pytest.fixture(scope="module")
+def glanced() -> tuple[Reconstructor, Trajectory]:
+    """5 px from view to view, in a quarter of a second; the truth."""
+    camera = SimulatedCamera(SENSOR, seed=2, motion=MotionKind.ARC, flow_px=0.02, parallax=0.06)
+    reconstructor = Reconstructor(SENSOR, Options(steps=60))
+    for first in range(0, FRAMES, EVERY):
+        frames = camera.next_frames(EVERY)
+        if first == 15 * EVERY:
+            reconstructor.gap(first, EVERY)
+        else:
+            reconstructor.glance(first, frames[: reconstructor.glance_frames])
+        reconstructor.improve(0.01)
+    k = np.arange(FRAMES)
+    return reconstructor, Trajectory((k + 0.5) / SENSOR.frame_rate_hz, *camera.truth(k))
+
+
+def test_it_finds_the_path_between_glances_too_but_not_over_a_gap(glanced: tuple[Reconstructor, Trajectory]) -> None:
+    reconstructor, truth = glanced
+    assert reconstructor.status().state in (State.TRACK, State.DEGRADED), reconstructor.status().reason
+    path = reconstructor.trajectory()
+    frames = np.round(path.times_s * SENSOR.frame_rate_hz - 0.5).astype(int)
+    lost = (frames > 14 * EVERY + 100) & (frames < 16 * EVERY)
+    assert not lost.any()
+    assert len(frames) > 0.85 * FRAMES
+    errors = score_trajectory(path, truth, SENSOR.frame_rate_hz).errors
+    assert errors is not None and errors.ate_percent < 3
+
+
+def test_it_is_mapped_and_refined(glanced: tuple[Reconstructor, Trajectory]) -> None:
+    reconstructor, _ = glanced
+    before = len(reconstructor.trajectory())
+    reconstructor.finish()
+    assert reconstructor.status().stage == "done"
+    assert len(reconstructor.scene()) > 500
+    assert len(reconstructor.trajectory()) == before
+    assert reconstructor.report()["knot_spacing_frames"] is None

@@ -154,6 +154,28 @@ def test_a_signal_ends_everything_and_leaves_nothing(
     assert list((tmp_path / "runtime").iterdir()) == []
 
 
+INTERRUPTED = """
+import os, signal, sys
+from spiked_service.daemon import Daemon
+from spiked_service.live import LiveSettings
+
+with Daemon(LiveSettings({"port": 0, "data": sys.argv[1] + "/data", "runtime": sys.argv[1] + "/run"})) as daemon:
+    async def strike():
+        with daemon.services.bus._lock:  # where a message is on its way: what is logged becomes one, too
+            os.kill(os.getpid(), signal.SIGTERM)
+            for _ in range(1000):
+                pass  # the handler runs in between, on this thread
+    daemon.pulse.beat = strike
+    daemon.run()
+"""
+
+
+def test_a_signal_under_a_lock_of_the_events_ends_the_service_all_the_same(tmp_path: Path) -> None:
+    ended = subprocess.run([sys.executable, "-c", INTERRUPTED, tmp_path], timeout=60, check=False, capture_output=True)
+    assert ended.returncode == 0, ended.stderr.decode()
+    assert b"stopping" in ended.stderr
+
+
 def test_the_death_of_the_service_takes_all_workers_along(daemon: Callable[..., Any], tmp_path: Path) -> None:
     one = daemon("--device", SMALL)
     capture = streaming(one)

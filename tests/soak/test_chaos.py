@@ -1,5 +1,9 @@
-"""Random maltreatment, and the invariants after each blow; the seed is in the test's name."""
+"""Random maltreatment, and the invariants after each blow; the seed is in the test's name.
 
+`CHAOS_SEED=100 pytest -m slow tests/soak/test_chaos.py` takes other seeds, from 100 on.
+"""
+
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -11,6 +15,7 @@ import pytest
 sys.path.append(str(Path(__file__).parent))
 from chaos import OVER, Clock, Victim, fill, small_disk, wait_for
 
+FIRST_SEED = int(os.environ.get("CHAOS_SEED", "0"))
 ACTIONS = [
     "kill_worker",
     "pause_worker",
@@ -42,7 +47,7 @@ def test_everything_once(daemon: Callable[..., Any], tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(FIRST_SEED, FIRST_SEED + 4))
 def test_much_at_random(daemon: Callable[..., Any], tmp_path: Path, seed: int) -> None:
     victim = Victim(daemon, tmp_path / "data", seed)
     maltreat(victim, victim.random.choices(ACTIONS, weights=[5, 2, 2, 1, 1, 1, 1, 1, 1], k=40))

@@ -152,6 +152,12 @@ def test_a_service_beyond_loopback_needs_a_token() -> None:
     assert "spiked token create" in done.stderr
 
 
+def test_a_setting_that_has_a_flag_of_its_own_can_be_set_by_name_too() -> None:
+    done = run("serve", "--set", "port=0", "--set", "log_level=inf")
+    assert done.returncode == 2
+    assert "did you mean info?" in done.stderr
+
+
 def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         done = run("serve", "--port", str(taken.getsockname()[1]), "--runtime", tmp_path / "runtime")

@@ -64,7 +64,6 @@ def serve(
     - `spiked token create laptop; spiked serve --device sim: --host 0.0.0.0`
     """
     flags: dict[str, object] = {
-        **dict(setting(text) for text in set_ or []),
         "devices": with_faults(device or [], drop=drop, gap=gap, corrupt=corrupt, unplug_at=unplug_at, stall=stall)
         or None,
         "host": host,
@@ -76,7 +75,8 @@ def serve(
         "log_level": log_level,
         "log_format": log_format,
     }
-    settings = LiveSettings({name: value for name, value in flags.items() if value is not None}, config)
+    given = dict(setting(text) for text in set_ or []) | {k: v for k, v in flags.items() if v is not None}
+    settings = LiveSettings(given, config)
     devices = settings.now.devices
     with Daemon(settings) as daemon:
         captures = daemon.services.captures

@@ -34,7 +34,7 @@ def test_it_finds_the_path_between_glances_too_but_not_over_a_gap(glanced: tuple
     assert reconstructor.status().state in (State.TRACK, State.DEGRADED), reconstructor.status().reason
     path = reconstructor.trajectory()
     frames = np.round(path.times_s * SENSOR.frame_rate_hz - 0.5).astype(int)
-    lost = (frames > 14 * EVERY + 200) & (frames < 16 * EVERY)
+    lost = (frames > 15 * EVERY - 60) & (frames < 16 * EVERY - 80)
     assert not lost.any()
     assert len(frames) > 0.85 * FRAMES
     errors = score_trajectory(path, truth, SENSOR.frame_rate_hz).errors

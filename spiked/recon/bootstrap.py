@@ -95,7 +95,7 @@ def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = 0.8) -> Verd
     every different outcome, the depth-reversed one above all, is clearly worse."""
     if len(views.ids) < 30:
         return Verdict(None, f"only {len(views.ids)} tracks span the views; more texture or light is needed", [])
-    rotation_only = _rotation_residual(views)
+    rotation_only = parallax_px(views)
     if rotation_only < min_parallax_px:
         return Verdict(None, f"parallax {rotation_only:.1f} px is below {min_parallax_px:g}: {MORE_MOTION}", [])
     rng = np.random.default_rng(seed)
@@ -189,7 +189,7 @@ def _align(first: Array, other: Array) -> Array:
     return np.asarray(rotation)
 
 
-def _rotation_residual(views: Views) -> float:
+def parallax_px(views: Views) -> float:
     """Median over tracks of the largest motion left (px) when the views are explained by rotation alone."""
     rays = views.rays()
     left = [rays[k] @ _align(rays[0], rays[k]).T for k in range(1, len(rays))]

@@ -4,7 +4,7 @@
 system of a few hundred poses is small, and the long sides are one matrix product.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from spiked.sensor import Intrinsics
 from spiked.spline import Spline
 
 Index = NDArray[np.int64]
+
+MOST_LOG_FOCAL = 0.2
+"""Change of the focal length's logarithm in one step, at most."""
 
 
 @dataclass
@@ -28,6 +31,8 @@ class Bundle:
     point: Index  # [M] the point of each observation
     pixels: Array  # [M, 2] px
     intrinsics: Intrinsics
+    focal_free: bool = False
+    """Whether the focal length (one for both axes) is adjusted too: then `intrinsics` changes as well."""
 
     def residuals(self) -> Array:
         """Reprojection errors [M, 2] in px; a point at or behind its camera has infinite error."""
@@ -61,7 +66,7 @@ class Bundle:
         for _ in range(iterations):
             system = self._linearise(scale_px, free)
             while damping < 1e6:
-                trial = self._stepped(*system.solve(damping), free)
+                trial = self._stepped(system.solve(damping), free)
                 cost = trial.cost(scale_px)
                 if cost < current:
                     break
@@ -69,6 +74,7 @@ class Bundle:
             else:
                 return current
             self.rotations, self.centres, self.points = trial.rotations, trial.centres, trial.points
+            self.intrinsics = trial.intrinsics
             damping = max(damping / 5, 1e-8)
             gain, current = (current - cost) / current, cost
             if gain < tolerance:
@@ -88,10 +94,15 @@ class Bundle:
         for _ in range(iterations):
             system = self._linearise(scale_px, everything)
             while damping < 1e6:
-                step, points = system.solve(damping, blend, (inertia.hessian(), inertia.gradient(spline)))
-                moved = spline.move(step[:, :3], step[:, 3:])
-                trial = Bundle(
-                    *moved.poses(times), self.points + points, self.camera, self.point, self.pixels, self.intrinsics
+                step = system.solve(damping, blend, (inertia.hessian(), inertia.gradient(spline)))
+                moved = spline.move(step.poses[:, :3], step.poses[:, 3:])
+                rotations, centres = moved.poses(times)
+                trial = replace(
+                    self,
+                    rotations=rotations,
+                    centres=centres,
+                    points=self.points + step.points,
+                    intrinsics=_scaled(self.intrinsics, step.log_focal),
                 )
                 cost = trial.cost(scale_px) + share * inertia.energy(moved)
                 if cost < current:
@@ -100,6 +111,7 @@ class Bundle:
             else:
                 return spline, current
             spline, self.rotations, self.centres, self.points = moved, trial.rotations, trial.centres, trial.points
+            self.intrinsics = trial.intrinsics
             damping = max(damping / 5, 1e-9)
             gain, current = (current - cost) / current, cost
             if gain < tolerance:
@@ -114,12 +126,23 @@ class Bundle:
         """How firmly each pose is held by the points where they are: [C, 6, 6] of (rotation, centre), in 1/px^2."""
         return self._linearise(scale_px, np.ones(len(self.centres), bool)).pose_hessian
 
-    def _stepped(self, poses: Array, points: Array, free: NDArray[np.bool_]) -> "Bundle":
+    def focal_sigma(self, scale_px: float) -> float:
+        """Relative standard deviation of the focal length with everything else free, if tracks were independent."""
+        system = replace(self, focal_free=True)._linearise(scale_px, np.ones(len(self.centres), bool))
+        information = system.focal_information()
+        return float(self.noise_px() / np.sqrt(information)) if information > 0 else np.inf
+
+    def _stepped(self, step: "_Step", free: NDArray[np.bool_]) -> "Bundle":
         rotations, centres = self.rotations.copy(), self.centres.copy()
-        rotations[free] = exp_so3(poses[:, :3]) @ rotations[free]
-        centres[free] += poses[:, 3:]
-        moved = self.points + points
-        return Bundle(rotations, centres, moved, self.camera, self.point, self.pixels, self.intrinsics)
+        rotations[free] = exp_so3(step.poses[:, :3]) @ rotations[free]
+        centres[free] += step.poses[:, 3:]
+        return replace(
+            self,
+            rotations=rotations,
+            centres=centres,
+            points=self.points + step.points,
+            intrinsics=_scaled(self.intrinsics, step.log_focal),
+        )
 
     def _linearise(self, scale_px: float, free: NDArray[np.bool_]) -> "_System":
         local, k = self._local(), self.intrinsics
@@ -133,6 +156,9 @@ class Bundle:
         by_point = np.stack([row_u, row_v], 1) @ self.rotations[self.camera].swapaxes(1, 2)  # [M, 2, 3]
         ray = self.points[self.point] - self.centres[self.camera]
         by_pose = np.concatenate([by_point @ hat(ray), -by_point], 2)  # [M, 2, 6]
+        by_focal = None
+        if self.focal_free:
+            by_focal = (error + self.pixels - [k.cx, k.cy]) * weight[:, None] ** 0.5
         return _System(
             by_pose * weight[:, None, None] ** 0.5,
             by_point * weight[:, None, None] ** 0.5,
@@ -141,13 +167,28 @@ class Bundle:
             self.point,
             free,
             len(self.points),
+            by_focal,
         )
+
+
+def _scaled(intrinsics: Intrinsics, log_focal: float) -> Intrinsics:
+    if log_focal == 0:
+        return intrinsics
+    factor = float(np.exp(np.clip(log_focal, -MOST_LOG_FOCAL, MOST_LOG_FOCAL)))
+    return replace(intrinsics, fx=intrinsics.fx * factor, fy=intrinsics.fy * factor)
 
 
 def _cauchy(error: Array, scale_px: float) -> tuple[Array, Array]:
     """Loss and weight of each observation; infinite errors cost as much as a 1000-scale one and pull at nothing."""
     square = np.minimum((error / scale_px) ** 2, 1e6).sum(1)
     return np.log1p(square), np.where(np.isfinite(error).all(1), 1 / (1 + square), 0.0)
+
+
+@dataclass(frozen=True)
+class _Step:
+    poses: Array  # [c, 6] of the free poses, or [knots, 6]
+    points: Array  # [P, 3]
+    log_focal: float = 0.0
 
 
 class _System:
@@ -162,6 +203,7 @@ class _System:
         point: Index,
         free: NDArray[np.bool_],
         points: int,
+        by_focal: Array | None = None,
     ) -> None:
         slot = np.cumsum(free) - 1
         seen = free[camera]
@@ -175,13 +217,35 @@ class _System:
         self.cross = np.zeros((cameras, 6, points, 3))
         blocks = self.cross.transpose(0, 2, 1, 3)
         np.add.at(blocks, (c, p), np.einsum("mki,mkj->mij", a, b))
+        self.focal: _Focal | None = None
+        if by_focal is not None:
+            self.focal = _Focal(
+                float((by_focal**2).sum()),
+                float((by_focal * error).sum()),
+                _sum_by(c, np.einsum("mki,mk->mi", a, by_focal[seen]), cameras),
+                _sum_by(point, np.einsum("mki,mk->mi", by_point, by_focal), points),
+            )
 
-    def solve(
-        self, damping: float, blend: Array | None = None, prior: tuple[Array, Array] | None = None
-    ) -> tuple[Array, Array]:
-        """Steps of the free poses [c, 6] and of the points [P, 3].
+    def focal_information(self) -> float:
+        """What is known of the focal length's logarithm when all else is free, in 1/px^2."""
+        assert self.focal is not None
+        cameras, _, points, _ = self.cross.shape
+        v_inverse = np.linalg.inv(self.points_hessian + 1e-9 * np.eye(3))
+        cross = self.cross.reshape(cameras * 6, points * 3)
+        scaled = np.einsum("ciPj,Pjk->ciPk", self.cross, v_inverse, optimize=True).reshape(cross.shape)
+        reduced = -scaled @ cross.T
+        index = np.arange(cameras)
+        reduced.reshape(cameras, 6, cameras, 6)[index, :, index, :] += self.pose_hessian
+        reduced[np.diag_indices(len(reduced))] += 1e-9 * np.abs(np.diag(reduced)).max()
+        by_points = self.focal.by_points
+        side = self.focal.by_poses.ravel() - scaled @ by_points.ravel()
+        left = self.focal.hessian - np.einsum("Pi,Pij,Pj->", by_points, v_inverse, by_points)
+        return float(left - side @ np.linalg.solve(reduced, side))
 
-        With `blend` [c, knots] the poses move only as that blend of knots, and their steps [knots, 6] are returned;
+    def solve(self, damping: float, blend: Array | None = None, prior: tuple[Array, Array] | None = None) -> _Step:
+        """Steps of the free poses, of the points and of the focal length if it is free.
+
+        With `blend` [c, knots] the poses move only as that blend of knots, and their steps are those of the knots;
         `prior` is added to their Hessian [knots, 6, knots, 6] and gradient [knots, 6].
         """
         cameras, _, points, _ = self.cross.shape
@@ -190,28 +254,56 @@ class _System:
         v_inverse = np.linalg.inv(v)
         scaled = np.einsum("ciPj,Pjk->ciPk", self.cross, v_inverse, optimize=True).reshape(cameras * 6, points * 3)
         cross = self.cross.reshape(cameras * 6, points * 3)
-        reduced = -scaled @ cross.T
-        blocks = reduced.reshape(cameras, 6, cameras, 6)
+        square = -scaled @ cross.T
+        blocks = square.reshape(cameras, 6, cameras, 6)
         index = np.arange(cameras)
         blocks[index, :, index, :] += self.pose_hessian * (1 + damping * np.eye(6)) + 1e-9 * np.eye(6)
-        right = -self.pose_gradient.ravel() + scaled @ self.points_gradient.ravel()
-        if blend is None:
-            steps = np.linalg.solve(reduced, right).reshape(cameras, 6)
-            poses = steps
-        else:
+        downhill = (-self.pose_gradient.ravel() + scaled @ self.points_gradient.ravel()).reshape(cameras, 6)
+        side = None
+        if self.focal is not None:
+            side = self.focal.by_poses - (scaled @ self.focal.by_points.ravel()).reshape(cameras, 6)
+        if blend is not None:
             knots = blend.shape[1]
             by_knot = np.tensordot(np.tensordot(blend, blocks, (0, 0)), blend, (2, 0))  # [k, 6, 6, k]
             square = by_knot.transpose(0, 1, 3, 2).reshape(knots * 6, knots * 6)
-            downhill = blend.T @ right.reshape(cameras, 6)
+            downhill = blend.T @ downhill
+            side = None if side is None else blend.T @ side
             if prior is not None:
                 square += prior[0].reshape(knots * 6, knots * 6)
                 downhill -= prior[1]
             square[np.diag_indices(knots * 6)] *= 1 + damping
             square[np.diag_indices(knots * 6)] += 1e-9
-            steps = np.linalg.solve(square, downhill.ravel()).reshape(knots, 6)
-            poses = blend @ steps
+        right, log_focal = downhill.ravel(), 0.0
+        if self.focal is not None and side is not None:
+            both = np.linalg.solve(square, np.stack([right, side.ravel()], 1))
+            by_points = np.einsum("Pij,Pj->Pi", v_inverse, self.focal.by_points)
+            left = (
+                self.focal.hessian * (1 + damping)
+                - (by_points * self.focal.by_points).sum()
+                - side.ravel() @ both[:, 1]
+            )
+            downhill_focal = -self.focal.gradient + (by_points * self.points_gradient).sum()
+            log_focal = float((downhill_focal - side.ravel() @ both[:, 0]) / max(left, 1e-9))
+            log_focal = float(np.clip(log_focal, -MOST_LOG_FOCAL, MOST_LOG_FOCAL))
+            solved = both[:, 0] - log_focal * both[:, 1]
+        else:
+            solved = np.linalg.solve(square, right)
+        steps = solved.reshape(-1, 6)
+        poses = steps if blend is None else blend @ steps
         back = -self.points_gradient - (cross.T @ poses.ravel()).reshape(points, 3)
-        return steps, np.einsum("Pij,Pj->Pi", v_inverse, back)
+        if self.focal is not None:
+            back -= log_focal * self.focal.by_points
+        return _Step(steps, np.einsum("Pij,Pj->Pi", v_inverse, back), log_focal)
+
+
+@dataclass(frozen=True)
+class _Focal:
+    """The focal length's row of the normal equations, for its logarithm."""
+
+    hessian: float
+    gradient: float
+    by_poses: Array  # [c, 6]
+    by_points: Array  # [P, 3]
 
 
 def _sum_by(index: Index, values: Array, length: int) -> Array:

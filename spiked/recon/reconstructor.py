@@ -16,15 +16,16 @@ from spiked.errors import ConfigurationError
 from spiked.pose import Array, log_so3
 from spiked.recon.colour import contradicts
 from spiked.recon.depth import SWEPT_PIXELS, Shot, neighbours, sweep
+from spiked.recon.focal import FIRST_DEG, Focal
 from spiked.recon.mapping import Mapper, Sight, fill_mosaic
-from spiked.recon.odometry import Odometry, State
+from spiked.recon.odometry import SAME_FOCAL, Odometry, State
 from spiked.recon.options import Options
 from spiked.recon.refine import align_spline
 from spiked.recon.tracks import picture
 from spiked.recon.views import Image, View, Windows, luminance
 from spiked.render import Camera
 from spiked.scene import Scene
-from spiked.sensor import Sensor
+from spiked.sensor import Intrinsics, Sensor
 from spiked.spline import Path, Spline
 from spiked.trajectory import Trajectory
 
@@ -113,14 +114,23 @@ class Reconstructor:
     """
 
     def __init__(self, sensor: Sensor, options: Options | None = None) -> None:
-        """Raises ConfigurationError when the sensor has no intrinsics."""
-        if sensor.intrinsics is None:
-            raise ConfigurationError("the focal length is not known: give --fov DEGREES or --intrinsics fx,fy,cx,cy")
-        self.sensor = sensor
+        """A sensor without intrinsics has its focal length estimated; `sensor` and `camera` follow it.
+
+        Raises ConfigurationError when poses are given without intrinsics.
+        """
         self.options = options or Options()
-        self.camera = Camera(sensor.intrinsics, sensor.width, sensor.height)
+        intrinsics = sensor.intrinsics
+        if intrinsics is None:
+            if self.options.poses is not None:
+                raise ConfigurationError(
+                    "the focal length is not known, and poses are given: give --fov DEGREES or --intrinsics fx,fy,cx,cy"
+                )
+            intrinsics = Intrinsics.from_fov(sensor.width, sensor.height, FIRST_DEG)
+        self.sensor = replace(sensor, intrinsics=intrinsics)
+        self.camera = Camera(intrinsics, sensor.width, sensor.height)
         self._windows = Windows(sensor, self.options.window_frames, self.options.calibration)
-        self._odometry = Odometry(sensor.intrinsics, self.options.seed)
+        focal = Focal(intrinsics, np.inf) if sensor.intrinsics is None else None
+        self._odometry = Odometry(intrinsics, self.options.seed, focal)
         self._mapper = self._new_mapper()
         self._rng = np.random.default_rng(self.options.seed)
         self._views: list[View] = []
@@ -149,6 +159,24 @@ class Reconstructor:
     def _new_mapper(self) -> Mapper:
         options = self.options
         return Mapper(self.sensor, self.camera, options.mapping, options.seed, options.threads)
+
+    @property
+    def focal(self) -> Focal | None:
+        """What is known of a focal length that nobody gave; None where it was given."""
+        return self._odometry.focal
+
+    def _follow_focal(self) -> None:
+        """A map that was drawn with another focal length is drawn anew."""
+        found = self._odometry.intrinsics
+        if found == self.camera.intrinsics:
+            return
+        changed = abs(np.log(found.fx / self.camera.intrinsics.fx)) > SAME_FOCAL
+        if self._stage != "refining" and not changed:
+            return
+        self.sensor = replace(self.sensor, intrinsics=found)
+        self.camera = Camera(found, self.sensor.width, self.sensor.height)
+        self._mapper, self._mapped = self._new_mapper(), None
+        self._seeded, self._queue = [], []
 
     def feed(self, first_frame: int, frames: NDArray[np.uint8]) -> None:
         """Take stored frames uint8 [n, frame_bytes] that begin at absolute index `first_frame`."""
@@ -258,6 +286,7 @@ class Reconstructor:
         begin = time.perf_counter()
         if not self._ready():
             return
+        self._follow_focal()
         self._stage = "mapping"
         if len(self._mapper.scene) == 0 or self._wants_seed():
             self._seed(self._newest_seed())
@@ -399,6 +428,9 @@ class Reconstructor:
     def _refine(self, progress: Callable[[Status], None] | None, cancelled: Callable[[], bool]) -> None:
         begin = time.perf_counter()
         self._stage = "refining"
+        self._follow_focal()
+        if self.focal is not None:
+            self.warnings.append(f"{self.focal}: give --fov or --intrinsics if you know it")
         usable = self._mappable()
         if self._stale():
             self._mapper = self._new_mapper()
@@ -560,6 +592,9 @@ class Reconstructor:
         return {
             "versions": {"spiked": release, "python": platform.python_version()}
             | {name: version(name) for name in ("numpy", "opencv-python-headless")},
+            "focal_px": [self.camera.intrinsics.fx, self.camera.intrinsics.fy],
+            "focal_estimated": self.focal is not None,
+            "focal_relative_sigma": None if self.focal is None else _finite(self.focal.relative_sigma),
             "sensor": {"width": self.sensor.width, "height": self.sensor.height, "frame_rate_hz": rate},
             "options": options,
             "frames": self._frames,
@@ -597,3 +632,7 @@ class Reconstructor:
         a, _ = self._refined.poses(times)
         b, _ = self._odometry.spline.poses(times)
         return float(np.degrees(np.sqrt((log_so3(a @ b.swapaxes(1, 2)) ** 2).sum(1).mean())))
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None

@@ -153,6 +153,6 @@ def test_a_mosaic_camera_gives_a_coloured_scene() -> None:
     assert np.std(reconstructor.scene().colours, axis=1).mean() > 0.003
 
 
-def test_without_a_focal_length_it_says_what_to_give() -> None:
+def test_given_poses_need_a_focal_length(shaken: tuple[SimulatedCamera, np.ndarray, Trajectory]) -> None:
     with pytest.raises(ConfigurationError, match="--fov"):
-        Reconstructor(Sensor(240, 160, 20000.0))
+        Reconstructor(Sensor(240, 160, 20000.0), Options(poses=shaken[2]))

@@ -66,6 +66,14 @@ class Level:
             np.stack([_mean(deviation[..., c], rest) / np.float32(rest) for c in range(3)], -1),
         )
 
+    def mixed(self, image: Image) -> Image:
+        """One brightness a pixel, [h, w], of colours [h, w, 3] in the proportion of a mosaic's sites; grey passes."""
+        return image if image.ndim == 2 else np.ascontiguousarray(image @ np.array([0.25, 0.5, 0.25], np.float32))
+
+    def shrunk(self, image: Image) -> Image:
+        """A grey image [H, W] at this size."""
+        return image if self.factor == 1 else self._mean(image)
+
     def grey(self, image: Image) -> Image:
         """One brightness a pixel, [H, W], of what this level renders or sees: all colours in the same proportion."""
         if image.ndim == 3:

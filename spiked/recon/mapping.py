@@ -6,13 +6,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from spiked.calibration import Calibration
 from spiked.pose import Array
 from spiked.recon.depth import Sweep
 from spiked.recon.levels import Level, Target, levels
 from spiked.recon.nuisances import Nuisances
 from spiked.recon.options import MapOptions
+from spiked.recon.passage import Passage
 from spiked.recon.views import Image, View, luminance
 from spiked.render import Camera, Gradients
+from spiked.render.charge import ChargeLoss
 from spiked.render.loss import dssim
 from spiked.render.optimiser import Adam
 from spiked.render.splats import Image as Rendered
@@ -47,13 +50,21 @@ class Sight:
     """[2, H, W] for a camera that moves from pose to pose (`Rasteriser.forward_moving`); None: it stands still."""
     seen: NDArray[np.bool_] | None = None
     """[H, W], which pixels looked in these windows; None: all."""
+    passage: Passage | None = None
+    """Fast motion: the frames around the one pose that is given, compared with what was seen from there."""
 
 
 class Mapper:
     """Holds the scene and improves it, a view at a time."""
 
     def __init__(
-        self, sensor: Sensor, camera: Camera, options: MapOptions, seed: int, threads: int | None = None
+        self,
+        sensor: Sensor,
+        camera: Camera,
+        options: MapOptions,
+        seed: int,
+        threads: int | None = None,
+        calibration: Calibration | None = None,
     ) -> None:
         self.options = options
         self.camera = camera
@@ -67,6 +78,9 @@ class Mapper:
         self.adam = Adam(self.scene.arrays())
         self.nuisances = Nuisances(sensor.height, sensor.width)
         self.steps = 0
+        self._calibration = calibration
+        self._charge = ChargeLoss(sensor, threads)
+        self._wrong: Image = np.zeros((1, 1), np.float32)
         self._rng = np.random.default_rng(seed)
         self._residuals: dict[int, float] = {}
 
@@ -125,21 +139,12 @@ class Mapper:
     def step(self, key: int, view: View, sight: Sight, decay: float, level: Level) -> Gradients:
         """One gradient step on a view; `decay` scales the rate of the means, and its root the others.
         Returns the gradients (for the poses)."""
-        target = level.target(view, sight.windows, sight.seen)
         # A background of any brightness: dark things have to be there, not to be holes.
         background = float(self._rng.uniform(0, self.options.background)) * self.white
-        image = _look(level, self.scene, replace(sight, windows=target.windows), background)
-        expected = image.values
-        factor: Image | None = None
-        if level.factor == 1 and self.options.nuisances and self.steps >= NUISANCES_FROM:
-            factor = self.nuisances.factor(key)
-            self.nuisances.observe(key, image.values, view.rate, target.deviation, self.steps >= GAINS_FROM)
-            expected = expected * factor
-            if self.steps % NUISANCE_STEPS == NUISANCE_STEPS - 1:
-                self.nuisances.update()
-        slope, self._residuals[key] = self._slope(expected, target, level)
-        if factor is not None:
-            slope *= factor
+        if sight.passage is None:
+            slope = self._by_window(key, view, sight, level, background)
+        else:
+            slope = self._by_charge(key, sight, sight.passage, level, background)
         gradients = level.rasteriser.backward(slope)
         self.steps += 1
         o = self.options
@@ -151,6 +156,43 @@ class Mapper:
         # Light taken away would fit as well, but viewers of the scene know none: they show such splats as black.
         np.maximum(self.scene.colours, 0, out=self.scene.colours)
         return gradients
+
+    def _by_window(self, key: int, view: View, sight: Sight, level: Level, background: float) -> Image:
+        """The derivative of the loss by the image, of a view's rates over its pixels' windows."""
+        target = level.target(view, sight.windows, sight.seen)
+        image = _look(level, self.scene, replace(sight, windows=target.windows), background)
+        expected = image.values
+        factor: Image | None = None
+        if level.factor == 1 and self._knows_nuisances():
+            factor = self.nuisances.factor(key)
+            self.nuisances.observe(key, image.values, view.rate, target.deviation, self.steps >= GAINS_FROM)
+            expected = expected * factor
+            if self.steps % NUISANCE_STEPS == NUISANCE_STEPS - 1:
+                self.nuisances.update()
+        slope, self._residuals[key] = self._slope(expected, target, level)
+        if factor is not None:
+            slope *= factor
+        return slope
+
+    def _by_charge(self, key: int, sight: Sight, passage: Passage, level: Level, background: float) -> Image:
+        """As `_by_window`, of the charge between the spikes of all frames around a view."""
+        rotation, centre = sight.rotations[0], sight.centres[0]
+        image = level.rasteriser.forward(self.scene, sight.rotations, sight.centres, background=background)
+        moved = passage.displacements(self.camera, rotation, centre, image.depth)
+        calibration, dark = self._calibration, None
+        gain = self.nuisances.factor(key)
+        if calibration is not None:
+            gain, dark = np.where(calibration.dead, 0, gain * calibration.gain), calibration.dark
+        floor = self.options.floor * self.white
+        charge = self._charge(image.values, passage.frames, moved, gain, dark, pixel=level.factor, floor=floor)
+        if self._knows_nuisances():
+            self.nuisances.note(key, self.nuisances.level(key) * charge.brightness)
+        self._residuals[key] = charge.loss / self.white**2
+        self._wrong = charge.slope
+        return charge.slope / np.float32(self.white**2)
+
+    def _knows_nuisances(self) -> bool:
+        return self.options.nuisances and self.steps >= NUISANCES_FROM
 
     def _slope(self, expected: Image, target: Target, level: Level) -> tuple[Image, float]:
         """The derivative of the loss by what is expected, and the weighted mean squared error in units of white."""
@@ -198,12 +240,17 @@ class Mapper:
 
     def densify(self, key: int, view: View, sight: Sight, share: float = 0.06) -> None:
         """Give splats to what is rendered worst: in place of dead ones first, then new ones up to the cap."""
-        image = self.look(sight)
         middle = len(sight.centres) // 2
         rotation, centre = sight.rotations[middle], sight.centres[middle]
-        certainty = self._certainty(self.levels[0].target(view, sight.windows, sight.seen).deviation)
-        error = (view.rate - self.nuisances.factor(key) * image.values) * certainty
+        if sight.passage is None:
+            image = self.look(sight)
+            certainty = self._certainty(self.levels[0].target(view, sight.windows, sight.seen).deviation)
+            error = (view.rate - self.nuisances.factor(key) * image.values) * certainty
+        else:
+            image = self.rasteriser.forward(self.scene, rotation[None], centre[None])
+            error = cv2.resize(self._wrong, (self.camera.width, self.camera.height), interpolation=cv2.INTER_LINEAR)
         badness = cv2.GaussianBlur(np.abs(cv2.GaussianBlur(error, (0, 0), 0.7)), (0, 0), 1.0)
+        badness = badness.sum(-1) if badness.ndim == 3 else badness
         badness = np.maximum(badness - np.median(badness), 0)
         dead = np.flatnonzero(self.scene.opacity_logits < -4.0)
         if len(dead):
@@ -220,7 +267,8 @@ class Mapper:
         )
         v, u = np.divmod(place, self.camera.width)
         depth = np.where(image.depth > 0, image.depth, 1.0)[v, u]
-        colour = fill_mosaic(view.rate, self.channels)[v, u]
+        seen = fill_mosaic(view.rate, self.channels) if sight.passage is None else image.values
+        colour = seen.reshape(*seen.shape[:2], self.colours)[v, u]
         self._append(u + 0.5, v + 0.5, depth, colour, 1.0, rotation, centre)
 
     def render(self, rotation: Array, centre: Array) -> Image:

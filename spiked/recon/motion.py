@@ -76,8 +76,9 @@ def at(field: Field, points: Array) -> Array:
     return np.asarray((1 - b) * top + b * low)
 
 
-def carried(frames: NDArray[np.uint8], sensor: Sensor, grids: NDArray[np.float32]) -> Image:
-    """Mean spikes a frame [H, W] of stored frames [n, frame_bytes], each moved by its grid [n, rows, columns, 2] px.
+def carried(frames: NDArray[np.uint8], sensor: Sensor, grids: NDArray[np.float32], cell: int = CELL_PX) -> Image:
+    """Mean spikes a frame [H, W] of stored frames [n, frame_bytes], each moved by its grid [n, rows, columns, 2] px of
+    nodes `cell` px apart.
 
     On a mosaic every place mixes the colours of the sites that passed it. Places that nothing passed hold the mean.
     """
@@ -91,7 +92,7 @@ def carried(frames: NDArray[np.uint8], sensor: Sensor, grids: NDArray[np.float32
         sensor.flipped,
         sensor.bit_order is BitOrder.MSB,
         grids,
-        CELL_PX,
+        cell,
         spikes,
         weight,
     )

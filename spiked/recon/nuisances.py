@@ -51,14 +51,18 @@ class Nuisances:
         agree = (np.abs(observed - expected) < 3 * (deviation + error)) & np.isfinite(deviation)
         total = float(expected[agree].sum())
         if total > 0:
-            self._levels[key] = float(observed[agree].sum()) / total
-            self._mean_level = float(np.mean(list(self._levels.values())))
+            self.note(key, float(observed[agree].sum()) / total)
         if not gains:
             return
         model = rendered * np.float32(self.level(key))
         self._xx += precision * model * model
         self._xy += precision * model * (observed - model)
         self._observed += 1
+
+    def note(self, key: int, brightness: float) -> None:
+        """A view is so many times as bright as its render without nuisances."""
+        self._levels[key] = brightness
+        self._mean_level = float(np.mean(list(self._levels.values())))
 
     def update(self) -> None:
         """New gains from all that was observed."""

@@ -20,6 +20,7 @@ from spiked.recon.focal import FIRST_DEG, Focal
 from spiked.recon.mapping import Mapper, Sight, fill_mosaic
 from spiked.recon.odometry import SAME_FOCAL, Odometry, State
 from spiked.recon.options import Options
+from spiked.recon.passage import Passage
 from spiked.recon.refine import align_spline
 from spiked.recon.tracks import picture
 from spiked.recon.views import Image, View, Windows, luminance
@@ -158,7 +159,7 @@ class Reconstructor:
 
     def _new_mapper(self) -> Mapper:
         options = self.options
-        return Mapper(self.sensor, self.camera, options.mapping, options.seed, options.threads)
+        return Mapper(self.sensor, self.camera, options.mapping, options.seed, options.threads, options.calibration)
 
     @property
     def focal(self) -> Focal | None:
@@ -351,7 +352,7 @@ class Reconstructor:
             self._queue = [int(i) for i in self._rng.permutation(self._mappable())]
         view = self._views[number := self._queue.pop()]
         level = self._mapper.level(coarse)
-        sight = self._sight(view, path, level.factor)
+        sight = self._passing(view, path) or self._sight(view, path, level.factor)
         self._mapper.step(number, view, sight, decay, level)
         if densify and self._mapper.steps % 100 == 0:
             self._mapper.densify(number, view, sight)
@@ -369,6 +370,16 @@ class Reconstructor:
         times, windows, seen = view.exposure(parts)
         rotations, centres = path.poses(np.clip(times, path.begin, path.end))
         return Sight(rotations, centres, windows, seen)
+
+    def _passing(self, view: View, path: Path) -> Sight | None:
+        """A view of fast motion: one pose, and the frames around it that the path covers."""
+        if view.frames is None:
+            return None
+        times = view.first + 0.5 + np.arange(len(view.frames))
+        covered = (times >= path.begin) & (times <= path.end)
+        rotations, centres = path.poses(np.append(times[covered], view.time))
+        passage = Passage(view.frames[covered], rotations[:-1], centres[:-1])
+        return Sight(rotations[-1:], centres[-1:], passage=passage)
 
     def _motion(self, path: Path, times: Array) -> float:
         """How far the image moves between two times at a typical place, in pixels."""
@@ -480,7 +491,10 @@ class Reconstructor:
         every = -(-len(numbered) // ALIGNED_VIEWS)
         pixel = self._mapper.alignment_level.factor
         self._refined = align_spline(
-            spline, numbered[::every], self._mapper, lambda view: self._sight(view, spline, pixel)
+            spline,
+            numbered[::every],
+            self._mapper,
+            lambda view: self._passing(view, spline) or self._sight(view, spline, pixel),
         )
 
     def _note(self, running_s: float = 0.0) -> None:

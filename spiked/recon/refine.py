@@ -11,8 +11,13 @@ import cv2
 import numpy as np
 
 from spiked.pose import Array, hat
+from spiked.recon.levels import Level
 from spiked.recon.mapping import Mapper, Sight
-from spiked.recon.views import View
+from spiked.recon.motion import carried
+from spiked.recon.passage import Passage
+from spiked.recon.views import Image, View
+from spiked.render.charge import CELL_PX
+from spiked.render.splats import Image as Rendered
 from spiked.spline import Spline
 
 
@@ -49,15 +54,12 @@ def _normal_equations(
 ) -> tuple[Array, Array]:
     """Hessian [6, 6] and gradient [6] of the view's weighted squared error, for (phi, centre) perturbed on the left."""
     level = mapper.alignment_level
-    target = level.target(view, sight.windows, sight.seen)
-    image = mapper.look(replace(sight, windows=target.windows), level)
-    expected = image.values
-    if level.factor == 1:
-        expected = np.asarray(expected * mapper.nuisances.factor(key), np.float32)
-    smooth = level.grey(expected) / np.float32(mapper.white)
-    error = smooth - level.grey(target.values) / np.float32(mapper.white)
-    floor = mapper.options.floor
-    certainty = floor**2 / ((level.grey(target.deviation) / mapper.white) ** 2 + floor**2)
+    if sight.passage is None:
+        image, smooth, seen, certainty = _windowed(key, view, sight, mapper, level)
+    else:
+        image, smooth, seen, certainty = _carried(sight, sight.passage, mapper, level)
+    smooth = smooth / np.float32(mapper.white)
+    error = smooth - seen / np.float32(mapper.white)
     k = level.camera.intrinsics
     du = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 32)
     dv = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 32)
@@ -81,3 +83,27 @@ def _normal_equations(
     weight = certainty[v, u] / (1 + (e / (3 * scale)) ** 2)
     weighted = jacobian * weight[:, None]
     return weighted.T @ jacobian, weighted.T @ e
+
+
+Compared = tuple[Rendered, Image, Image, Image]
+"""The render, its grey image, what was seen [h, w] alike, and the weight of each pixel's squared difference."""
+
+
+def _windowed(key: int, view: View, sight: Sight, mapper: Mapper, level: Level) -> Compared:
+    """A view's rates, and the map over the pixels' windows."""
+    target = level.target(view, sight.windows, sight.seen)
+    image = mapper.look(replace(sight, windows=target.windows), level)
+    expected = image.values
+    if level.factor == 1:
+        expected = np.asarray(expected * mapper.nuisances.factor(key), np.float32)
+    floor = mapper.options.floor
+    certainty = floor**2 / ((level.grey(target.deviation) / mapper.white) ** 2 + floor**2)
+    return image, level.grey(expected), level.grey(target.values), certainty
+
+
+def _carried(sight: Sight, passage: Passage, mapper: Mapper, level: Level) -> Compared:
+    """The spikes of the frames around a moment, carried to it by the map's depth and the path, and the map then."""
+    image = level.rasteriser.forward(mapper.scene, sight.rotations, sight.centres)
+    moved = passage.displacements(mapper.camera, sight.rotations[0], sight.centres[0], image.depth)
+    seen = level.shrunk(carried(passage.frames, mapper.sensor, moved, CELL_PX))
+    return image, level.mixed(image.values), seen, np.ones_like(seen)

@@ -24,6 +24,8 @@ MARGIN = 24
 PROBE = 16
 """Frames that the motion is first judged from."""
 WINDOWS = (4, 8, 16, 32, 64)
+PASSAGE = 12
+"""Frames on either side of a view's middle that the map is fitted to where the motion is fast."""
 FIRST_WINDOW = 16
 WINDOW_MOTION_PX = (0.12, 0.6)
 """A view gets twice as long when the image moves less than the first in it, and half as long above twice the second."""
@@ -57,6 +59,10 @@ class View:
     sharp: Image | None = None
     """Mean spikes a frame at the middle of the window, of frames around it carried along the image motion, all colours
     mixed; None where the motion is slow or not known."""
+    first: int = 0
+    """Absolute index of the first of `frames`."""
+    frames: NDArray[np.uint8] | None = None
+    """Stored frames [n, frame_bytes] around the middle, where `sharp` is known; the map is fitted to all of them."""
 
     @property
     def time(self) -> float:
@@ -84,7 +90,12 @@ class View:
 
 
 def make_view(
-    window: Window, after_gap: bool, calibration: Calibration | None = None, sharp: Image | None = None
+    window: Window,
+    after_gap: bool,
+    calibration: Calibration | None = None,
+    sharp: Image | None = None,
+    first: int = 0,
+    frames: NDArray[np.uint8] | None = None,
 ) -> View:
     """The view of a spike-aligned window, in light instead of spikes where the camera is calibrated."""
     rate = window.rate(fill=True)
@@ -96,7 +107,7 @@ def make_view(
     delay = np.nan_to_num(window.centre() - middle, nan=0.0).astype(np.float16)
     duration = np.where(window.valid, window.duration(), window.end - window.begin).astype(np.float16)
     count = float(window.count.mean())
-    return View(window.begin, window.end, rate, deviation, delay, duration, count, after_gap, sharp)
+    return View(window.begin, window.end, rate, deviation, delay, duration, count, after_gap, sharp, first, frames)
 
 
 class Windows:
@@ -198,10 +209,16 @@ class Windows:
             self._next = end
             if sharp is None and self.sharpen and final:
                 continue  # what comes after the last frame is not known, and a smeared view would be worse than none
-            yield make_view(window, self._gap, self._calibration, sharp)
+            first, frames = self._around((begin + end) // 2, stop) if sharp is not None else (0, None)
+            yield make_view(window, self._gap, self._calibration, sharp, first, frames)
             self._gap = False
         keep = max(self._first, min(self._next - MARGIN, stop))
         self._frames, self._first = self._frames[keep - self._first :].copy(), keep
+
+    def _around(self, middle: int, stop: int) -> tuple[int, NDArray[np.uint8]]:
+        """The frames about a moment; they share memory with those of other views."""
+        first, last = max(self._first, middle - PASSAGE), min(stop, middle + PASSAGE)
+        return first, self._frames[first - self._first : last - self._first]
 
     def _sharp(self, time: float, stop: int) -> Image | None:
         if not self.sharpen:

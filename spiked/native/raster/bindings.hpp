@@ -22,5 +22,6 @@ inline void expect(bool holds, const char* what) {
 }
 
 void bind_losses(nanobind::module_&);
+void bind_charge(nanobind::module_&);
 
 }  // namespace raster

@@ -159,6 +159,33 @@ struct SsimImage {
 };
 // Floats of scratch: eight planes with margins above and below, and eight rows with margins at both ends.
 static inline int64_t ssim_scratch(int width, int height) { return 8 * ((int64_t)(height + 10) * width + width + 10); }
+constexpr int kMaxChargeFrames = 64;
+constexpr int kLeastChargeFrames = 4;  // a pixel that saw the image for less does not count
+
+// Frames of spikes, and an image seen by their pixels at displaced places (charge.inl).
+struct ChargeJob {
+    int64_t frames, width, height, row_stride, frame_stride;
+    bool flipped, msb;
+    uint8_t tile[4];  // the colours of a mosaic's 2x2 sites
+    const uint8_t* bytes;
+    const float* grids;  // [frames][rows][columns][2], px of the sensor, at nodes `cell` apart
+    int64_t rows, columns, cell;
+    const float* image;  // [image_height][image_width][colours], expected spikes a frame
+    int64_t image_width, image_height;
+    int32_t colours;
+    float pixel;        // side of an image pixel in sensor pixels
+    const float* gain;  // [height][width], 0 for pixels that do not count
+    const float* dark;  // [height][width] or null, spikes a frame
+    float floor;        // error of the map, spikes a frame
+    float jitter;       // of an interval's charge
+    float* slope;       // image rows from slope_row on
+    int64_t slope_row;
+};
+
+struct ChargeSums {
+    double loss, pixels, chi2, intervals, expected, counted;
+};
+
 constexpr int kMultiplyAddChains = 12;  // vectors that a round of multiply_add changes
 
 struct Kernels {
@@ -203,6 +230,9 @@ struct Kernels {
                      const float* weight, float* d_rendered);
     // Mean structural similarity of two planes, and its gradient.
     double (*ssim)(const SsimImage&, const float* rendered, const float* target, float* scratch, float* d_rendered);
+    // Adds rows [first, last) to the sums and to job.slope; lines [frames][columns][2] and scratch are its own.
+    void (*charge)(const ChargeJob&, int64_t first, int64_t last, float* lines, void* scratch, ChargeSums&);
+    int64_t (*charge_scratch)();
     float (*multiply_add)(int64_t rounds);
     int lanes;
 };

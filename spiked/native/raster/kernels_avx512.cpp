@@ -12,10 +12,11 @@ namespace {
 #include "moving.inl"
 #include "raster.inl"
 #include "losses.inl"
+#include "charge.inl"
 // clang-format on
 }  // namespace
 
 const Kernels kAvx512 = {"avx512",  prepare,          project, emit,   forward, store_tile, backward, project_moving,
-                         unproject, unproject_moving, cover,   finish, adam,    robust,     ssim,     multiply_add,
+                         unproject, unproject_moving, cover,   finish, adam,    robust,     ssim, charge, charge_scratch, multiply_add,
                          kLanes};
 }  // namespace raster

@@ -83,6 +83,7 @@ void backward(Renderer& self, ReadAny<float> d_values, Write<float, 2> means, Wr
 
 NB_MODULE(_raster, m) {
     bind_losses(m);
+    bind_charge(m);
     nb::class_<Renderer>(m, "Renderer")
         .def(
             "__init__",

@@ -1,0 +1,140 @@
+// Bands of rows share out the work; each has image rows of its own to add to, so that no bit depends on the threads.
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "bindings.hpp"
+#include "kernels.hpp"
+#include "pool.hpp"
+
+namespace nb = nanobind;
+
+namespace raster {
+namespace {
+
+constexpr int kBands = 8;
+
+struct Band {
+    int64_t first = 0, last = 0;  // sensor rows
+    std::vector<float> slope;
+    ChargeSums sums;
+};
+
+class ChargeLoss {
+  public:
+    explicit ChargeLoss(int threads) : pool_(threads) {}
+
+    nb::tuple run(Read<uint8_t, 2> frames, int64_t width, int64_t height, int64_t row_stride, bool flipped, bool msb,
+                  Read<uint8_t, 1> tile, Read<float, 4> grids, int64_t cell, Read<float, 3> image, float pixel,
+                  Read<float, 2> gain, std::optional<Read<float, 2>> dark, float floor, float jitter,
+                  Write<float, 3> slope) {
+        const int64_t count = static_cast<int64_t>(frames.shape(0));
+        const int64_t image_height = static_cast<int64_t>(image.shape(0));
+        const int64_t image_width = static_cast<int64_t>(image.shape(1)), colours = static_cast<int64_t>(image.shape(2));
+        expect(width > 0 && width % 8 == 0 && height > 0 && height <= kMaxSide && width <= kMaxSide &&
+                   row_stride >= width / 8,
+               "a row is whole bytes and fits its stride");
+        expect(count > 0 && count <= kMaxChargeFrames &&
+                   static_cast<int64_t>(frames.shape(1)) == row_stride * height,
+               "frames are uint8 [n, row_stride * height], at most 64");
+        expect(cell > 0 && cell % 8 == 0 && static_cast<int64_t>(grids.shape(0)) == count && grids.shape(3) == 2 &&
+                   grids.shape(1) > 1 && grids.shape(2) > 1 &&
+                   (static_cast<int64_t>(grids.shape(2)) - 1) * cell >= width &&
+                   (static_cast<int64_t>(grids.shape(1)) - 1) * cell >= height,
+               "grids are float32 [n, rows, columns, 2] and cover the sensor");
+        expect((colours == 1 || colours == 3) && image_width > 1 && image_height > 1 && image_width <= kMaxSide &&
+                   image_height <= kMaxSide && pixel >= 1,
+               "the image is float32 [h, w, 1 or 3], at least 2x2");
+        expect(slope.shape(0) == image.shape(0) && slope.shape(1) == image.shape(1) &&
+                   slope.shape(2) == image.shape(2),
+               "the slope has the shape of the image");
+        expect(tile.shape(0) == 4 && *std::max_element(tile.data(), tile.data() + 4) < 3, "a tile is four of 0, 1, 2");
+        auto fits = [&](const auto& map) {
+            return static_cast<int64_t>(map.shape(0)) == height && static_cast<int64_t>(map.shape(1)) == width;
+        };
+        expect(fits(gain) && (!dark || fits(*dark)), "gain and dark have the sensor's size");
+        expect(floor > 0 && jitter > 0, "floor and jitter are positive");
+        ChargeJob job{};
+        job.frames = count, job.width = width, job.height = height;
+        job.row_stride = row_stride, job.frame_stride = row_stride * height;
+        job.flipped = flipped, job.msb = msb;
+        std::copy(tile.data(), tile.data() + 4, job.tile);
+        job.bytes = frames.data(), job.grids = grids.data();
+        job.rows = static_cast<int64_t>(grids.shape(1)), job.columns = static_cast<int64_t>(grids.shape(2));
+        job.cell = cell, job.image = image.data(), job.image_width = image_width, job.image_height = image_height;
+        job.colours = static_cast<int32_t>(colours), job.pixel = pixel;
+        job.gain = gain.data(), job.dark = dark ? dark->data() : nullptr;
+        job.floor = floor, job.jitter = jitter;
+        nb::gil_scoped_release release;
+        const ChargeSums sums = all(job, slope.data());
+        nb::gil_scoped_acquire acquire;
+        return nb::make_tuple(sums.loss, sums.pixels, sums.chi2, sums.intervals, sums.expected, sums.counted);
+    }
+
+  private:
+    ChargeSums all(const ChargeJob& job, float* slope) {
+        const Kernels& kernels = choose_kernels();
+        const int64_t stride = job.image_width * job.colours;
+        scratch_.resize(static_cast<size_t>(pool_.threads()));
+        pool_.run(kBands, [&](int number, int thread) {
+            Band& band = bands_[number];
+            band.first = job.height * number / kBands;
+            band.last = job.height * (number + 1) / kBands;
+            band.sums = {};
+            const auto [low, high] = reach(job, band.first, band.last);
+            band.slope.assign(static_cast<size_t>((high - low) * stride), 0.0f);
+            ChargeJob mine = job;
+            mine.slope = band.slope.data(), mine.slope_row = low;
+            std::vector<char>& scratch = scratch_[static_cast<size_t>(thread)];
+            scratch.resize(static_cast<size_t>(kernels.charge_scratch()) + 64);
+            const size_t skip = 64 - reinterpret_cast<uintptr_t>(scratch.data()) % 64;
+            std::vector<float> lines(static_cast<size_t>(job.frames * job.columns * 2));
+            kernels.charge(mine, band.first, band.last, lines.data(), scratch.data() + skip, band.sums);
+            band.first = low, band.last = high;  // now: the image rows that it added to
+        });
+        std::fill(slope, slope + job.image_height * stride, 0.0f);
+        ChargeSums sums{};
+        for (const Band& band : bands_) {
+            float* out = slope + band.first * stride;
+            for (size_t i = 0; i < band.slope.size(); ++i) out[i] += band.slope[i];
+            sums.loss += band.sums.loss, sums.pixels += band.sums.pixels;
+            sums.chi2 += band.sums.chi2, sums.intervals += band.sums.intervals;
+            sums.expected += band.sums.expected, sums.counted += band.sums.counted;
+        }
+        return sums;
+    }
+
+    // The image rows that sensor rows [first, last) can come to lie in.
+    static std::pair<int64_t, int64_t> reach(const ChargeJob& job, int64_t first, int64_t last) {
+        const int64_t upper = std::min(first / job.cell, job.rows - 2);
+        const int64_t lower = std::min((last + job.cell - 1) / job.cell + 1, job.rows - 1);
+        float least = 0, most = 0;
+        for (int64_t f = 0; f < job.frames; ++f)
+            for (int64_t k = upper * job.columns; k < (lower + 1) * job.columns; ++k) {
+                const float moved = job.grids[(f * job.rows * job.columns + k) * 2 + 1];
+                least = std::min(least, moved), most = std::max(most, moved);
+            }
+        const float low = std::floor((static_cast<float>(first) + least) / job.pixel) - 2;
+        const float high = std::ceil((static_cast<float>(last) + most) / job.pixel) + 3;
+        const float height = static_cast<float>(job.image_height);
+        return {static_cast<int64_t>(std::clamp(low, 0.0f, height - 2)),
+                static_cast<int64_t>(std::clamp(high, 2.0f, height))};
+    }
+
+    Pool pool_;
+    Band bands_[kBands];
+    std::vector<std::vector<char>> scratch_;
+};
+
+}  // namespace
+
+void bind_charge(nb::module_& m) {
+    nb::class_<ChargeLoss>(m, "ChargeLoss")
+        .def(nb::init<int>(), nb::arg("threads"))
+        .def("run", &ChargeLoss::run, nb::kw_only(), nb::arg("frames"), nb::arg("width"), nb::arg("height"),
+             nb::arg("row_stride"), nb::arg("flipped"), nb::arg("msb"), nb::arg("tile"), nb::arg("grids"),
+             nb::arg("cell"), nb::arg("image"), nb::arg("pixel"), nb::arg("gain"), nb::arg("dark").none(),
+             nb::arg("floor"), nb::arg("jitter"), nb::arg("slope"));
+}
+
+}  // namespace raster

@@ -1,0 +1,192 @@
+// What frames of spikes say of an image that is carried along its motion. A pixel gathers light until the charge of one
+// spike is full: between two of its spikes, what it saw of the image as that moved past adds up to exactly one. Plain
+// loops over kPixels pixels of a row, which the compiler vectorises for each instruction set.
+
+constexpr int kPixels = 64;
+
+struct ChargeWork {
+    float light[kMaxChargeFrames][kPixels];  // expected charge of a frame
+    float right[kMaxChargeFrames][kPixels], down[kMaxChargeFrames][kPixels];  // between the four image pixels
+    int32_t at[kMaxChargeFrames][kPixels];                                    // the upper left one of them
+    float inside[kMaxChargeFrames][kPixels], spike[kMaxChargeFrames][kPixels];  // 0 or 1
+    float slope[kMaxChargeFrames][kPixels];
+};
+
+struct ChargeRow {
+    const float* gain;
+    const float* dark;     // may be null
+    const uint8_t* bytes;  // of the first frame
+    const float* lines;    // the displacements of the grids' columns on this row, [frames][columns][2]
+    int64_t y;
+};
+
+// Light and spikes of `count` pixels from column x0 on, in all frames.
+static void see(const ChargeJob& job, const ChargeRow& row, int64_t x0, int count, ChargeWork& work) {
+    const float step = 1.0f / (float)job.cell, shrink = 1.0f / job.pixel;
+    const float right_edge = (float)job.image_width - 1.001f, lower_edge = (float)job.image_height - 1.001f;
+    const int32_t colours = job.colours, stride = colours * (int32_t)job.image_width;
+    float gain[kPixels], dark[kPixels];
+    int32_t channel[kPixels];
+    for (int i = 0; i < kPixels; ++i) {
+        const bool there = i < count;
+        gain[i] = there ? row.gain[x0 + i] : 0;
+        dark[i] = there && row.dark ? row.dark[x0 + i] : 0;
+        channel[i] = colours > 1 ? job.tile[(row.y & 1) * 2 + ((x0 + i) & 1)] : 0;
+    }
+    for (int64_t f = 0; f < job.frames; ++f) {
+        const uint8_t* bytes = row.bytes + f * job.frame_stride + x0 / 8;
+        float* spike = work.spike[f];
+        for (int i = 0; i < kPixels; ++i) spike[i] = 0;
+        for (int i = 0; i < count; ++i)
+            spike[i] = (float)((bytes[i >> 3] >> (job.msb ? 7 - (i & 7) : (i & 7))) & 1);
+        const float* line = row.lines + f * job.columns * 2;
+        float dx[kPixels], dy[kPixels];
+        for (int from = 0; from < kPixels; from += 8) {
+            const int64_t column = (x0 + from) / job.cell;
+            const float* a = line + 2 * (column < job.columns - 2 ? column : job.columns - 2);
+            const float begin = (float)((x0 + from) % job.cell) + 0.5f;
+            const float by_x = (a[2] - a[0]) * step, by_y = (a[3] - a[1]) * step;
+            for (int i = 0; i < 8; ++i) {
+                dx[from + i] = a[0] + (begin + (float)i) * by_x;
+                dy[from + i] = a[1] + (begin + (float)i) * by_y;
+            }
+        }
+        float *light = work.light[f], *right = work.right[f], *down = work.down[f], *inside = work.inside[f];
+        int32_t* at = work.at[f];
+        for (int i = 0; i < kPixels; ++i) {
+            float x = ((float)(x0 + i) + 0.5f + dx[i]) * shrink - 0.5f;
+            float y = ((float)row.y + 0.5f + dy[i]) * shrink - 0.5f;
+            inside[i] = (x >= 0) & (y >= 0) & (x < right_edge) & (y < lower_edge) ? 1.0f : 0.0f;
+            x = x > 0 ? x : 0;
+            x = x < right_edge ? x : right_edge;
+            y = y > 0 ? y : 0;
+            y = y < lower_edge ? y : lower_edge;
+            const int32_t column = (int32_t)x, line_number = (int32_t)y;
+            right[i] = x - (float)column;
+            down[i] = y - (float)line_number;
+            at[i] = line_number * stride + column * colours + channel[i];
+        }
+        for (int i = 0; i < kPixels; ++i) {
+            const float* p = job.image + at[i];
+            const float above = p[0] + right[i] * (p[colours] - p[0]);
+            const float below = p[stride] + right[i] * (p[stride + colours] - p[stride]);
+            light[i] = gain[i] * (above + down[i] * (below - above)) + dark[i];
+        }
+    }
+    for (int64_t f = 0; f < job.frames; ++f)
+        for (int i = 0; i < kPixels; ++i) {
+            work.spike[f][i] *= gain[i] > 0 ? work.inside[f][i] : 0;
+            work.inside[f][i] = gain[i] > 0 ? work.inside[f][i] : 0;
+        }
+}
+
+// Residuals of the intervals, and the slope of the loss by the light of each frame.
+static void judge(const ChargeJob& job, const ChargeRow& row, int64_t x0, ChargeWork& work, ChargeSums& sums) {
+    constexpr float kEdgeWeight = 6.0f;  // 1 / variance of the charge before the first and after the last spike
+    const float floor2 = job.floor * job.floor, jitter2 = job.jitter * job.jitter;
+    float charge[kPixels] = {}, spikes[kPixels] = {}, residual[kPixels] = {}, squares[kPixels] = {};
+    float first[kPixels] = {}, last[kPixels] = {}, charge_first[kPixels] = {}, charge_last[kPixels] = {};
+    float lengths[kPixels] = {}, seen[kPixels] = {};
+    for (int64_t f = 0; f < job.frames; ++f) {
+        const float t = (float)f;
+        for (int i = 0; i < kPixels; ++i) {
+            const float in = work.inside[f][i], hit = work.spike[f][i];
+            charge[i] += in * work.light[f][i];
+            seen[i] += in;
+            const float now = charge[i] - spikes[i];
+            const bool begins = (hit > 0) & (spikes[i] == 0);
+            const float length = begins ? 0 : t - last[i];
+            const float wrong = begins ? 0 : now - residual[i];
+            first[i] = begins ? t : first[i];
+            charge_first[i] = begins ? charge[i] : charge_first[i];
+            last[i] = hit > 0 ? t : last[i];
+            charge_last[i] = hit > 0 ? charge[i] : charge_last[i];
+            residual[i] = hit > 0 ? now : residual[i];
+            lengths[i] += hit * length * length;
+            squares[i] += hit * wrong * wrong;
+            work.slope[f][i] = wrong;
+            spikes[i] += hit;
+        }
+    }
+    float inner[kPixels], outer[kPixels];  // what multiplies a residual; the slope outside of all intervals
+    for (int i = 0; i < kPixels; ++i) {
+        const bool some = spikes[i] > 0, more = spikes[i] > 1;
+        const float span = last[i] - first[i];
+        const float edge = some ? charge_first[i] + (charge[i] - charge_last[i]) - 1 : charge[i];
+        const float edge_length = some ? seen[i] - span : seen[i];
+        const float rate = more ? (spikes[i] - 1) / (span > 0 ? span : 1) : 1;
+        const float variance = rate * rate * (1.0f / 6) + jitter2;
+        const float precision = (more ? lengths[i] / variance : 0) + kEdgeWeight * edge_length * edge_length;
+        // Who fires in every frame may have seen more light than that.
+        const bool saturated = more & (span < spikes[i]), above = charge[i] > spikes[i];
+        const bool enough = seen[i] >= kLeastChargeFrames;
+        const float scale = enough ? floor2 / (1 + floor2 * precision) : 0;
+        inner[i] = more & !(saturated & above) ? 2 * scale / variance : 0;
+        outer[i] = saturated & above ? 0 : 2 * kEdgeWeight * scale * edge;
+        sums.loss += scale * ((more ? squares[i] / variance : 0) + kEdgeWeight * edge * edge);
+        sums.pixels += enough;
+        sums.chi2 += enough & more ? squares[i] / variance : 0;
+        sums.intervals += enough & more ? spikes[i] - 1 : 0;
+        // Counts are good to half a spike, the map to some percent.
+        const float off = charge[i] - spikes[i] > 0 ? charge[i] - spikes[i] : spikes[i] - charge[i];
+        const bool agrees = enough & (off < 1.2f + 0.2f * (charge[i] + spikes[i]));
+        sums.expected += agrees ? charge[i] : 0;
+        sums.counted += agrees ? spikes[i] : 0;
+    }
+    float current[kPixels] = {};
+    for (int64_t f = job.frames - 1; f >= 0; --f) {
+        const float t = (float)f;
+        for (int i = 0; i < kPixels; ++i) {
+            current[i] = work.spike[f][i] > 0 ? work.slope[f][i] : current[i];
+            const bool between = (spikes[i] > 1) & (t > first[i]) & (t <= last[i]);
+            work.slope[f][i] = work.inside[f][i] * (between ? inner[i] * current[i] : outer[i]);
+        }
+    }
+    for (int i = 0; i < kPixels && x0 + i < job.width; ++i) charge[i] = row.gain[x0 + i];
+    for (int64_t f = 0; f < job.frames; ++f)
+        for (int i = 0; i < kPixels; ++i) work.slope[f][i] *= charge[i];
+}
+
+// The transpose of see(): each slope goes to the four image pixels that its light came from.
+static void spread(const ChargeJob& job, int count, const ChargeWork& work) {
+    const int32_t colours = job.colours, stride = colours * (int32_t)job.image_width;
+    float* out = job.slope - job.slope_row * (int64_t)stride;
+    for (int64_t f = 0; f < job.frames; ++f) {
+        for (int i = 0; i < count; ++i) {
+            float* p = out + work.at[f][i];
+            const float lower = work.slope[f][i] * work.down[f][i], upper = work.slope[f][i] - lower;
+            const float upper_right = upper * work.right[f][i], lower_right = lower * work.right[f][i];
+            p[0] += upper - upper_right;
+            p[colours] += upper_right;
+            p[stride] += lower - lower_right;
+            p[stride + colours] += lower_right;
+        }
+    }
+}
+
+static void charge(const ChargeJob& job, int64_t first_row, int64_t last_row, float* lines, void* scratch,
+                   ChargeSums& sums) {
+    ChargeWork& work = *(ChargeWork*)scratch;
+    for (int64_t y = first_row; y < last_row; ++y) {
+        const float place = ((float)y + 0.5f) / (float)job.cell;
+        const int64_t upper = (int64_t)place < job.rows - 2 ? (int64_t)place : job.rows - 2;
+        const float share = place - (float)upper;
+        for (int64_t f = 0; f < job.frames; ++f) {
+            const float* a = job.grids + (f * job.rows + upper) * job.columns * 2;
+            const float* b = a + job.columns * 2;
+            float* line = lines + f * job.columns * 2;
+            for (int64_t k = 0; k < 2 * job.columns; ++k) line[k] = a[k] + share * (b[k] - a[k]);
+        }
+        const int64_t stored = job.flipped ? job.height - 1 - y : y;
+        const ChargeRow row = {job.gain + y * job.width, job.dark ? job.dark + y * job.width : nullptr,
+                               job.bytes + stored * job.row_stride, lines, y};
+        for (int64_t x = 0; x < job.width; x += kPixels) {
+            const int count = (int)(job.width - x < kPixels ? job.width - x : kPixels);
+            see(job, row, x, count, work);
+            judge(job, row, x, work, sums);
+            spread(job, count, work);
+        }
+    }
+}
+
+static int64_t charge_scratch() { return (int64_t)sizeof(ChargeWork); }

@@ -1,0 +1,107 @@
+"""What frames of spikes say of an image that moved past the sensor: the loss of the charge between spikes.
+
+A pixel fires whenever it has gathered the charge of one spike. Between two of its spikes, then, the light that it saw
+of the image, as that moved past, adds up to one, whatever the motion and however long it took. An image rendered at
+one moment, carried along its motion to every frame, is thereby compared with all intervals of many frames: for the
+price of one render and without the smear of a long window.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.errors import ConfigurationError
+from spiked.native._raster import ChargeLoss as _ChargeLoss
+from spiked.render.cpu import MAX_THREADS, usable_cores
+from spiked.render.splats import Floats
+from spiked.sensor import BitOrder, Sensor
+
+CELL_PX = 8
+"""Spacing of the nodes at which displacements are given."""
+MOST_FRAMES = 64
+
+
+@dataclass(frozen=True)
+class Charge:
+    """What the frames say of an image."""
+
+    loss: float
+    """Mean over the pixels of weight * squared error, (spikes a frame)^2."""
+    slope: Floats
+    """Its derivative by the image, of the image's shape."""
+    chi2: float
+    """Mean squared residual of an interval in units of its variance; 0 without any interval."""
+    brightness: float
+    """Spikes counted over spikes expected, by the pixels that roughly agree; 1 without any."""
+
+
+class ChargeLoss:
+    """Compares images with frames. One object serves one thread at a time; the number of threads changes no bit."""
+
+    def __init__(self, sensor: Sensor, threads: int | None = None) -> None:
+        """Threads default to the cores this process may use."""
+        threads = usable_cores() if threads is None else threads
+        if not 1 <= threads <= MAX_THREADS:
+            raise ConfigurationError(f"cannot work with {threads} threads: use 1 to {MAX_THREADS}")
+        self.sensor = sensor
+        self._native = _ChargeLoss(threads)
+        mosaic = None if sensor.mosaic is None else sensor.mosaic.channels(2, 2).ravel()
+        self._tile = np.zeros(4, np.uint8) if mosaic is None else np.ascontiguousarray(mosaic)
+
+    def __call__(
+        self,
+        image: Floats,
+        frames: NDArray[np.uint8],
+        displacements: Floats,
+        gain: Floats,
+        dark: Floats | None = None,
+        *,
+        pixel: int = 1,
+        floor: float,
+        jitter: float = 0.02,
+    ) -> Charge:
+        """Loss, slope and brightness of an image in spikes a frame.
+
+        image [h, w], or [h, w, 3] for a mosaic, shows the sensor's field at one moment, its pixels `pixel` times as
+        large as the sensor's. frames [n, frame_bytes] as stored, at most `MOST_FRAMES`; displacements float32
+        [n, rows, columns, 2] lead, in px, from nodes `CELL_PX` apart (the first at the sensor's corner) in each frame
+        to where the same things are in the image. gain [H, W] multiplies the light (0: a pixel that does not count),
+        dark [H, W] is added to it, in spikes a frame.
+
+        The variance of an interval's charge is rate^2 / 6 (spikes are only known to the frame) plus jitter^2; that
+        before the first and after the last spike is 1 / 6. A pixel's residuals are weighted so that an error e of its
+        rate costs e^2 floor^2 / (deviation^2 + floor^2). Raises ConfigurationError for shapes that do not fit.
+        """
+        sensor = self.sensor
+        planes = np.ascontiguousarray(image, np.float32)
+        planes = planes[..., None] if planes.ndim == 2 else planes
+        slope = np.empty_like(planes)
+        try:
+            loss, pixels, chi2, intervals, expected, counted = self._native.run(
+                frames=np.ascontiguousarray(frames),
+                width=sensor.width,
+                height=sensor.height,
+                row_stride=sensor.row_stride,
+                flipped=sensor.flipped,
+                msb=sensor.bit_order is BitOrder.MSB,
+                tile=self._tile,
+                grids=np.ascontiguousarray(displacements, np.float32),
+                cell=CELL_PX,
+                image=planes,
+                pixel=pixel,
+                gain=np.ascontiguousarray(gain, np.float32),
+                dark=None if dark is None else np.ascontiguousarray(dark, np.float32),
+                floor=floor,
+                jitter=jitter,
+                slope=slope,
+            )
+        except ValueError as error:
+            raise ConfigurationError(f"images, frames and displacements do not fit: {error}") from error
+        slope /= np.float32(max(pixels, 1.0))
+        return Charge(
+            loss / max(pixels, 1.0),
+            slope.reshape(image.shape),
+            chi2 / intervals if intervals > 0 else 0.0,
+            counted / expected if expected > 0 else 1.0,
+        )

@@ -415,12 +415,7 @@ def device_of(source: str) -> str:
 
 def _check(plan: Plan) -> None:
     """Refuse at once what would fail a moment later in a worker."""
-    sensor = open_source(plan.source).sensor
-    if plan.reconstruct and sensor.intrinsics is None and plan.intrinsics is None:
-        raise ConfigurationError(
-            f"the focal length of {plan.source} is not known: give intrinsics (fx, fy, cx, cy) with the capture, "
-            "as `spiked serve --intrinsics`, in a recording's sidecar, or as a camera's field of view (usb0?fov=40)"
-        )
+    open_source(plan.source)
 
 
 def unhurried(source: str) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from spiked.scene import Scene
+from spiked.sensor import Intrinsics
 from spiked.trajectory import Trajectory
 
 _NEWEST = 3
@@ -29,6 +30,8 @@ class Published(BaseModel):
     poses: int
     scene_bytes: int
     psnr_db: float | None = None
+    intrinsics: tuple[float, float, float, float] | None = None
+    """fx, fy, cx, cy (px) that it was made with: given or estimated."""
 
 
 class _Index(BaseModel):
@@ -63,7 +66,14 @@ class Publisher:
         """Numbers of the versions that can be read."""
         return [published.version for published in self._versions]
 
-    def publish(self, scene: Scene, trajectory: Trajectory, white: float, psnr_db: float | None = None) -> Published:
+    def publish(
+        self,
+        scene: Scene,
+        trajectory: Trajectory,
+        white: float,
+        psnr_db: float | None = None,
+        intrinsics: Intrinsics | None = None,
+    ) -> Published:
         """Make the next version the newest, and let go of old ones. Raises OSError when the disk does not take it."""
         version = self.version + 1
         content = scene.ply(white)
@@ -77,6 +87,7 @@ class Publisher:
             poses=len(trajectory),
             scene_bytes=len(content),
             psnr_db=psnr_db,
+            intrinsics=None if intrinsics is None else (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy),
         )
         write_atomically(self._folder / published.scene, content)
         write_atomically(self._folder / published.trajectory, trajectory.tum().encode())

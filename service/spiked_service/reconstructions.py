@@ -145,7 +145,7 @@ class Reconstructions:
         """
         capture = self._catalogue.captures.get(capture_id)
         chosen = options or ReconstructionOptions()
-        _check(capture, chosen)
+        _check(capture)
         row = ReconstructionRow(
             new_id(), capture_id, False, JobState.QUEUED, datetime.now(UTC), options=chosen, priority=priority
         )
@@ -224,7 +224,7 @@ class Reconstructions:
             if not row.state.over:
                 raise BusyError(f"reconstruction {row.id} is {row.state}: cancel it, or wait for its end")
             chosen = options or row.options
-            _check(self._catalogue.captures.get(row.capture_id), chosen)
+            _check(self._catalogue.captures.get(row.capture_id))
             self._backoffs.pop(row.id, None)
             begun = ReconstructionRow(
                 row.id,
@@ -471,15 +471,11 @@ class Reconstructions:
         return row
 
 
-def _check(capture: CaptureRow, options: ReconstructionOptions) -> None:
+def _check(capture: CaptureRow) -> None:
     if capture.deleted_at is not None:
         raise ConfigurationError(f"capture {capture.id} is deleted: restore it first")
     if not capture.plan.record or (capture.state.over and (capture.recording is None or not capture.recording.frames)):
         raise ConfigurationError(f"capture {capture.id} has no recording to reconstruct from")
-    if capture.sensor is not None and _intrinsics(options, capture) is None:
-        raise ConfigurationError(
-            f"the focal length of capture {capture.id} is not known: give intrinsics (fx, fy, cx, cy) in the options"
-        )
 
 
 def _intrinsics(options: ReconstructionOptions, capture: CaptureRow) -> Intrinsics | None:

@@ -509,7 +509,8 @@ class Reconstructor:
         last = next((v for v in reversed(o.views) if v.rotation is not None), None)
         pose = (last.inliers, last.chi2, last.sigma_px) if last is not None else (None, None, None)
         done = self._progress
-        return Status(o.state, o.reason, self._stage, self._frames, len(m.scene), m.loss, self._version, done, *pose)
+        reason = o.reason if self.focal is None or o.spline is None else f"{o.reason}; {self.focal}"
+        return Status(o.state, reason, self._stage, self._frames, len(m.scene), m.loss, self._version, done, *pose)
 
     def tracked(self, since: int = 0) -> list[Tracked]:
         """The views tracked so far, in order, without the first `since`."""

@@ -89,10 +89,11 @@ def test_bad_input_is_one_line_and_exit_code_2_and_writes_nothing(tmp_path: Path
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_reconstruct_without_optics_says_which_option_is_missing(tmp_path: Path) -> None:
+def test_known_poses_without_optics_say_which_option_is_missing(room: Path, tmp_path: Path) -> None:
     path = tmp_path / "plain.dat"
     path.write_bytes(np.random.default_rng(0).bytes(12_500 * 16))
-    done = run("reconstruct", path, "-o", tmp_path / "out", "--width", "400", "--height", "250")
+    size = ("--width", "400", "--height", "250")
+    done = run("reconstruct", path, "-o", tmp_path / "out", *size, "--poses", room / "groundtruth.tum")
     assert done.returncode == 2
     assert "--fov" in done.stderr.splitlines()[-1]
     assert not (tmp_path / "out").exists()

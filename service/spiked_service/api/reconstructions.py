@@ -1,5 +1,6 @@
 """Reconstructions: ask for one, follow it, end it, and take away what it has published."""
 
+from dataclasses import replace
 from http import HTTPStatus
 from typing import Annotated, Any
 
@@ -7,6 +8,7 @@ from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import PlainTextResponse
 from fastapi.routing import APIRoute
 
+from spiked.sensor import Intrinsics
 from spiked_service.api import files
 from spiked_service.api.idempotency import IdempotencyKey
 from spiked_service.api.problems import GoneError, NotReadyError, problems
@@ -113,6 +115,8 @@ class Results:
             named = "" if version is None else f" {version}"
             raise NotReadyError(f"reconstruction {row.id} has no version{named} yet; it is at stage {row.stage}")
         sensor = self._captures.get(row.capture_id).row.sensor
+        if sensor is not None and published.intrinsics is not None:
+            sensor = replace(sensor, intrinsics=Intrinsics(*published.intrinsics))
         return Result(folder, published, sensor, self._reconstructions.timeline(row.id))
 
 

@@ -299,7 +299,8 @@ class _Herald:
             return
         try:
             scene, white = self._reconstructor.scene(), self._reconstructor.white
-            published = self._publisher.publish(scene, trajectory, white, _psnr_db(status.loss))
+            optics = self._reconstructor.camera.intrinsics
+            published = self._publisher.publish(scene, trajectory, white, _psnr_db(status.loss), optics)
         except OSError as error:
             raise SceneError(f"the scene cannot be published: {error.strerror}; make room on the disk") from error
         self._poses = len(trajectory)

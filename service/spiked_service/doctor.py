@@ -19,7 +19,7 @@ from spiked_driver.usb_cameras import UDEV_FILE, UsbCamera, find_cameras
 
 from spiked.errors import SourceError
 from spiked.ring.segment import FOLDER as RING_FOLDER
-from spiked.ring.writer import DEFAULT_BYTES
+from spiked.ring.writer import DEFAULT_BYTES, MOST_BACKLOG_BYTES
 
 UDEV_FOLDERS = tuple(Path(folder) for folder in ("/etc", "/run", "/usr/lib", "/lib", "/usr/local/lib"))
 CPU = Path("/sys/devices/system/cpu")
@@ -173,7 +173,8 @@ def _memory() -> Finding:
 def _shared_memory() -> Finding:
     name = "shared memory"
     free = shutil.disk_usage(RING_FOLDER).free
-    found = f"{free / 2**20:.0f} MiB free in {RING_FOLDER}, a capture takes {DEFAULT_BYTES / 2**20:.0f} MiB"
+    takes = f"{DEFAULT_BYTES >> 20} MiB, and up to {MOST_BACKLOG_BYTES >> 20} to reconstruct meanwhile"
+    found = f"{free >> 20} MiB free in {RING_FOLDER}, a capture takes {takes}"
     if free > 1.1 * DEFAULT_BYTES:
         return Finding(name, Status.OK, found)
     todo = f"sudo mount -o remount,size=1G {RING_FOLDER} (a container has an option for it, as --shm-size)"

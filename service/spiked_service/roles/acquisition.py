@@ -1,6 +1,7 @@
 """The acquisition worker: a source into a ring, and nothing else."""
 
 import math
+import shutil
 
 from spiked_driver.acquisition import acquire
 from spiked_driver.realtime import take_priority
@@ -8,7 +9,8 @@ from spiked_driver.source import Source
 from spiked_driver.spec import is_camera, open_source
 
 from spiked.ring import RingWriter
-from spiked.ring.writer import DEFAULT_BYTES
+from spiked.ring.segment import FOLDER
+from spiked.ring.writer import DEFAULT_BYTES, MOST_BACKLOG_BYTES
 from spiked.sensor import Sensor
 from spiked_service.messages import AcquisitionOrder, RingOpened, Warned
 from spiked_service.worker import Link
@@ -23,8 +25,6 @@ _MOURNING_S = 15.0
 """A source that waits holds its frames so long for the successor of a consumer that was killed."""
 _HISTORY_SHARE = 0.4
 """Part of the ring that a lossless reader may begin in the past; it may lag half of it."""
-
-_MOST_BACKLOG_BYTES = 512 << 20
 
 
 def run_acquisition(order: AcquisitionOrder, link: Link) -> None:
@@ -67,5 +67,7 @@ def _slots(sensor: Sensor, history_s: float, backlog_s: float, waits: bool) -> i
     slots_a_second = sensor.frame_rate_hz / _BLOCK_FRAMES
     wanted = math.ceil(history_s * slots_a_second / _HISTORY_SHARE)
     if not waits:
-        wanted = max(wanted, min(math.ceil(backlog_s * slots_a_second), _MOST_BACKLOG_BYTES // slot_bytes))
+        # Catching up from afar is a comfort: it leaves room for other captures.
+        room = min(MOST_BACKLOG_BYTES, shutil.disk_usage(FOLDER).free // 2)
+        wanted = max(wanted, min(math.ceil(backlog_s * slots_a_second), room // slot_bytes))
     return wanted if wanted > DEFAULT_BYTES // slot_bytes else None

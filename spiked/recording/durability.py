@@ -4,11 +4,15 @@ import ctypes
 import errno
 import os
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
 _KEEP_SIZE = 1  # FALLOC_FL_KEEP_SIZE of <linux/falloc.h>: a killed writer leaves no zeros behind its last frame
+_BEGIN_WRITE = 2  # SYNC_FILE_RANGE_WRITE of <linux/fs.h>: does not wait, and takes no error from who asks later
+_EARLY_BYTES = 16 << 20
+_PERIOD_S = 1.0
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
@@ -78,11 +82,19 @@ def _fitting(file: int, durability: Durability) -> tuple[int, int]:
 
 
 class Syncer:
-    """Forces files onto the disk every second, on a thread of its own."""
+    """Forces files onto the disk every second, on a thread of its own.
 
-    def __init__(self, sync: Callable[[], None]) -> None:
+    In between it has the kernel begin to write what has come: the disk works while frames are copied, and a sync, the
+    last one too, has little left to wait for.
+    """
+
+    def __init__(self, file: int, size: int, sync: Callable[[], None]) -> None:
+        """`file` is the descriptor of the file that grows, now of `size` bytes."""
+        self._file = file
+        self._written = self._begun = size
         self._sync = sync
         self._over = threading.Event()
+        self._wake = threading.Event()
         self._error: OSError | None = None
         self._thread = threading.Thread(target=self._run, name="sync", daemon=True)
         self._thread.start()
@@ -92,15 +104,38 @@ class Syncer:
         if self._error is not None:
             raise self._error
 
+    def written(self, size: int) -> None:
+        """Tell how long the file is now."""
+        self._written = size
+        if size - self._begun >= _EARLY_BYTES:
+            self._wake.set()
+
     def close(self) -> None:
         """End the thread, after the sync that may be going on."""
         self._over.set()
+        self._wake.set()
         self._thread.join()
 
     def _run(self) -> None:
-        while not self._over.wait(1.0):
+        due_s = time.monotonic() + _PERIOD_S
+        while True:
+            self._wake.wait(max(0.0, due_s - time.monotonic()))
+            self._wake.clear()
+            if self._over.is_set():
+                return
+            self._begin()
+            if time.monotonic() < due_s:
+                continue
             try:
                 self._sync()
             except OSError as error:
                 self._error = error
                 return
+            due_s = time.monotonic() + _PERIOD_S
+
+    def _begin(self) -> None:
+        """Only begins to write, so errors are left for the sync, which is told of them as well."""
+        size = self._written - self._begun
+        if size > 0:
+            _libc.sync_file_range(self._file, ctypes.c_int64(self._begun), ctypes.c_int64(size), _BEGIN_WRITE)
+            self._begun += size

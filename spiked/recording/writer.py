@@ -109,7 +109,7 @@ class RecordingWriter:
             index = IndexWriter(beside, self.sensor.frame_bytes, resume=resume)
         files = _Files(frames, index, Allocator(frames.fileno(), self._durability, self.bytes))
         if self._durability.sync is Sync.SECOND:
-            files.syncer = Syncer(lambda: self._sync(files))
+            files.syncer = Syncer(frames.fileno(), self.bytes, lambda: self._sync(files))
         return files
 
     @property
@@ -161,6 +161,8 @@ class RecordingWriter:
             ) from error
         self.frames += len(frames)
         self._next += len(frames)
+        if files.syncer is not None:
+            files.syncer.written(self.bytes)
 
     def _stored(self, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if self.sensor.bit_order is BitOrder.MSB:

@@ -1,5 +1,6 @@
 """What a recording is worth after kills, full disks and bad bytes."""
 
+import ctypes
 import os
 import resource
 import shutil
@@ -22,6 +23,7 @@ from spiked.recording import (
     Gap,
     RecordingWriter,
     Sync,
+    durability,
     index_path,
     open_recording,
     read_index,
@@ -259,3 +261,26 @@ def test_a_read_only_file_system_is_told(small_disk: Path) -> None:
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
     with pytest.raises(RecordingError, match="Read-only"):
         RecordingWriter(small_disk / "b.dat", SENSOR)
+
+
+def test_the_disk_begins_before_a_sync_is_due(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[tuple[int, int]] = []
+    real = durability._libc.sync_file_range
+
+    def watched(file: int, offset: ctypes.c_int64, size: ctypes.c_int64, flags: int) -> int:
+        begun.append((offset.value, size.value))
+        return int(real(file, offset, size, flags))
+
+    monkeypatch.setattr(durability._libc, "sync_file_range", watched)
+    monkeypatch.setattr(durability, "_EARLY_BYTES", 4096)
+    monkeypatch.setattr(durability, "_PERIOD_S", 600.0)
+    with RecordingWriter(tmp_path / "a.dat", SENSOR, durability=LIVE) as writer:
+        for _ in range(3):
+            writer.append(frames(writer.next_frame, 40))
+            deadline_s = time.monotonic() + 20
+            while sum(size for _, size in begun) < writer.bytes:
+                assert time.monotonic() < deadline_s, begun
+                time.sleep(0.001)
+    ends = [0, *(offset + size for offset, size in begun)]
+    assert [offset for offset, _ in begun] == ends[:-1]  # all of it, in order, nothing twice
+    assert ends[-1] == 120 * SENSOR.frame_bytes

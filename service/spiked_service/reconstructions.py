@@ -436,7 +436,7 @@ class Reconstructions:
         if trouble is None:
             state = JobState.CANCELLED if job.cancelled else JobState.COMPLETE
             # A tracker that never began says why in its reason; of one that tracked to the end there is nothing to say.
-            return replace(row, state=state, stage=Stage.DONE)
+            return replace(row, state=state, stage=Stage.DONE, reason="" if row.poses else row.reason)
         if job.cancelled:
             return replace(row, state=JobState.CANCELLED)
         if job.refusal is not None:

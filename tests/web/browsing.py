@@ -2,6 +2,7 @@
 
 import base64
 import io
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,8 @@ PATIENCE_S = 60.0
 DESKTOP = {"width": 1280, "height": 800}
 PHONE = {"width": 390, "height": 844}
 AXE = Path(__file__).resolve().parents[2] / "web" / "node_modules" / "axe-core" / "axe.min.js"
+STEPS = 600 if "SCREENSHOTS" in os.environ else 150
+"""Of refinement: a scene to be looked at, or one to be tested with."""
 MOST_BYTES = 300_000
 """Of a screenshot."""
 

@@ -16,7 +16,7 @@ from spiked.simulate import SimulatedCamera
 from spiked.simulate.record import simulate
 
 sys.path.append(str(Path(__file__).parent))  # pytest's importlib mode adds no folder by itself
-from browsing import DESKTOP, PATIENCE_S, Studied, finished
+from browsing import DESKTOP, PATIENCE_S, STEPS, Studied, finished
 
 FLAGS = [
     "--no-sandbox",
@@ -32,8 +32,6 @@ FLAGS = [
 ]
 """WebGL without a GPU; root needs no sandbox; nothing is asked of the network."""
 FRAMES = 1024
-STEPS = 600 if "SCREENSHOTS" in os.environ else 150
-"""Of refinement: a scene to be looked at, or one to be tested with."""
 
 
 @pytest.fixture(scope="session")

@@ -1,10 +1,11 @@
 """The Captures page: found, looked at, reconstructed once more, compared, deleted and brought back."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
-from browsing import Studied, address, until
+from browsing import STEPS, Studied, address, finished, until
 
 
 def test_a_capture_is_found_and_looked_at(studied: Studied, visit: Callable[..., Any]) -> None:
@@ -24,9 +25,10 @@ def test_a_capture_is_found_and_looked_at(studied: Studied, visit: Callable[...,
     row.get_by_role("link").click()
     page.get_by_text("Over time").wait_for()
     assert studied.capture_id in address(page)
-    for plot in ("χ²", "Loss", "PSNR estimate", "Spike rate", "Flicker"):
+    for plot in ("Pose σ", "χ²", "Loss", "PSNR estimate", "Spike rate", "Flicker"):
         page.locator(f"figure.plot:has(figcaption:has-text('{plot}')) canvas").wait_for()
     page.get_by_text("No frames are missing").wait_for()
+    assert f"steps\n{STEPS}" in page.locator(".panel:has(h2:text-is('Options used'))").inner_text()
     page.locator("summary").filter(has_text="Log").click()
     until(lambda: len(page.locator(".log pre").inner_text()) > 10, "a log")
 
@@ -40,6 +42,21 @@ def test_everything_can_be_downloaded(studied: Studied, visit: Callable[..., Any
         answer = studied.http.get(target)
         assert answer.status_code == 200, target
         assert answer.content, target
+
+
+@pytest.mark.slow
+def test_missing_frames_are_listed_with_their_cause(studied: Studied, visit: Callable[..., Any], room: Path) -> None:
+    plan = {"source": f"replay:{room}?gap=700:40:usb", "name": "a gap", "options": {"steps": 20}}
+    capture_id = studied.http.post("captures", json=plan).json()["id"]
+    until(lambda: studied.http.get(f"captures/{capture_id}").json()["verdict"], "it is recorded", 300)
+    page = visit(f"{studied.address}?page=captures&capture={capture_id}")
+    row = page.locator("table.gaps tbody tr")
+    row.wait_for()
+    assert row.inner_text().split("\t") == ["frame 700, 35.00 ms", "40", "usb"]
+    assert "40" in page.locator(".verdict.warning").inner_text()  # degraded, and why
+    studied.http.post(f"captures/{capture_id}:stop")  # what was missed is known; the refinement need not be waited for
+    finished(studied.http, capture_id)
+    studied.http.delete(f"captures/{capture_id}")
 
 
 @pytest.mark.slow
@@ -87,7 +104,7 @@ def test_deleted_and_brought_back(studied: Studied, visit: Callable[..., Any]) -
 
 def test_set_up_tells_where_each_setting_comes_from(studied: Studied, visit: Callable[..., Any]) -> None:
     page = visit(f"{studied.address}?page=setup")
-    row = page.get_by_role("row").filter(has=page.get_by_text("port", exact=True))
+    row = page.locator(".configuration tr:has(th > code:text-is('port'))")
     row.wait_for()
     assert "flag" in row.inner_text()
     page.get_by_role("button", name="Reload").click()

@@ -1,15 +1,18 @@
 """The Live page: a capture from its start to its verdict, and a daemon or a camera that goes away meanwhile."""
 
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from browsing import Studied, choose, until
+from browsing import Studied, choose, finished, until
 from virtual_camera.host import CameraSettings
 from virtual_camera.rig import VirtualCameras
 
+SIDE_PX = 320
 FIRST_PAINT_MS = 1000
 FIRST_PAINT = """() => new Promise((tell) =>
     new PerformanceObserver((list) => {
@@ -56,6 +59,11 @@ def test_a_capture_without_end_is_stopped(daemon: Callable[..., Any], visit: Cal
     page.get_by_role("button", name="Start").click()
     first = until(lambda: received(page), "frames come")
     until(lambda: received(page) > first, "more frames come, without a reload")
+    for consumer in ("recorder", "preview"):
+        row = page.locator("table.consumers tbody tr").filter(has_text=consumer)
+        assert row.get_by_role("meter", name=f"Ring fill of {consumer}").count() == 1
+        assert re.search(r"\d\s*m?s\b", row.inner_text()), "its lag"
+    until(lambda: re.search(r"GB free, .+ of recording", page.locator(".disk").inner_text()), "disk space left")
     page.get_by_role("button", name="Stop").click()
     page.locator("[data-grade]").wait_for()
 
@@ -68,6 +76,27 @@ def test_what_is_refused_is_said(daemon: Callable[..., Any], visit: Callable[...
     told = page.locator(".panel .trouble")
     told.wait_for()
     assert "missing.dat" in told.inner_text()
+
+
+def test_pixels_that_fire_whatever_they_see_are_marked(
+    daemon: Callable[..., Any], visit: Callable[..., Any], room: Path, tmp_path: Path
+) -> None:
+    x, row = 101, 60
+    frames = np.fromfile(room, np.uint8).reshape(-1, SIDE_PX * 200 // 8)
+    frames[:, row * SIDE_PX // 8 + x // 8] |= 1 << x % 8
+    frames.tofile(tmp_path / "hot.dat")
+    shutil.copy(room.with_suffix(".json"), tmp_path / "hot.json")
+    one = daemon("--device", "sim:", "--no-capture")
+    plan = {"source": f"replay:{tmp_path / 'hot.dat'}", "reconstruct": False}
+    finished(one.http, one.http.post("captures", json=plan).json()["id"])
+    page = visit(one.address)
+    rings = page.locator(".marks circle")
+    rings.first.wait_for()
+    places = [(circle.get_attribute("cx"), circle.get_attribute("cy")) for circle in rings.all()]
+    assert {(f"{x}.5", f"{row}.5"), (f"{x}.5", f"{199 - row}.5")} & set(places)  # as the file's rows are stored
+    assert page.get_by_role("img", name=f"{len(places)} hot pixels").count() == 1
+    page.get_by_role("checkbox", name="Hot pixels").uncheck()
+    rings.first.wait_for(state="detached")
 
 
 def test_kinds_of_pictures_and_gain(studied: Studied, visit: Callable[..., Any]) -> None:

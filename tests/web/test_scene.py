@@ -76,6 +76,31 @@ def test_the_canvas_shows_what_the_service_renders(studied: Studied, visit: Call
 
 
 @pytest.mark.slow
+def test_each_layer_is_drawn_and_the_frustum_moves(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = open_scene(visit, f"{studied.address}?page=scene&frame=200")
+    before = still(page)
+
+    def changed() -> bool:
+        return bool(np.abs(picture(page) - before).max() > 0.1)
+
+    page.get_by_role("checkbox", name="Splats").uncheck()
+    until(changed, "the splats are gone")
+    for layer in ("Path", "Frustum", "Grid", "Axes"):
+        before = still(page)
+        box = page.get_by_role("checkbox", name=layer)
+        box.uncheck()
+        until(changed, f"{layer} is gone")
+        box.check()
+        until(lambda: not changed(), f"{layer} is back")
+    choose(page, "Speed")
+    until(changed, "the path has other colours")
+    page.get_by_role("checkbox", name="Path").uncheck()
+    before = still(page)
+    page.get_by_label("Frame", exact=True).fill("900")
+    until(changed, "the frustum is elsewhere")
+
+
+@pytest.mark.slow
 def test_spz_previews_lie_where_the_whole_scene_lies(studied: Studied, visit: Callable[..., Any]) -> None:
     whole = open_scene(visit, f"{studied.address}?page=scene&ride=1&frame=320")
     choose(whole, "Rendered")

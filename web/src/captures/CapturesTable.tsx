@@ -165,8 +165,9 @@ function Row({
           {nameOf(capture)}
         </a>
         <span className="dim">
-          <span title={capture.source}>{sourceOf(capture)}</span>
-          {capture.keep && " · kept"}
+          {capture.name !== "" && <span title={capture.source}>{sourceOf(capture)}</span>}
+          {capture.name !== "" && capture.keep && " · "}
+          {capture.keep && "kept"}
         </span>
       </th>
       <td>{when(capture.started_at)}</td>

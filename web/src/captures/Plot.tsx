@@ -14,6 +14,7 @@ const SYNC = uPlot.sync("captures");
 /** uPlot's `Scale.Distr`: a constant enum, which has no values that isolated modules could import. */
 const LINEAR = 1;
 const LOGARITHMIC = 3;
+const LEAST_TICK_PX = 20;
 /** So many values make no line that could be seen. */
 const FEW = 24;
 const DASHES = [[], [6, 4]];
@@ -53,6 +54,7 @@ export function Plot({ title, unit, hint, log, data, names, gaps }: PlotProps): 
           {
             ...axis,
             size: 58,
+            space: LEAST_TICK_PX,
             // A logarithmic axis has a line for each power of ten, not for each of its nine parts.
             grid: log ? { ...axis.grid, filter: (_, ticks) => ticks.map((t) => (isPower(t) ? t : null)) } : axis.grid,
             values: (_, ticks) => ticks.map((t) => ((t as number | null) === null ? "" : short(t))),
@@ -70,7 +72,11 @@ export function Plot({ title, unit, hint, log, data, names, gaps }: PlotProps): 
             value: (_: uPlot, v: number | null) => (v === null ? "–" : `${short(v)} ${unit}`),
           })),
         ],
-        hooks: { drawClear: [(u) => shade(u, gaps)] },
+        hooks: {
+          drawClear: [(u) => shade(u, gaps)],
+          // The one value of one line is told only while something points at it.
+          setLegend: [(u) => u.root.classList.toggle("idle", names.length === 1 && (u.legend.idx ?? null) === null)],
+        },
       },
       data,
       element,

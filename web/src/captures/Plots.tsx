@@ -91,7 +91,7 @@ function plotsOf(
     ...plot(
       {
         title: "Flicker",
-        unit: "",
+        unit: "%",
         log: false,
         hint: "Swing of the spike rate around its mean over 10 ms, as a share of it",
       },

@@ -58,9 +58,9 @@ it("finds the swing of mains light and nothing in steady light", () => {
   const line = (rate: number[]): Timeline => ({ time_s: times, rate }) as unknown as Timeline;
   const swing = flicker(line(times.map((t) => 0.3 * (1 + 0.1 * Math.sin(2 * Math.PI * 100 * t)))));
   const middle = swing.slice(50, 450).map((x) => x ?? 0);
-  expect(Math.max(...middle)).toBeCloseTo(0.1, 1);
+  expect(Math.max(...middle)).toBeCloseTo(10, 0);
   const steady = flicker(line(times.map(() => 0.3)));
-  expect(Math.max(...steady.map((x) => Math.abs(x ?? 0)))).toBeLessThan(1e-9);
+  expect(Math.max(...steady.map((x) => Math.abs(x ?? 0)))).toBeLessThan(1e-7);
 });
 
 it("joins the bins of a histogram of few frames", () => {

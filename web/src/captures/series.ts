@@ -49,7 +49,7 @@ export function joined(times: readonly (readonly number[])[], values: readonly C
 }
 
 /**
- * Flicker: how much the spike rate swings around its own slow course, as a share of it. The slow course is the mean over
+ * Flicker: how much the spike rate swings around its own slow course, in percent of it. The slow course is the mean over
  * 10 ms, a whole period of light on mains of 50 and about one of 60 Hz.
  */
 export function flicker(timeline: Timeline): Column {
@@ -63,7 +63,7 @@ export function flicker(timeline: Timeline): Column {
     const around = rate.slice(first, end).filter((x) => x !== null);
     const own = rate[i] ?? null;
     const mean = around.reduce((sum, x) => sum + x, 0) / around.length;
-    return own === null || around.length < 3 || mean <= 0 ? null : own / mean - 1;
+    return own === null || around.length < 3 || mean <= 0 ? null : 100 * (own / mean - 1);
   });
 }
 

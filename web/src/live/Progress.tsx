@@ -5,7 +5,7 @@ import type { JSX } from "react";
 import type { Reconstruction } from "../api/types";
 import { count, decibel, duration, percent, small } from "../state/format";
 import { go } from "../state/route";
-import { Badge, jobTone, Meter, Panel, Stat, trackingHint, trackingTone } from "../ui/parts";
+import { JobBadge, Meter, Panel, Stat, trackingHint } from "../ui/parts";
 import { Icon } from "../ui/icons";
 
 export function Progress({ job }: { job: Reconstruction | null }): JSX.Element {
@@ -16,17 +16,9 @@ export function Progress({ job }: { job: Reconstruction | null }): JSX.Element {
       </Panel>
     );
   const running = job.state === "running" || job.state === "queued";
+  const follows = job.stage === "waiting" || job.stage === "tracking";
   return (
-    <Panel
-      title="Reconstruction"
-      aside={
-        running ? (
-          <Badge tone={trackingTone[job.tracking_state]}>{job.tracking_state}</Badge>
-        ) : (
-          <Badge tone={jobTone[job.state]}>{job.state}</Badge>
-        )
-      }
-    >
+    <Panel title="Reconstruction" aside={<JobBadge job={job} />}>
       <dl className="stats">
         <Stat name="Stage">{job.stage}</Stat>
         <Stat name="Poses">{count(job.poses)}</Stat>
@@ -46,10 +38,10 @@ export function Progress({ job }: { job: Reconstruction | null }): JSX.Element {
           </span>
         </div>
       )}
-      {running && job.stage !== "refining" && job.tracking_state !== "track" && (
-        <p>{trackingHint[job.tracking_state]}</p>
+      {running && follows && job.tracking_state !== "track" && <p>{trackingHint[job.tracking_state]}</p>}
+      {(follows || !running) && job.reason !== "" && (
+        <p className={job.state === "failed" ? "problem" : "dim"}>{job.reason}</p>
       )}
-      {job.reason !== "" && <p className={job.state === "failed" ? "problem" : "dim"}>{job.reason}</p>}
       <button
         type="button"
         disabled={job.version === 0}

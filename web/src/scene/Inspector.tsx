@@ -3,10 +3,11 @@
 import { type JSX, useState } from "react";
 
 import type { Capture, Reconstruction } from "../api/types";
+import { nameOf } from "../state/capture";
 import { count, decibel, percent } from "../state/format";
 import { toast } from "../state/toasts";
 import { Icon } from "../ui/icons";
-import { Badge, jobTone, Meter, Segmented, Stat, trackingHint, trackingTone } from "../ui/parts";
+import { JobBadge, Meter, Segmented, Stat, trackingHint } from "../ui/parts";
 import { type Bookmark, readBookmarks, writeBookmarks } from "./bookmarks";
 import { type Colouring, SPEED_COLOURS, STATE_COLOURS, STATES } from "./path";
 import type { Shown } from "./useScene";
@@ -55,14 +56,8 @@ export function Inspector(props: InspectorProps): JSX.Element {
   return (
     <aside className="inspector" aria-label="Scene settings">
       <header>
-        <strong>{capture.name === "" ? capture.source : capture.name}</strong>
-        {running ? (
-          <span title={trackingHint[job.tracking_state]}>
-            <Badge tone={trackingTone[job.tracking_state]}>{job.tracking_state}</Badge>
-          </span>
-        ) : (
-          <Badge tone={jobTone[job.state]}>{job.state}</Badge>
-        )}
+        <strong>{nameOf(capture)}</strong>
+        <JobBadge job={job} />
       </header>
       <dl className="stats">
         <Stat name="Version">{shown?.version ?? "–"}</Stat>

@@ -197,7 +197,9 @@ export class Viewer {
     const { layers } = this;
     if (this.mesh !== null) this.mesh.visible = layers.splats;
     this.line.visible = layers.path && !this.riding && this.line.geometry.instanceCount > 0;
-    this.frustum.visible = layers.frustum && !this.riding && this.placement !== null && this.sensor !== null;
+    // Before there is a scene nothing tells how large a frustum would be of use.
+    const placed = this.extent !== null && this.placement !== null && this.sensor !== null;
+    this.frustum.visible = layers.frustum && !this.riding && placed;
     this.grid.visible = layers.grid && !this.riding && this.extent !== null;
     this.axes.visible = layers.axes && !this.riding && this.extent !== null;
     this.draw();

@@ -9,11 +9,11 @@ import { useService, wordsOf } from "../state/store";
 import { toast } from "../state/toasts";
 import { type Asked, useAsked } from "../state/useAsked";
 import { Icon } from "../ui/icons";
-import { Badge, Empty, Loading, Panel, type Tone, Trouble } from "../ui/parts";
+import { Badge, Empty, Loading, Panel, type Tone, Trouble, Words } from "../ui/parts";
 
 const TONES: Record<Finding["status"], Tone> = { ok: "good", warning: "warning", problem: "problem" };
 const LINKS = [
-  { href: "docs", label: "API documentation", hint: "Every call, to try out" },
+  { href: "docs", label: "API documentation", hint: "Every call, with its answers" },
   { href: "openapi.json", label: "OpenAPI schema", hint: "To generate clients from" },
   { href: "metrics", label: "Metrics", hint: "For Prometheus" },
   { href: "healthz", label: "Health", hint: "The process answers" },
@@ -48,8 +48,14 @@ export function SetupPage(): JSX.Element {
                       <Badge tone={TONES[item.status]}>{item.status}</Badge>
                       <div>
                         <strong>{item.name}</strong>
-                        <p>{item.finding}</p>
-                        {item.what_to_do !== null && <p className="todo">{item.what_to_do}</p>}
+                        <p>
+                          <Words>{item.finding}</Words>
+                        </p>
+                        {item.what_to_do !== null && (
+                          <p className="todo">
+                            <Words>{item.what_to_do}</Words>
+                          </p>
+                        )}
                       </div>
                     </li>
                   ))}
@@ -215,7 +221,9 @@ function Configuration({ asked }: { asked: Asked<Setting[]> }): JSX.Element {
                   <tr key={item.key}>
                     <th scope="row">
                       <code>{item.key}</code>
-                      <span className="dim">{item.doc}</span>
+                      <span className="dim">
+                        <Words>{item.doc}</Words>
+                      </span>
                     </th>
                     <td>
                       <code>

@@ -2,7 +2,7 @@
 
 import type { JSX, ReactNode } from "react";
 
-import type { CaptureState, DeviceState, Grade, JobState, TrackingState } from "../api/types";
+import type { CaptureState, DeviceState, Grade, JobState, Reconstruction, TrackingState } from "../api/types";
 import { Icon, type IconName } from "./icons";
 
 export type Tone = "good" | "warning" | "problem" | "active" | "quiet";
@@ -64,6 +64,22 @@ export const trackingHint: Record<TrackingState, string> = {
   lost: "The camera is not followed: go back to what it has seen.",
   reloc: "The camera is looked for in the map: hold it on what it has seen.",
 };
+
+/** What a reconstruction is at: how it follows the camera while it does, then what it works at, then how it ended. */
+export function JobBadge({ job }: { job: Reconstruction }): JSX.Element {
+  if (job.state !== "running") return <Badge tone={jobTone[job.state]}>{job.state}</Badge>;
+  if (job.stage !== "tracking") return <Badge tone="active">{job.stage}</Badge>;
+  return (
+    <span title={trackingHint[job.tracking_state]}>
+      <Badge tone={trackingTone[job.tracking_state]}>{job.tracking_state}</Badge>
+    </span>
+  );
+}
+
+/** A sentence of the service, with what it puts between backticks as code. */
+export function Words({ children }: { children: string }): JSX.Element {
+  return <>{children.split("`").map((part, i) => (i % 2 === 1 ? <code key={i}>{part}</code> : part))}</>;
+}
 
 /** A share of something, 0 to 1. */
 export function Meter({ share, label, tone = "active" }: { share: number; label: string; tone?: Tone }): JSX.Element {

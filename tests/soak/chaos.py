@@ -206,14 +206,7 @@ class Victim:
                 for _ in range(2):
                     self.daemon.http.post(f"captures/{capture['id']}:stop")
         wait_for(lambda: all(capture["state"] in OVER for capture in self.captures()), "all captures are over")
-        jobs = {"limit": 200}
-        wait_for(
-            lambda: all(
-                job["state"] not in ("queued", "running")
-                for job in self.daemon.http.get("reconstructions", params=jobs).json()["items"]
-            ),
-            "all jobs are over",
-        )
+        self._work_off()
         wait_for(lambda: not self.daemon.workers(), "no worker is left")
         for capture in self.captures():
             assert not (SHM / f"spiked-{capture['id']}").exists()
@@ -221,6 +214,20 @@ class Victim:
         for file in self._data.glob("reconstructions/*/published.json"):
             json.loads(file.read_text())
         self.check()
+
+    def _work_off(self) -> None:
+        """Wait for all jobs, however many were begun again, as long as one of them gets on."""
+        last, since_s = None, time.monotonic()
+        while True:
+            jobs = self.daemon.http.get("reconstructions", params={"limit": 200}).json()["items"]
+            left = [job for job in jobs if job["state"] in ("queued", "running")]
+            if not left:
+                return
+            now = [(job["id"], job["state"], job["stage"], job["frames"], job["progress"]) for job in left]
+            if now != last:
+                last, since_s = now, time.monotonic()
+            assert time.monotonic() - since_s < DEADLINE_S, f"no job gets on: {left}"
+            time.sleep(0.2)
 
     def _ready(self) -> Any:
         with suppress(httpx.HTTPError):

@@ -30,6 +30,10 @@ def job(done: Any) -> str:
     return str(done.reconstruction_ids[0])
 
 
+TRASH = "use_after_free"
+"""A deleted capture can be looked at and restored until the retention takes it, and says when it was deleted."""
+
+
 def fuzz(service: Any, folder: Path, known: dict[str, str], *options: str) -> None:
     """Run schemathesis; ids in `known` are used instead of random ones."""
     folder.mkdir(exist_ok=True)
@@ -42,26 +46,26 @@ def fuzz(service: Any, folder: Path, known: dict[str, str], *options: str) -> No
         "--checks",
         "all",
         "--exclude-checks",
-        "positive_data_acceptance",
+        f"positive_data_acceptance,{TRASH}",
     ]
     command += ["--seed", "1", "--request-timeout", "60", "--warnings", "off", *options]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=3000, check=False)
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=1700, check=False)
     assert done.returncode == 0, done.stdout[-12_000:] + done.stderr[-2000:]
 
 
-# Captures of the simulated camera that a fuzzer would start by the hundred are left to the examples.
-QUIET = ("--exclude-operation-id", "start_capture", "--exclude-operation-id", "arm_device")
 LASTING = ("--exclude-method", "DELETE")
 
 
 def test_requests_about_what_there_is(service: Any, done: Any, job: str, tmp_path: Path) -> None:
     known = {"capture_id": done.id, "reconstruction_id": job, "device_id": "sim:"}
     options = ("--phases", "examples,coverage,fuzzing", "--max-examples", "5")
-    fuzz(service, tmp_path / "known", known, *QUIET, *LASTING, *options)
+    fuzz(service, tmp_path / "known", known, *LASTING, *options)
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_long(service: Any, done: Any, job: str, tmp_path: Path) -> None:
     known = {"capture_id": done.id, "reconstruction_id": job, "device_id": "sim:"}
-    fuzz(service, tmp_path / "known", known, *QUIET, *LASTING, "--phases", "coverage,fuzzing", "--max-examples", "200")
-    fuzz(service, tmp_path / "random", {}, *QUIET, "--phases", "coverage,fuzzing,stateful", "--max-examples", "200")
+    options = ("--max-examples", "200", "--max-time", "900")
+    fuzz(service, tmp_path / "known", known, *LASTING, "--phases", "coverage,fuzzing", *options)
+    fuzz(service, tmp_path / "random", {}, "--phases", "coverage,fuzzing,stateful", *options)

@@ -132,6 +132,14 @@ class Bundle:
         information = system.focal_information()
         return float(self.noise_px() / np.sqrt(information)) if information > 0 else np.inf
 
+    def spline_information(self, spline: Spline, times: Array, scale_px: float) -> Array:
+        """What is known of the knots with all points free: [6 knots, 6 knots] of (rotation, centre), in 1/px^2."""
+        blend = spline.basis_matrix(times)
+        inertia = Inertia.of(spline, blend, self.noise_px())
+        system = replace(self, focal_free=False)._linearise(scale_px, np.ones(len(self.centres), bool))
+        square, _ = system.by_knots(blend)
+        return square + inertia.hessian().reshape(square.shape)
+
     def _stepped(self, step: "_Step", free: NDArray[np.bool_]) -> "Bundle":
         rotations, centres = self.rotations.copy(), self.centres.copy()
         rotations[free] = exp_so3(step.poses[:, :3]) @ rotations[free]
@@ -226,21 +234,35 @@ class _System:
                 _sum_by(point, np.einsum("mki,mk->mi", by_point, by_focal), points),
             )
 
+    def reduced(self, damping: float = 0.0) -> tuple[Array, Array, Array]:
+        """The Hessian of the free poses [6 c, 6 c] with the points eliminated, the inverse Hessians of the points
+        [P, 3, 3], and the poses' cross terms times these [6 c, 3 P]."""
+        cameras, _, points, _ = self.cross.shape
+        v_inverse = np.linalg.inv(self.points_hessian * (1 + damping * np.eye(3)) + 1e-9 * np.eye(3))
+        scaled = np.einsum("ciPj,Pjk->ciPk", self.cross, v_inverse, optimize=True).reshape(cameras * 6, points * 3)
+        square = -scaled @ self.cross.reshape(cameras * 6, points * 3).T
+        index = np.arange(cameras)
+        own = self.pose_hessian * (1 + damping * np.eye(6)) + 1e-9 * np.eye(6)
+        square.reshape(cameras, 6, cameras, 6)[index, :, index, :] += own
+        return square, np.asarray(v_inverse), scaled
+
+    def by_knots(self, blend: Array, damping: float = 0.0) -> tuple[Array, tuple[Array, Array]]:
+        """As `reduced`, for poses that only move as the blend [c, knots] of knots: [6 knots, 6 knots]; and the rest."""
+        square, v_inverse, scaled = self.reduced(damping)
+        cameras, knots = blend.shape
+        blocks = square.reshape(cameras, 6, cameras, 6)
+        by_knot = np.tensordot(np.tensordot(blend, blocks, (0, 0)), blend, (2, 0))  # [k, 6, 6, k]
+        return by_knot.transpose(0, 1, 3, 2).reshape(knots * 6, knots * 6), (v_inverse, scaled)
+
     def focal_information(self) -> float:
         """What is known of the focal length's logarithm when all else is free, in 1/px^2."""
         assert self.focal is not None
-        cameras, _, points, _ = self.cross.shape
-        v_inverse = np.linalg.inv(self.points_hessian + 1e-9 * np.eye(3))
-        cross = self.cross.reshape(cameras * 6, points * 3)
-        scaled = np.einsum("ciPj,Pjk->ciPk", self.cross, v_inverse, optimize=True).reshape(cross.shape)
-        reduced = -scaled @ cross.T
-        index = np.arange(cameras)
-        reduced.reshape(cameras, 6, cameras, 6)[index, :, index, :] += self.pose_hessian
-        reduced[np.diag_indices(len(reduced))] += 1e-9 * np.abs(np.diag(reduced)).max()
+        square, v_inverse, scaled = self.reduced()
+        square[np.diag_indices(len(square))] += 1e-9 * np.abs(np.diag(square)).max()
         by_points = self.focal.by_points
         side = self.focal.by_poses.ravel() - scaled @ by_points.ravel()
         left = self.focal.hessian - np.einsum("Pi,Pij,Pj->", by_points, v_inverse, by_points)
-        return float(left - side @ np.linalg.solve(reduced, side))
+        return float(left - side @ np.linalg.solve(square, side))
 
     def solve(self, damping: float, blend: Array | None = None, prior: tuple[Array, Array] | None = None) -> _Step:
         """Steps of the free poses, of the points and of the focal length if it is free.
@@ -249,30 +271,22 @@ class _System:
         `prior` is added to their Hessian [knots, 6, knots, 6] and gradient [knots, 6].
         """
         cameras, _, points, _ = self.cross.shape
-        eye = np.eye(3)
-        v = self.points_hessian * (1 + damping * eye) + 1e-9 * eye
-        v_inverse = np.linalg.inv(v)
-        scaled = np.einsum("ciPj,Pjk->ciPk", self.cross, v_inverse, optimize=True).reshape(cameras * 6, points * 3)
-        cross = self.cross.reshape(cameras * 6, points * 3)
-        square = -scaled @ cross.T
-        blocks = square.reshape(cameras, 6, cameras, 6)
-        index = np.arange(cameras)
-        blocks[index, :, index, :] += self.pose_hessian * (1 + damping * np.eye(6)) + 1e-9 * np.eye(6)
+        if blend is None:
+            square, v_inverse, scaled = self.reduced(damping)
+        else:
+            square, (v_inverse, scaled) = self.by_knots(blend, damping)
         downhill = (-self.pose_gradient.ravel() + scaled @ self.points_gradient.ravel()).reshape(cameras, 6)
         side = None
         if self.focal is not None:
             side = self.focal.by_poses - (scaled @ self.focal.by_points.ravel()).reshape(cameras, 6)
         if blend is not None:
-            knots = blend.shape[1]
-            by_knot = np.tensordot(np.tensordot(blend, blocks, (0, 0)), blend, (2, 0))  # [k, 6, 6, k]
-            square = by_knot.transpose(0, 1, 3, 2).reshape(knots * 6, knots * 6)
             downhill = blend.T @ downhill
             side = None if side is None else blend.T @ side
             if prior is not None:
-                square += prior[0].reshape(knots * 6, knots * 6)
+                square += prior[0].reshape(square.shape)
                 downhill -= prior[1]
-            square[np.diag_indices(knots * 6)] *= 1 + damping
-            square[np.diag_indices(knots * 6)] += 1e-9
+            square[np.diag_indices(len(square))] *= 1 + damping
+            square[np.diag_indices(len(square))] += 1e-9
         right, log_focal = downhill.ravel(), 0.0
         if self.focal is not None and side is not None:
             both = np.linalg.solve(square, np.stack([right, side.ravel()], 1))
@@ -290,6 +304,7 @@ class _System:
             solved = np.linalg.solve(square, right)
         steps = solved.reshape(-1, 6)
         poses = steps if blend is None else blend @ steps
+        cross = self.cross.reshape(cameras * 6, points * 3)
         back = -self.points_gradient - (cross.T @ poses.ravel()).reshape(points, 3)
         if self.focal is not None:
             back -= log_focal * self.focal.by_points

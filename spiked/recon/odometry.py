@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from spiked.pose import Array, exp_so3, hat, log_so3, mean_rotation
 from spiked.recon.bootstrap import INLIER_PX, LEAST_INLIERS, MORE_MOTION, SCALE_PX, Views, bootstrap
 from spiked.recon.bundle import Bundle
+from spiked.recon.certainty import path_error
 from spiked.recon.focal import CORRELATED, Focal, try_fields
 from spiked.recon.smooth import clock_of, coarsest
 from spiked.recon.stamps import Stamps, delays
@@ -77,6 +78,10 @@ WORST_SIGMA_PX = 1.0
 WORST_INLIERS = 0.5
 WORST_OVERLAP = 0.25
 """Tracking counts as degraded beyond any of these; overlap is the share of the tracks whose points are known."""
+CERTAINTY = 5.0
+"""How many times worse the whole path is than if all errors of tracks were independent: 4 (garden) to 7 (living)."""
+WORST_PATH_ERROR = 0.03
+"""A predicted error of the path, relative to its RMS radius, above which users are warned."""
 STILL_PX = 0.12
 """Less motion from view to view than this is none: tracks are not better."""
 STOOD_PX = 0.3
@@ -110,12 +115,15 @@ class Odometry:
     sparse: bool = False
     """The views are so far apart that no spline can be tied to them: the path leads from each to the next, only the
     newest are adjusted together, and nothing takes much longer than a view."""
+    path_error: float | None = None
+    """Predicted error of the finished path relative to its RMS radius; None before the end."""
     changes: list[tuple[float, State, str]] = field(default_factory=list)
     """(time in frames, state, reason) of each change of state."""
 
     def __post_init__(self) -> None:
         self._tracks = Tracks()
         self._stamps = Stamps()
+        self._adjusted: tuple[Bundle, Array] | None = None
         self._boot_start = 0
         self._boot_parallax = MIN_PARALLAX_PX
         self._boot_views = 0
@@ -180,6 +188,8 @@ class Odometry:
             self.settle()
             if abs(self.intrinsics.fx / before - 1) < SAME_FOCAL:
                 break
+        if self._adjusted is not None and self.spline is not None and not self.sparse:
+            self.path_error = CERTAINTY * path_error(self._adjusted[0], self.spline, self._adjusted[1], SCALE_PX / 2)
         self._review()
 
     def _review(self) -> None:
@@ -537,6 +547,7 @@ class Odometry:
             self.intrinsics = bundle.intrinsics
             self.focal = Focal(self.intrinsics, CORRELATED * bundle.focal_sigma(SCALE_PX))
         self.spline = self._in_old_frame(spline, bundle, numbers)
+        self._adjusted = bundle, times
         self._take(bundle, ids, numbers)
         others = [n for n in posed if n not in set(numbers)]
         if others:

@@ -18,7 +18,7 @@ from spiked.recon.colour import contradicts
 from spiked.recon.depth import SWEPT_PIXELS, Shot, neighbours, sweep
 from spiked.recon.focal import FIRST_DEG, Focal
 from spiked.recon.mapping import Mapper, Sight, fill_mosaic
-from spiked.recon.odometry import SAME_FOCAL, Odometry, State
+from spiked.recon.odometry import SAME_FOCAL, WORST_PATH_ERROR, Odometry, State
 from spiked.recon.options import Options
 from spiked.recon.passage import Passage
 from spiked.recon.refine import align_spline
@@ -410,6 +410,12 @@ class Reconstructor:
                 self._odometry.end()
             else:
                 self._take_given_poses()
+        error = self._odometry.path_error
+        if error is not None and error > WORST_PATH_ERROR:
+            self.warnings.append(
+                f"the shape of the whole path is only known to about {error:.0%}, before the map corrects it: "
+                "few tracks tie its parts together; more sideways motion, slower motion or more light would help"
+            )
         self._spent["tracking"] += time.perf_counter() - begin
         begin = time.perf_counter()
         if self._ready():
@@ -607,6 +613,7 @@ class Reconstructor:
         return {
             "versions": {"spiked": release, "python": platform.python_version()}
             | {name: version(name) for name in ("numpy", "opencv-python-headless")},
+            "path_error_predicted": odometry.path_error,
             "focal_px": [self.camera.intrinsics.fx, self.camera.intrinsics.fy],
             "focal_estimated": self.focal is not None,
             "focal_relative_sigma": None if self.focal is None else _finite(self.focal.relative_sigma),

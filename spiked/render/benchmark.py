@@ -13,15 +13,17 @@ from numpy.typing import NDArray
 from spiked.native._raster import multiply_adds
 from spiked.pose import exp_so3
 from spiked.render.camera import Camera
+from spiked.render.charge import CELL_PX, ChargeLoss
 from spiked.render.cpu import Rasteriser, usable_cores
 from spiked.render.loss import dssim, robust
 from spiked.render.optimiser import Adam
 from spiked.render.splats import Floats, Splats
-from spiked.sensor import Intrinsics
+from spiked.sensor import Intrinsics, Sensor
 
 FORWARD_OPERATIONS, BACKWARD_OPERATIONS = 18, 34
 """Vector arithmetic instructions that a splat costs a pixel, for one colour."""
 MOTION_PX = 2.0
+CHARGE_FRAMES = 24
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,7 @@ def measure(sizes: tuple[Size, ...] = SIZES, repetitions: int = 10) -> list[Row]
     for size in sizes:
         rows += _steps(size, repetitions, peak)
     rows += _accumulation(sizes[0], repetitions)
+    rows.append(_by_charge(sizes[0], repetitions))
     rows.append(_against_naive(repetitions))
     rows += _fused(sizes[0], repetitions)
     return rows
@@ -212,6 +215,33 @@ def _accumulation(size: Size, repetitions: int) -> list[Row]:
     name = f"8 exact sub-poses, {where}"
     rows.append(Row(name, timing.best_s * 1e3, "ms", timing.best_s / still.best_s, against, "", timing.spread))
     return rows
+
+
+def _by_charge(size: Size, repetitions: int) -> Row:
+    """A step on all spikes of some frames: one render, carried along its motion, beside that render alone."""
+    camera, splats = scene(size)
+    width = size.width // 8 * 8
+    sensor = Sensor(width, size.height, 20_000.0)
+    frames = np.random.default_rng(1).integers(0, 256, (CHARGE_FRAMES, sensor.frame_bytes), np.uint8)
+    frames &= np.random.default_rng(2).integers(0, 256, frames.shape, np.uint8)  # a quarter of the pixels fire
+    rows, columns = -(-size.height // CELL_PX) + 1, -(-width // CELL_PX) + 1
+    moved = np.zeros((CHARGE_FRAMES, rows, columns, 2), np.float32)
+    moved[...] = (np.arange(CHARGE_FRAMES, dtype=np.float32) - CHARGE_FRAMES / 2)[:, None, None, None]
+    gain = np.ones((size.height, width), np.float32)
+    rasteriser, charge = Rasteriser(camera, 1), ChargeLoss(sensor, 1)
+    pose = np.eye(3)[None], np.zeros((1, 3))
+
+    def still() -> None:
+        rasteriser.backward(rasteriser.forward(splats, *pose).values)
+
+    def step() -> None:
+        image = rasteriser.forward(splats, *pose).values
+        rasteriser.backward(charge(image, frames, moved, gain, floor=0.01).slope)
+
+    one, all_frames = repeated(still, repetitions), repeated(step, repetitions)
+    name = f"step by the charge of {CHARGE_FRAMES} frames, {size.splats // 1000}k splats, {size.width}x{size.height}"
+    share = all_frames.best_s / one.best_s
+    return Row(name, all_frames.best_s * 1e3, "ms", share, "of a still step", "<= 3", all_frames.spread)
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,12 @@
 
 PUB drops, without a word, what a subscriber has no room for. So pictures have a socket of their own with room for two:
 they go first, and cannot displace anything else. Every message says its number within its topic, `topic_seq`, so that a
-subscriber sees what it has lost; REP gives it again as long as it is remembered.
+subscriber sees what it has lost; REP gives it again as long as it is remembered. REP is played by a ROUTER: a socket of
+that kind waits for each asker who takes no answer, and all others with it.
 """
 
 import threading
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,7 +47,7 @@ class ZmqServer:
             self._events, self._state, self._previews = (
                 self._bound(kind, room, first_port and first_port + offset)
                 for offset, (kind, room) in enumerate(
-                    [(zmq.PUB, _ROOM), (zmq.REP, _ROOM_PICTURES), (zmq.PUB, _ROOM_PICTURES)]
+                    [(zmq.PUB, _ROOM), (zmq.ROUTER, _ROOM_PICTURES), (zmq.PUB, _ROOM_PICTURES)]
                 )
             )
         except ConfigurationError:
@@ -105,11 +107,13 @@ class ZmqServer:
         while not self._over.is_set():
             if not self._state.poll(_LOOK_MS):
                 continue
-            answer = _answer(self._bus, self._state.recv_multipart())
-            try:
-                self._state.send(pack(answer))
-            except zmq.Again:
-                continue  # who asked is gone
+            frames = self._state.recv_multipart()
+            if b"" not in frames:
+                continue  # nobody who waits for an answer asks like this
+            question = frames.index(b"") + 1
+            answer = pack(_answer(self._bus, frames[question:]))
+            with suppress(zmq.Again):  # who asked takes nothing
+                self._state.send_multipart([*frames[:question], answer], zmq.NOBLOCK)
 
 
 def _answer(bus: Bus, frames: list[bytes]) -> dict[str, Any]:

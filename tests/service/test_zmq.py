@@ -154,6 +154,20 @@ def test_a_question_that_is_too_long_ends_only_its_own_connection(
     assert "messages" in ask(context, server, msgpack.packb({"get": "state"}))
 
 
+def test_one_who_asks_much_and_leaves_keeps_nobody_waiting(server: ZmqServer, context: "zmq.Context[Any]") -> None:
+    for _ in range(3):
+        with zmq.Context() as own, own.socket(zmq.DEALER) as rude:
+            rude.set(zmq.LINGER, 0)
+            rude.connect(server.endpoints.state)
+            for _ in range(20):
+                rude.send_multipart([b"", b"odd"])
+                rude.send_multipart([b"no envelope"])
+            time.sleep(0.003)  # some of it is sent, and its answers find nobody
+        begun_s = time.monotonic()
+        assert "messages" in ask(context, server, msgpack.packb({"get": "state"}))
+        assert time.monotonic() - begun_s < 2.0
+
+
 def test_a_port_that_is_taken_is_an_error_that_says_so(bus: Bus, server: ZmqServer) -> None:
     port = int(server.endpoints.events.rpartition(":")[2])
     with pytest.raises(ConfigurationError, match=f":{port} for ZeroMQ: .*in use"):

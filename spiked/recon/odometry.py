@@ -81,7 +81,7 @@ WORST_OVERLAP = 0.25
 CERTAINTY = 5.0
 """How many times worse the whole path is than if all errors of tracks were independent: 4 (garden) to 7 (living)."""
 WORST_PATH_ERROR = 0.03
-"""A predicted error of the path, relative to its RMS radius, above which users are warned."""
+"""A predicted error of the path, relative to its RMS radius, above which it counts as degraded and users are warned."""
 STILL_PX = 0.12
 """Less motion from view to view than this is none: tracks are not better."""
 STOOD_PX = 0.3
@@ -205,6 +205,11 @@ class Odometry:
             last = fit, len(view.ids)
         if last is not None and self.state in (State.TRACK, State.DEGRADED):
             self._judge(*last)
+            if self.path_error is not None and self.path_error > WORST_PATH_ERROR:
+                about = f"about {self.path_error:.0%}"
+                self._become(
+                    State.DEGRADED, f"the whole path's shape is only known to {about}: few tracks tie it together"
+                )
 
     def _try_bootstrap(self, final: bool = False) -> None:
         newest = self.views[-1]

@@ -89,10 +89,13 @@ def test_a_camera_that_stops_and_goes_on() -> None:
 
 
 def test_a_camera_that_turns_first() -> None:
+    """240x160 pixels leave such a path loosely known, which is told."""
     motion = After(path(MotionKind.ROTATION, 3), 400, path())
     reconstructor, error, coverage = followed(motion, 900)
-    assert reconstructor.status().state is State.TRACK, reconstructor.status().reason
-    assert error < 4 and coverage > 0.7
+    status = reconstructor.status()
+    told = status.state is State.DEGRADED and "shape" in status.reason
+    assert error < 6 and coverage > 0.7
+    assert told or (status.state is State.TRACK and error < 3), (error, status)
     assert any("sideways" in reason for _, _, reason in reconstructor._odometry.changes)
 
 

@@ -30,12 +30,12 @@ class ChargeLoss {
                   Write<float, 3> slope) {
         const int64_t count = static_cast<int64_t>(frames.shape(0));
         const int64_t image_height = static_cast<int64_t>(image.shape(0));
-        const int64_t image_width = static_cast<int64_t>(image.shape(1)), colours = static_cast<int64_t>(image.shape(2));
+        const int64_t image_width = static_cast<int64_t>(image.shape(1)),
+                      colours = static_cast<int64_t>(image.shape(2));
         expect(width > 0 && width % 8 == 0 && height > 0 && height <= kMaxSide && width <= kMaxSide &&
                    row_stride >= width / 8,
                "a row is whole bytes and fits its stride");
-        expect(count > 0 && count <= kMaxChargeFrames &&
-                   static_cast<int64_t>(frames.shape(1)) == row_stride * height,
+        expect(count > 0 && count <= kMaxChargeFrames && static_cast<int64_t>(frames.shape(1)) == row_stride * height,
                "frames are uint8 [n, row_stride * height], at most 64");
         expect(cell > 0 && cell % 8 == 0 && static_cast<int64_t>(grids.shape(0)) == count && grids.shape(3) == 2 &&
                    grids.shape(1) > 1 && grids.shape(2) > 1 &&
@@ -45,8 +45,7 @@ class ChargeLoss {
         expect((colours == 1 || colours == 3) && image_width > 1 && image_height > 1 && image_width <= kMaxSide &&
                    image_height <= kMaxSide && pixel >= 1,
                "the image is float32 [h, w, 1 or 3], at least 2x2");
-        expect(slope.shape(0) == image.shape(0) && slope.shape(1) == image.shape(1) &&
-                   slope.shape(2) == image.shape(2),
+        expect(slope.shape(0) == image.shape(0) && slope.shape(1) == image.shape(1) && slope.shape(2) == image.shape(2),
                "the slope has the shape of the image");
         expect(tile.shape(0) == 4 && *std::max_element(tile.data(), tile.data() + 4) < 3, "a tile is four of 0, 1, 2");
         auto fits = [&](const auto& map) {

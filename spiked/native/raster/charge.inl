@@ -5,9 +5,9 @@
 constexpr int kPixels = 64;
 
 struct ChargeWork {
-    float light[kMaxChargeFrames][kPixels];  // expected charge of a frame
-    float right[kMaxChargeFrames][kPixels], down[kMaxChargeFrames][kPixels];  // between the four image pixels
-    int32_t at[kMaxChargeFrames][kPixels];                                    // the upper left one of them
+    float light[kMaxChargeFrames][kPixels];                                     // expected charge of a frame
+    float right[kMaxChargeFrames][kPixels], down[kMaxChargeFrames][kPixels];    // between the four image pixels
+    int32_t at[kMaxChargeFrames][kPixels];                                      // the upper left one of them
     float inside[kMaxChargeFrames][kPixels], spike[kMaxChargeFrames][kPixels];  // 0 or 1
     float slope[kMaxChargeFrames][kPixels];
 };
@@ -37,8 +37,7 @@ static void see(const ChargeJob& job, const ChargeRow& row, int64_t x0, int coun
         const uint8_t* bytes = row.bytes + f * job.frame_stride + x0 / 8;
         float* spike = work.spike[f];
         for (int i = 0; i < kPixels; ++i) spike[i] = 0;
-        for (int i = 0; i < count; ++i)
-            spike[i] = (float)((bytes[i >> 3] >> (job.msb ? 7 - (i & 7) : (i & 7))) & 1);
+        for (int i = 0; i < count; ++i) spike[i] = (float)((bytes[i >> 3] >> (job.msb ? 7 - (i & 7) : (i & 7))) & 1);
         const float* line = row.lines + f * job.columns * 2;
         float dx[kPixels], dy[kPixels];
         for (int from = 0; from < kPixels; from += 8) {

@@ -16,7 +16,7 @@ namespace {
 // clang-format on
 }  // namespace
 
-const Kernels kAvx2 = {"avx2",    prepare,          project, emit,   forward, store_tile, backward, project_moving,
-                       unproject, unproject_moving, cover,   finish, adam,    robust,     ssim, charge, charge_scratch, multiply_add,
-                       kLanes};
+const Kernels kAvx2 = {"avx2",         prepare,   project,          emit,         forward, store_tile, backward,
+                       project_moving, unproject, unproject_moving, cover,        finish,  adam,       robust,
+                       ssim,           charge,    charge_scratch,   multiply_add, kLanes};
 }  // namespace raster

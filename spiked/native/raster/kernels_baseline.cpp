@@ -18,7 +18,7 @@ namespace {
 // clang-format on
 }  // namespace
 
-const Kernels kBaseline = {"baseline", prepare,          project, emit,   forward, store_tile, backward, project_moving,
-                           unproject,  unproject_moving, cover,   finish, adam,    robust,     ssim, charge, charge_scratch, multiply_add,
-                           kLanes};
+const Kernels kBaseline = {"baseline",     prepare,   project,          emit,         forward, store_tile, backward,
+                           project_moving, unproject, unproject_moving, cover,        finish,  adam,       robust,
+                           ssim,           charge,    charge_scratch,   multiply_add, kLanes};
 }  // namespace raster

@@ -88,7 +88,7 @@ def test_a_token_is_asked_for_and_taken_in_three_ways(daemon: Callable[..., Any]
         assert browser.get(f"{one.address}api/v1/captures").status_code == 200
 
 
-@pytest.mark.parametrize("source", ["usb0", "foo:", "sim:?bogus=1", "sim:?pace=abc", "replay:none.dat"])
+@pytest.mark.parametrize("source", ["usb:", "foo:", "sim:?bogus=1", "sim:?pace=abc", "replay:none.dat"])
 def test_a_source_that_cannot_be_opened_is_refused_at_once(daemon: Callable[..., Any], source: str) -> None:
     one = daemon()
     answer = one.http.post("captures", json={"source": source})
@@ -96,6 +96,18 @@ def test_a_source_that_cannot_be_opened_is_refused_at_once(daemon: Callable[...,
     assert answer.headers["content-type"] == "application/problem+json"
     assert source.partition("?")[0].removeprefix("replay:") in answer.json()["detail"]
     assert one.http.get("captures").json()["items"] == []
+
+
+def test_a_camera_that_is_not_plugged_in_is_waited_for(daemon: Callable[..., Any]) -> None:
+    one = daemon()
+    started = one.http.post("captures", json={"source": "usb7"})
+    assert started.status_code == 201
+
+    def told() -> bool:
+        counters = one.http.get(f"captures/{started.json()['id']}").json()["counters"]
+        return counters["device"] == "absent" and "usb7 is not there: waiting for it" in counters["device_reason"]
+
+    wait_for(told, "word of the camera that is not there")
 
 
 def test_serving_a_device_that_cannot_be_opened_ends_with_one_line(tmp_path: Path) -> None:

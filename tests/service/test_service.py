@@ -104,10 +104,10 @@ def test_a_camera_that_is_not_plugged_in_is_waited_for(daemon: Callable[..., Any
     assert started.status_code == 201
 
     def told() -> bool:
-        counters = one.http.get(f"captures/{started.json()['id']}").json()["counters"]
+        counters = one.http.get(f"captures/{started.json()['id']}").json()["counters"] or {"device": None}
         return counters["device"] == "absent" and "usb7 is not there: waiting for it" in counters["device_reason"]
 
-    wait_for(told, "word of the camera that is not there")
+    wait_for(told, "it is said that the camera is not there")
 
 
 def test_serving_a_device_that_cannot_be_opened_ends_with_one_line(tmp_path: Path) -> None:

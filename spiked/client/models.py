@@ -1047,7 +1047,10 @@ class CaptureOut(BaseModel):
     ]
     source: str
     state: CaptureState
-    reason: Annotated[str, Field(description="Why, if the capture has failed or is about to.")]
+    reason: Annotated[
+        str,
+        Field(description="Why, if the capture has failed or is about to; or what it waits for, while no frame comes."),
+    ]
     warnings: list[str]
     verdict: Annotated[VerdictOut | None, Field(description="Null until the recording is closed.")]
     started_at: AwareDatetime

@@ -99,15 +99,20 @@ def test_a_source_that_cannot_be_opened_is_refused_at_once(daemon: Callable[...,
 
 
 def test_a_camera_that_is_not_plugged_in_is_waited_for(daemon: Callable[..., Any]) -> None:
-    one = daemon()
-    started = one.http.post("captures", json={"source": "usb7"})
-    assert started.status_code == 201
+    one = daemon("--device", "usb7", "--follow")
+    capture = f"captures/{one_capture(one)['id']}"
+    waits = "the camera usb7 is not there: waiting for it"
 
     def told() -> bool:
-        counters = one.http.get(f"captures/{started.json()['id']}").json()["counters"] or {"device": None}
-        return counters["device"] == "absent" and "usb7 is not there: waiting for it" in counters["device_reason"]
+        counters = one.http.get(capture).json()["counters"] or {"device": None}
+        return counters["device"] == "absent" and counters["device_reason"] == waits
 
     wait_for(told, "it is said that the camera is not there")
+    wait_for(lambda: one.output.readline() == f"streaming  {waits}\n", "whoever follows is told")
+    assert one.http.get(capture).json()["reason"] == one.http.get("captures").json()["items"][0]["reason"] == waits
+    one.http.post(f"{capture}:stop")
+    wait_for(lambda: one.http.get(capture).json()["state"] in ("complete", "failed"), "it can be stopped all the same")
+    assert waits not in one.http.get(capture).json()["reason"]
 
 
 def test_serving_a_device_that_cannot_be_opened_ends_with_one_line(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The whole way: a virtual camera on a mocked machine, the daemon, a capture over REST, bytes and a reconstruction."""
 
+import json
 import os
 import shutil
 import signal
@@ -8,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -57,10 +59,8 @@ def test_a_capture_over_rest_gets_every_frame_and_is_reconstructed(
     body = {"source": device["source"], "frames": FRAMES, "options": {"steps": 20}}
     capture_id = http.post("captures", json=body).json()["id"]
 
-    def counters() -> dict[str, Any]:
-        return http.get(f"captures/{capture_id}").json().get("counters") or {}
-
-    wait_for(lambda: (counters().get("device") or "").startswith("absent"), "the daemon waits for the camera")
+    waits = "the camera usb0 is not there: waiting for it"
+    wait_for(lambda: http.get(f"captures/{capture_id}").json()["reason"] == waits, "the daemon waits for the camera")
     rig.plug()
     over = ("finishing", "complete", "failed")
     wait_for(lambda: http.get(f"captures/{capture_id}").json()["state"] in over, "all frames came")
@@ -100,6 +100,9 @@ def test_a_capture_goes_on_when_the_camera_is_back(
     wait_for(lambda: counters().get("received", 0) > 100, "frames come")
     rig.unplug()
     wait_for(lambda: counters()["device"].startswith("absent"), "it is seen that the camera is gone")
+    waits = "the camera usb0 was unplugged: waiting for it"
+    assert http.get(f"captures/{capture_id}").json()["reason"] == waits
+    assert captures_told(http)[-1] == ("absent", waits), "who listens to the capture's events only does not learn it"
     before = counters()["received"]
     rig.plug(port="2-5")
     wait_for(lambda: counters()["received"] > before + 500, "frames come again")
@@ -107,6 +110,25 @@ def test_a_capture_goes_on_when_the_camera_is_back(
     assert after["device"].startswith("streaming")
     assert after["lost"]["device"] > 0
     assert after["received"] + sum(after["lost"].values()) == after["next_frame"]
+    assert http.get(f"captures/{capture_id}").json()["reason"] == ""
+    told = captures_told(http)
+    assert {reason for device, reason in told if device == "streaming"} == {""}
+    assert told[-1] == ("streaming", "")
+
+
+def captures_told(http: httpx.Client) -> list[tuple[str | None, str]]:
+    """State of the device and reason in every message about a capture so far, and one more."""
+    told: list[tuple[str | None, str]] = []
+    with http.stream("GET", "events", params={"topics": "capture", "since": 0}) as events:
+        now = http.get("system").json()["events_seq"]
+        for line in events.iter_lines():
+            if line.startswith("data: "):
+                message = json.loads(line.removeprefix("data: "))
+                capture = message["data"]
+                told.append((capture["counters"] and capture["counters"]["device"], capture["reason"]))
+                if message["seq"] > now:
+                    break
+    return told
 
 
 def test_a_killed_acquisition_is_followed_and_the_capture_goes_on(

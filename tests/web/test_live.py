@@ -159,10 +159,16 @@ def test_a_camera_is_unplugged_and_comes_back(
     sign = page.locator(".panel:has(h2:text-is('Capture')) header .badge")
     rig.unplug()
     until(lambda: sign.inner_text() in ("absent", "lost"), "the page says that the camera is gone")
+    frames = page.locator(".panel:has(h2:text-is('Frames'))")
+    frames.get_by_text("the camera usb0 was unplugged: waiting for it").wait_for()
+    assert frames.locator("header .badge").inner_text() in ("absent", "lost")
     before = received(page)
     rig.plug(port="2-5")
     until(lambda: sign.inner_text() == "streaming", "the page says that the camera is back")
     until(lambda: received(page) > before + 200, "frames come again")
+    until(
+        lambda: frames.get_by_text("waiting for it").count() == 0, "it is not said any longer that the camera is gone"
+    )
     lost = page.locator("table:has(caption:text-is('Frames lost, by cause')) tbody td").first
     assert number(lost.text_content()) > 0
     page.get_by_role("button", name="Stop").click()

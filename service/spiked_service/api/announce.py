@@ -23,8 +23,7 @@ class BusAnnouncer:
 
     def capture(self, snapshot: Snapshot) -> None:
         """A capture has changed, or its counters have."""
-        ids = [row.id for row in snapshot.reconstructions]
-        self._bus.publish(Topic.CAPTURE, CaptureOut.of(snapshot.row, snapshot.counters, ids), capture_id=snapshot.id)
+        self._bus.publish(Topic.CAPTURE, CaptureOut.of(snapshot), capture_id=snapshot.id)
 
     def job(self, row: ReconstructionRow) -> None:
         """A reconstruction has changed."""

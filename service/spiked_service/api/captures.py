@@ -111,7 +111,7 @@ def capture_routes(
         )
         snapshot = captures.start(plan)
         response.headers["Location"] = request.url_for("get_capture", capture_id=snapshot.row.id).path
-        return CaptureOut.of_snapshot(snapshot)
+        return CaptureOut.of(snapshot)
 
     @router.get("", responses=problems())
     def list_captures(
@@ -123,19 +123,19 @@ def capture_routes(
     ) -> CapturePage:
         """Captures, newest first."""
         page = captures.list(limit, cursor, q, state, deleted)
-        items = [CaptureOut.of_snapshot(captures.snapshot(row)) for row in page.items]
+        items = [CaptureOut.of(captures.snapshot(row)) for row in page.items]
         return CapturePage(items=items, next_cursor=page.next_cursor)
 
     @router.get("/{capture_id:id}", responses=problems(404))
     def get_capture(capture_id: str) -> CaptureOut:
         """State, counters and recording of a capture."""
-        return CaptureOut.of_snapshot(captures.get(capture_id))
+        return CaptureOut.of(captures.get(capture_id))
 
     @router.patch("/{capture_id:id}", responses=problems(404))
     def change_capture(capture_id: str, body: CaptureChange) -> CaptureOut:
         """Name it, note something, or keep it from being cleaned up."""
         captures.update(capture_id, name=body.name, notes=body.notes, keep=body.keep)
-        return CaptureOut.of_snapshot(captures.get(capture_id))
+        return CaptureOut.of(captures.get(capture_id))
 
     @router.delete("/{capture_id:id}", status_code=HTTPStatus.NO_CONTENT, responses=problems(404, 409))
     def remove_capture(capture_id: str) -> None:
@@ -146,13 +146,13 @@ def capture_routes(
     def restore_capture(capture_id: str, idempotency_key: IdempotencyKey = None) -> CaptureOut:
         """Undo its removal."""
         captures.restore(capture_id)
-        return CaptureOut.of_snapshot(captures.get(capture_id))
+        return CaptureOut.of(captures.get(capture_id))
 
     @router.post("/{capture_id:id}:stop", status_code=HTTPStatus.ACCEPTED, responses=problems(404))
     def stop_capture(capture_id: str, idempotency_key: IdempotencyKey = None) -> CaptureOut:
         """End the acquisition and refine what there is; asked again, end the refinement too."""
         captures.stop(capture_id)
-        return CaptureOut.of_snapshot(captures.get(capture_id))
+        return CaptureOut.of(captures.get(capture_id))
 
     @router.head("/{capture_id:id}/recording", include_in_schema=False)
     @router.get("/{capture_id:id}/recording", responses=_RECORDING_RESPONSES, response_class=Response)

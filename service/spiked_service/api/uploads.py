@@ -86,7 +86,7 @@ def upload_routes(uploads: Uploads, captures: Captures, route_class: type[APIRou
         row = uploads.complete(upload_id, captures)
         assert row.capture_id is not None
         response.headers["Location"] = request.url_for("get_capture", capture_id=row.capture_id).path
-        return CaptureOut.of_snapshot(captures.get(row.capture_id))
+        return CaptureOut.of(captures.get(row.capture_id))
 
     @router.delete("/{upload_id:id}", status_code=HTTPStatus.NO_CONTENT, responses=problems(404, 409))
     def remove_upload(upload_id: str) -> None:

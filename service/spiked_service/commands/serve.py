@@ -114,8 +114,8 @@ def _followed(captures: Captures) -> Iterator[None]:
 def _line(snapshot: Snapshot) -> str:
     """How a capture stands, in one line."""
     row = snapshot.row
-    if not snapshot.reconstructions or row.state is CaptureState.FAILED:
-        return f"{row.state}  {row.reason}".rstrip()
+    if not snapshot.reconstructions or row.state is CaptureState.FAILED or snapshot.waits_for:
+        return f"{row.state}  {snapshot.reason}".rstrip()
     job = snapshot.reconstructions[-1]
     loss = "" if job.loss is None else f"  loss {job.loss:.1e}"
     left = f"  {100 * job.progress:.0f} % refined" if row.state is CaptureState.FINISHING else ""

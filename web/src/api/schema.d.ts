@@ -1036,7 +1036,7 @@ export interface components {
             state: components["schemas"]["CaptureState"];
             /**
              * Reason
-             * @description Why, if the capture has failed or is about to.
+             * @description Why, if the capture has failed or is about to; or what it waits for, while no frame comes.
              */
             reason: string;
             /** Warnings */

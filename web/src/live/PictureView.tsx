@@ -156,6 +156,7 @@ function NoPicture({ capture, kind }: { capture: Capture | null; kind: PreviewKi
     <div className="empty" role="status">
       <Icon name="camera" />
       <strong>Waiting for the first frames…</strong>
+      {capture.reason !== "" && <p>{capture.reason}</p>}
     </div>
   );
 }

@@ -4,7 +4,7 @@ import type { JSX } from "react";
 
 import type { Capture, Device, System } from "../api/types";
 import { bytes, count, duration, percent, rate } from "../state/format";
-import { Badge, captureTone, gradeTone, Meter, Panel, Stat } from "../ui/parts";
+import { Badge, captureTone, deviceTone, gradeTone, Meter, Panel, Stat } from "../ui/parts";
 
 const CAUSES = ["device", "usb", "ring", "disk"] as const;
 
@@ -17,8 +17,19 @@ export function Frames({ capture, rateHz }: { capture: Capture; rateHz: number |
     capture.state === "streaming" &&
     /^(sim|replay):/.test(capture.source) &&
     counters?.consumers.some((one) => one.policy === "lossless" && one.fill > 0.9) === true;
+  const gone = capture.state === "streaming" && (counters?.device === "absent" || counters?.device === "lost");
+  const sign = gone ? (
+    <Badge tone={deviceTone[counters.device]}>{counters.device}</Badge>
+  ) : (
+    <Badge tone={captureTone[capture.state]}>{capture.state}</Badge>
+  );
   return (
-    <Panel title="Frames" aside={<Badge tone={captureTone[capture.state]}>{capture.state}</Badge>}>
+    <Panel title="Frames" aside={sign}>
+      {capture.state !== "failed" && capture.reason !== "" && (
+        <p className="warning" role="status">
+          {capture.reason}
+        </p>
+      )}
       <dl className="stats">
         <Stat name="Received">{counters === null ? "–" : count(counters.received)}</Stat>
         <Stat name="Length">{seconds === null ? "–" : duration(seconds)}</Stat>

@@ -24,7 +24,7 @@ from spiked_service.messages import PreviewTaken
 from spiked_service.pictures import Statistics
 from spiked_service.reconstruction_options import ReconstructionOptions
 from spiked_service.snapshot import Snapshot
-from spiked_service.store.rows import CaptureRow, CaptureState, Counters, Grade, Judgement, Origin, Recorded
+from spiked_service.store.rows import CaptureState, Counters, Grade, Judgement, Origin, Recorded
 
 
 class ConsumerOut(Out):
@@ -261,7 +261,9 @@ class CaptureOut(Out):
     origin: Origin = Field(description="live: captured here; upload: a recording from elsewhere.")
     source: str
     state: CaptureState
-    reason: str = Field(description="Why, if the capture has failed or is about to.")
+    reason: str = Field(
+        description="Why, if the capture has failed or is about to; or what it waits for, while no frame comes."
+    )
     warnings: list[str]
     verdict: VerdictOut | None = Field(description="Null until the recording is closed.")
     started_at: datetime
@@ -274,13 +276,9 @@ class CaptureOut(Out):
     sensor: SensorOut | None = Field(description="Null until the source is open.")
 
     @classmethod
-    def of_snapshot(cls, snapshot: Snapshot) -> "CaptureOut":
+    def of(cls, snapshot: Snapshot) -> "CaptureOut":
         """All that is known."""
-        return cls.of(snapshot.row, snapshot.counters, [row.id for row in snapshot.reconstructions])
-
-    @classmethod
-    def of(cls, row: CaptureRow, counters: Counters | None, reconstruction_ids: list[str]) -> "CaptureOut":
-        """A row with what is known beyond it."""
+        row = snapshot.row
         return cls(
             id=row.id,
             name=row.name,
@@ -289,7 +287,7 @@ class CaptureOut(Out):
             origin=row.origin,
             source=row.source,
             state=row.state,
-            reason=row.reason,
+            reason=snapshot.reason,
             warnings=list(row.warnings),
             verdict=VerdictOut.of(row.verdict),
             started_at=row.started_at,
@@ -297,8 +295,8 @@ class CaptureOut(Out):
             deleted_at=row.deleted_at,
             frames_planned=row.frames_planned,
             recording=RecordingOut.of(row.recording),
-            reconstruction_ids=reconstruction_ids,
-            counters=CountersOut.of(counters),
+            reconstruction_ids=[one.id for one in snapshot.reconstructions],
+            counters=CountersOut.of(snapshot.counters),
             sensor=SensorOut.of(row.sensor),
         )
 

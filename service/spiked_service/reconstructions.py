@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from spiked.errors import ConfigurationError
+from spiked.recon import State
 from spiked.sensor import Intrinsics
 from spiked_service.announcer import Announcer
 from spiked_service.backoff import Backoff
@@ -433,12 +434,15 @@ class Reconstructions:
             return replace(
                 row, live=False, state=JobState.QUEUED, stage=Stage.WAITING, progress=0.0, reason=told, ended_at=None
             )
-        if trouble is None:
-            state = JobState.CANCELLED if job.cancelled else JobState.COMPLETE
-            # A tracker that never began says why in its reason; of one that tracked to the end there is nothing to say.
-            return replace(row, state=state, stage=Stage.DONE, reason="" if row.poses else row.reason)
         if job.cancelled:
-            return replace(row, state=JobState.CANCELLED)
+            return replace(row, state=JobState.CANCELLED, stage=Stage.DONE if trouble is None else row.stage, reason="")
+        if trouble is None:
+            # A tracker that never began, or ended in doubt, says why; of one that tracked to its end nothing is to say.
+            well = bool(row.poses) and row.tracking_state is State.TRACK
+            progress = 1.0 if row.poses and not job.early else row.progress
+            return replace(
+                row, state=JobState.COMPLETE, stage=Stage.DONE, progress=progress, reason="" if well else row.reason
+            )
         if job.refusal is not None:
             return replace(row, state=JobState.FAILED, reason=job.refusal)
         capture = self._catalogue.captures.find(row.capture_id)

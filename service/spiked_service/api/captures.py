@@ -11,7 +11,7 @@ from spiked.recording import open_recording
 from spiked.recording.sidecar import sidecar_path
 from spiked_service.api import files
 from spiked_service.api.idempotency import IdempotencyKey
-from spiked_service.api.problems import ConflictError, NotReadyError, problems
+from spiked_service.api.problems import ConflictError, NothingError, NotReadyError, problems
 from spiked_service.api.reconstructions import (
     BINARY,
     ETAG,
@@ -293,9 +293,12 @@ def capture_routes(
         return shot_at(open_recording(path), frame, 0 if row.recording is None else row.recording.first_frame)
 
     def _result(capture_id: str, version: int | None = None) -> Result:
-        reconstructions = captures.get(capture_id).reconstructions
+        capture = captures.get(capture_id)
+        reconstructions = capture.reconstructions
+        if not reconstructions and capture.row.state in _LIVE and capture.row.plan.reconstruct:
+            raise NotReadyError(f"the reconstruction of capture {capture_id} has not begun yet")
         if not reconstructions:
-            raise NotReadyError(f"capture {capture_id} has no reconstruction; POST reconstructions starts one")
+            raise NothingError(f"capture {capture_id} has no reconstruction; POST reconstructions starts one")
         newest = next((row for row in reversed(reconstructions) if row.version), reconstructions[-1])
         return results.of(newest, version)
 

@@ -38,7 +38,10 @@ def device_routes(captures: Captures, sources: Sources, route_class: type[APIRou
     # Ids may hold slashes: replay:folder/file.dat. Hence the longer paths first.
     @router.post("/{device_id:device}:arm", status_code=HTTPStatus.ACCEPTED, responses=problems(404, 409))
     def arm_device(device_id: DeviceId, body: ArmRequest, idempotency_key: IdempotencyKey = None) -> DeviceOut:
-        """Let it run without recording, so that a capture can begin up to `pretrigger_s` before it is asked for."""
+        """Let it run without recording, so that a capture can begin up to `pretrigger_s` before it is asked for.
+
+        This takes a moment; captures are taken from when its state is armed.
+        """
         device = _find(sources, device_id)
         captures.arm(unhurried(device.source), body.pretrigger_s)
         return shown(captures, device)
@@ -77,9 +80,11 @@ def shown(captures: Captures, device: Device) -> DeviceOut:
         state, reason = DeviceState.STREAMING, ""
     elif standby is not None:
         counters, warnings = standby.counters(), standby.warnings
-        state, reason = DeviceState.ARMED, ""
+        state, reason = (device.state, device.reason) if counters is None else (DeviceState.ARMED, "")
     if counters is not None and (live is not None or counters.device is not DeviceState.STREAMING):
         state, reason = counters.device, counters.device_reason
+    if standby is not None and state is not DeviceState.ARMED and not reason:
+        reason = "being armed: a capture can begin when it is armed"
     return DeviceOut(
         id=device.source,
         kind=device.kind,

@@ -1,12 +1,13 @@
 """Errors as RFC 9457 problem details that say what is wrong and what to do."""
 
+from difflib import get_close_matches
 from http import HTTPStatus
 from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from starlette.exceptions import HTTPException
 
 from spiked.errors import SpikedError
@@ -52,6 +53,14 @@ class NotReadyError(SpikedError):
     """What was asked for will exist later."""
 
 
+class NoPoseError(SpikedError):
+    """A time or frame has no pose, or none yet."""
+
+
+class NothingError(SpikedError):
+    """What was asked for is not there, and nothing is at work that would make it."""
+
+
 class GoneError(SpikedError):
     """What was asked for is not kept."""
 
@@ -71,6 +80,8 @@ class KeyReusedError(SpikedError):
 _STATUS: dict[type[SpikedError], HTTPStatus] = {
     UnknownIdError: HTTPStatus.NOT_FOUND,
     NotReadyError: HTTPStatus.NOT_FOUND,
+    NoPoseError: HTTPStatus.NOT_FOUND,
+    NothingError: HTTPStatus.NOT_FOUND,
     GoneError: HTTPStatus.NOT_FOUND,
     FrameNotRecordedError: HTTPStatus.NOT_FOUND,
     BusyError: HTTPStatus.CONFLICT,
@@ -86,6 +97,8 @@ _STATUS: dict[type[SpikedError], HTTPStatus] = {
 
 _KINDS: dict[type[SpikedError], str] = {
     NotReadyError: "not-ready",
+    NoPoseError: "no-pose",
+    NothingError: "nothing-there",
     GoneError: "gone",
     FrameNotRecordedError: "not-recorded",
     BusyError: "busy",
@@ -111,6 +124,8 @@ _WHAT_TO_DO: dict[int, str] = {
 
 _MORE: dict[str, str] = {
     "not-ready": "ask again in a moment, or wait for the event that tells of it",
+    "no-pose": "ask for a time or frame that the detail names, or again when more is tracked",
+    "nothing-there": "do as the detail says",
     "gone": "ask for a newer version; GET versions lists those that are kept",
     "not-recorded": "ask for a frame that the detail names",
     "idempotency-key-reused": "use a new key for a new request",
@@ -158,7 +173,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:
-        told = "; ".join(_told(one) for one in error.errors()[:10])
+        told = "; ".join(_told(one, request) for one in error.errors()[:10])
         return problem(HTTPStatus.UNPROCESSABLE_ENTITY, told, instance=request.url.path)
 
     @app.exception_handler(HTTPException)
@@ -184,12 +199,40 @@ def install(app: FastAPI) -> None:
         )
 
 
-def _told(error: Any) -> str:
+def _told(error: Any, request: Request) -> str:
     """One finding of Pydantic: where, what, and what came, if that is short."""
-    where = ".".join(str(part) for part in error["loc"] if part != "body") or "body"
     given = error.get("input")
+    if error["type"] == "json_invalid":
+        return f"the body is not JSON: {error['ctx']['error']} (character {error['loc'][-1]})"
+    if isinstance(given, bytes):  # FastAPI does not look into a body that is not said to be JSON
+        sent = request.headers.get("content-type", "nothing")[:60]
+        return f"the body was sent as {sent}, not as JSON: add the header content-type: application/json"
+    where = ".".join(str(part) for part in error["loc"] if part != "body") or "body"
+    if error["type"] == "extra_forbidden":
+        return f"{where}: there is no such field{_nearest(request, error['loc'])}"
     shown = f", not {given!r}" if isinstance(given, str | int | float) and len(repr(given)) < 60 else ""
     return f"{where}: {str(error['msg']).removeprefix('Value error, ')}{shown}"
+
+
+def _nearest(request: Request, place: tuple[str | int, ...]) -> str:
+    """The field of the route's body that was probably meant, for one that does not exist."""
+    field = getattr(request.scope.get("route"), "body_field", None)
+    schema = TypeAdapter(field.field_info.annotation).json_schema() if field is not None else {}
+    node: Any = schema
+    for part in place[1:-1]:
+        node = _resolved(node, schema).get("properties", {}).get(part, {})
+    found = get_close_matches(str(place[-1]), _resolved(node, schema).get("properties", {}), n=1)
+    return f"; did you mean {found[0]}?" if found else ""
+
+
+def _resolved(node: Any, schema: dict[str, Any]) -> dict[str, Any]:
+    """The object that a node of a JSON schema stands for, where it stands for one."""
+    for choice in node.get("anyOf", [node]):
+        name = choice.get("$ref", "").removeprefix("#/$defs/")
+        found: dict[str, Any] = schema.get("$defs", {}).get(name, choice)
+        if "properties" in found:
+            return found
+    return {}
 
 
 _SCHEMA = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}

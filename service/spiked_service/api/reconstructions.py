@@ -11,7 +11,7 @@ from fastapi.routing import APIRoute
 from spiked.sensor import Intrinsics
 from spiked_service.api import files
 from spiked_service.api.idempotency import IdempotencyKey
-from spiked_service.api.problems import GoneError, NotReadyError, problems
+from spiked_service.api.problems import GoneError, NothingError, NotReadyError, problems
 from spiked_service.api.results import (
     Range,
     Result,
@@ -106,13 +106,21 @@ class Results:
         self.scenes = SceneFiles()
 
     def of(self, row: ReconstructionRow, version: int | None = None) -> Result:
-        """A version of a reconstruction, the newest if none is named. Raises NotReadyError, GoneError."""
+        """A version of a reconstruction, the newest if none is named. Raises NotReadyError, NothingError, GoneError."""
         folder = self._reconstructions.folder(row.id)
         published = at(folder, version)
         if published is None and version is not None and version <= row.version:
             raise GoneError(f"version {version} of reconstruction {row.id} is not kept")
         if published is None:
             named = "" if version is None else f" {version}"
+            if row.state.over and row.version:
+                raise NothingError(
+                    f"reconstruction {row.id} is {row.state} and has no version{named}; GET versions lists what it has"
+                )
+            if row.state.over:
+                raise NothingError(
+                    f"reconstruction {row.id} is {row.state} and has published nothing; :restart begins it again"
+                )
             raise NotReadyError(f"reconstruction {row.id} has no version{named} yet; it is at stage {row.stage}")
         sensor = self._captures.get(row.capture_id).row.sensor
         if sensor is not None and published.intrinsics is not None:

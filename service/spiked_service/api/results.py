@@ -20,7 +20,7 @@ from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
 from spiked.trajectory import Trajectory
 from spiked_service.api import files
-from spiked_service.api.problems import GoneError, NotReadyError
+from spiked_service.api.problems import GoneError, NoPoseError, NotReadyError
 from spiked_service.api.schemas.reconstructions import TrajectoryOut
 from spiked_service.api.schemas.views import MAX_PIXELS, CameraModel, PathModel, ViewRequest
 from spiked_service.images import ImageFormat, encode
@@ -87,11 +87,11 @@ class Range:
     step: int
 
     def of(self, trajectory: Trajectory) -> Trajectory:
-        """from_s <= time < to_s, every step-th pose. Raises GoneError if nothing is left."""
+        """from_s <= time < to_s, every step-th pose. Raises NoPoseError if nothing is left."""
         begin = -np.inf if self.from_s is None else self.from_s
         part = trajectory.between(begin, np.inf if self.to_s is None else self.to_s)
         if len(part) == 0 and len(trajectory):
-            raise NotReadyError(
+            raise NoPoseError(
                 f"no pose lies in this range; there are poses from {trajectory.times_s[0]:.6f} "
                 f"to {trajectory.times_s[-1]:.6f} s"
             )
@@ -99,7 +99,7 @@ class Range:
 
 
 def trajectory_response(request: Request, result: Result, kind: TrajectoryFormat, part: Range) -> Response:
-    """The trajectory in one of the formats. Raises NotReadyError, SceneError, ConfigurationError."""
+    """The trajectory in one of the formats. Raises NotReadyError, NoPoseError, SceneError, ConfigurationError."""
     path = result.folder / result.published.trajectory
     stamp = files.stamp(path)
     tag = files.etag(result.published.version, kind, stamp, part.from_s, part.to_s, part.step)
@@ -184,7 +184,10 @@ def _encoded(result: Result, kind: SceneFormat, max_splats: int | None) -> bytes
 
 
 def views_response(result: Result, request: ViewRequest, kind: ImageFormat, renderer: ViewRenderer) -> Response:
-    """One picture, or a ZIP of several. Raises NotReadyError, ConfigurationError, SceneError, OverloadedError."""
+    """One picture, or a ZIP of several.
+
+    Raises NotReadyError, NoPoseError, ConfigurationError, SceneError, OverloadedError.
+    """
     camera = _camera(result.sensor, request)
     poses = _poses(result, request)
     if len(poses) * camera.width * camera.height > MAX_PIXELS:
@@ -260,7 +263,7 @@ def _pose(trajectory: Trajectory, sensor: Sensor | None, camera: CameraModel) ->
     row = int(trajectory.nearest(np.array([(camera.frame + 0.5) / rate]), 0.51 / rate)[0])
     if row < 0:
         first, last = (round(float(t) * rate - 0.5) for t in trajectory.times_s[[0, -1]])
-        raise NotReadyError(f"frame {camera.frame} has no pose in this version; it has poses from {first} to {last}")
+        raise NoPoseError(f"frame {camera.frame} has no pose in this version; it has poses from {first} to {last}")
     return Pose(trajectory.rotations[row], trajectory.centres[row])
 
 

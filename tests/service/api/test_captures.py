@@ -233,7 +233,23 @@ def test_every_refusal_says_what_to_do(service: Any) -> None:
         assert body["what_to_do"] and body["detail"] and body["type"].startswith("urn:spiked:problem:")
     malformed = service.http.post("captures", content=b"{", headers={"Content-Type": "application/json"})
     assert malformed.status_code == 422
+    assert malformed.json()["detail"].startswith("the body is not JSON: ")
     assert "HTTPValidationError" not in httpx.get(f"{service.daemon.address}openapi.json").text
+
+
+def test_usual_mistakes_are_told_in_words(service: Any) -> None:
+    def detail(**body: Any) -> str:
+        answer = service.http.post("captures", **body)
+        assert answer.status_code == 422
+        return str(answer.json()["detail"])
+
+    assert detail(json={"source": "sim:", "frame": 5}) == "frame: there is no such field; did you mean frames?"
+    nested = {"source": "sim:", "options": {"stepps": 5, "intrinsics": {"fx": 1, "fy": 1, "cx": 1, "cy": 1, "fxx": 1}}}
+    assert "options.stepps: there is no such field; did you mean steps?" in detail(json=nested)
+    assert "options.intrinsics.fxx: there is no such field; did you mean fx?" in detail(json=nested)
+    assert detail(json={"source": "sim:", "qqqqqq": 5}) == "qqqqqq: there is no such field"
+    form = {"Content-Type": "application/x-www-form-urlencoded"}  # what curl says of any body
+    assert "x-www-form-urlencoded, not as JSON: add" in detail(content=b'{"source": "sim:"}', headers=form)
 
 
 def test_devices_say_what_they_do(service: Any) -> None:
@@ -245,8 +261,14 @@ def test_devices_say_what_they_do(service: Any) -> None:
 
 def test_a_capture_can_begin_before_it_was_asked_for(service: Any) -> None:
     assert service.http.post("devices/sim::arm", json={"pretrigger_s": 0.02}).status_code == 202
-    assert service.http.get("devices/sim:").json()["state"] == "armed"
+    deadline = time.monotonic() + 60
+    while (device := service.http.get("devices/sim:").json())["state"] != "armed":  # until then captures are refused
+        assert device["state"] == "idle" and device["reason"].startswith("being armed"), device
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
     assert service.http.post("devices/sim::arm", json={"pretrigger_s": 0.02}).status_code == 409
+    refused = service.http.post("captures", json={"device": "sim:", "pretrigger_s": 0.5})
+    assert refused.status_code == 422 and "keeps 0.02 s, not 0.5" in refused.json()["detail"]
     assert service.http.post("devices/sim::disarm").status_code == 202
     assert service.http.get("devices/sim:").json()["state"] == "idle"
 

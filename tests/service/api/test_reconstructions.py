@@ -207,6 +207,8 @@ def test_a_recording_is_reconstructed_again_with_other_options(service: Any, don
     over = client.wait_for_reconstruction(started.id, 120)
     assert over.state == "complete", over.reason
     assert over.frames == done.recording.frames
+    assert over.progress == 1
+    assert (over.tracking_state == "track") == (over.reason == ""), "one that ends in doubt says why"
     assert started.id in [one.id for one in client.reconstructions(capture_id=done.id)]
     with pytest.raises(ApiError):
         client.start_reconstruction("01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10")
@@ -224,7 +226,11 @@ def test_cancel_and_restart(service: Any, done: CaptureOut) -> None:
         assert time.monotonic() < deadline
         time.sleep(0.05)
     client.cancel_reconstruction(started.id)
-    assert client.wait_for_reconstruction(started.id, 60).state == "cancelled"
+    cancelled = client.wait_for_reconstruction(started.id, 60)
+    assert (cancelled.state, cancelled.reason) == ("cancelled", "")
+    nothing = service.http.get(f"reconstructions/{started.id}/trajectory", params={"version": cancelled.version + 1})
+    assert nothing.json()["type"].endswith(":nothing-there"), "who waits for it waits for ever"
+    assert "is cancelled and has" in nothing.json()["detail"]
     client.restart_reconstruction(started.id, ReconstructionOptions(steps=5))
     assert client.wait_for_reconstruction(started.id, 120).state == "complete"
     client.remove_reconstruction(started.id)

@@ -36,6 +36,8 @@ export interface paths {
         /**
          * Arm Device
          * @description Let it run without recording, so that a capture can begin up to `pretrigger_s` before it is asked for.
+         *
+         *     This takes a moment; captures are taken from when its state is armed.
          */
         post: operations["arm_device_api_v1_devices__device_id__arm_post"];
         delete?: never;

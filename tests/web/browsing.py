@@ -58,9 +58,9 @@ class Studied:
         return found
 
 
-def picture(page: Any) -> Picture:
-    """What the canvas shows, [H, W, 3], 0 to 1."""
-    url = page.evaluate("() => document.querySelector('.stage canvas').toDataURL('image/png')")
+def picture(page: Any, canvas: str = ".stage canvas") -> Picture:
+    """What a canvas shows, [H, W, 3], 0 to 1."""
+    url = page.evaluate("canvas => document.querySelector(canvas).toDataURL('image/png')", canvas)
     return decoded(base64.b64decode(url.split(",")[1]))
 
 

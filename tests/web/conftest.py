@@ -109,6 +109,13 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def studied(daemon_class: Any, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studied]:
     """A replayed recording, reconstructed, in a daemon that waits for more."""
     with running(daemon_class, room.parent / "daemon", "--device", "sim:") as daemon:
+        for before in (
+            {"source": f"replay:{room}?gap=700:40:usb", "name": "desk, loose cable"},
+            {"source": "sim:?width=160&height=100&seed=5", "frames": 2000, "name": "hall, first try"},
+        ):
+            answer = daemon.http.post("captures", json={**before, "reconstruct": False})
+            assert answer.status_code == 201, answer.text
+            finished(daemon.http, answer.json()["id"])
         plan = {"source": f"replay:{room}", "name": "desk, by hand", "options": {"steps": STEPS}}
         answer = daemon.http.post("captures", json=plan)
         assert answer.status_code == 201, answer.text

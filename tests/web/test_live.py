@@ -63,9 +63,26 @@ def test_a_capture_without_end_is_stopped(daemon: Callable[..., Any], visit: Cal
         row = page.locator("table.consumers tbody tr").filter(has_text=consumer)
         assert row.get_by_role("meter", name=f"Ring fill of {consumer}").count() == 1
         assert re.search(r"\d\s*m?s\b", row.inner_text()), "its lag"
+    rate = page.locator("dl.stats div:has(dt:text-is('Rate')) dd").first
+    until(lambda: re.search(r"\d\s*k?Hz$", rate.inner_text()), "the rate of frames")
     until(lambda: re.search(r"GB free, .+ of recording", page.locator(".disk").inner_text()), "disk space left")
     page.get_by_role("button", name="Stop").click()
     page.locator("[data-grade]").wait_for()
+
+
+def test_what_is_not_recorded_is_only_watched(daemon: Callable[..., Any], visit: Callable[..., Any]) -> None:
+    one = daemon("--device", "sim:?width=160&height=100", "--no-capture")
+    page = visit(one.address)
+    page.get_by_label("Length", exact=True).select_option("seconds")
+    page.get_by_label("Length in seconds").fill("0.01")
+    page.get_by_role("checkbox", name="Record").uncheck()
+    page.get_by_role("checkbox", name="Reconstruct").uncheck()
+    page.get_by_role("button", name="Start").click()
+    until(lambda: received(page) == 200, "all frames have come")
+    capture = finished(one.http, one.http.get("captures").json()["items"][0]["id"])
+    assert (capture["state"], capture["recording"]) == ("complete", None)
+    page.reload()
+    page.get_by_text("It was not recorded").wait_for()
 
 
 def test_what_is_refused_is_said(daemon: Callable[..., Any], visit: Callable[..., Any]) -> None:

@@ -6,13 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
-from browsing import PHONE, Studied, address, choose, decoded, picture, psnr_db, shown_version, still, until
+from browsing import PHONE, Studied, address, choose, decoded, keep, picture, psnr_db, shown_version, still, until
 
 from spiked.scene import Scene
 
 MANY = 500_000
+STATES = ("boot", "track", "degraded", "lost", "reloc")
 
 
 def open_scene(visit: Callable[..., Any], address: str, **more: Any) -> Any:
@@ -98,6 +100,60 @@ def test_each_layer_is_drawn_and_the_frustum_moves(studied: Studied, visit: Call
     before = still(page)
     page.get_by_label("Frame", exact=True).fill("900")
     until(changed, "the frustum is elsewhere")
+
+
+@pytest.mark.slow
+def test_states_are_told_without_colours(studied: Studied, visit: Callable[..., Any], pictures_folder: Path) -> None:
+    """By dashes and widths, on the path and on the band over time, and in words."""
+    trajectory = studied.http.get(f"reconstructions/{studied.reconstruction_id}/trajectory?format=json").json()
+    path = np.float64(trajectory["positions"]) * [1, -1, -1]  # as three.js has its axes
+    middle, size = (path.max(0) + path.min(0)) / 2, float(np.ptp(path, axis=0).max())
+    camera = ",".join(f"{x:.5f}" for x in [*(middle + np.float64([0.3, 0.3, 1.1]) * size), *middle, 55])
+    page = visit("about:blank")
+    stretches: list[str] = []
+
+    def retold(route: Any) -> None:
+        answer = route.fetch()
+        told = answer.json()
+        rows = len(told["states"])
+        told["states"] = [stretches[len(stretches) * row // rows] for row in range(rows)]
+        route.fulfill(response=answer, json=told)
+
+    page.route(re.compile(r"/trajectory\?"), retold)
+
+    def pieces(*states: str) -> int:
+        """How many the path on the canvas falls into, in shades of grey."""
+        stretches[:] = states
+        page.goto(f"{studied.address}?page=scene&frame=500&camera={camera}")
+        until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+        for layer in ("Splats", "Frustum", "Grid", "Axes"):
+            page.get_by_role("checkbox", name=layer).uncheck()
+        until(lambda: picture(page).mean(axis=2).max() > 0.3, "the path is drawn")
+        lit: int = cv2.connectedComponents((still(page).mean(axis=2) > 0.2).astype(np.uint8))[0] - 1
+        return lit
+
+    whole = pieces("track")
+    assert pieces("boot") > 3 * whole
+    pieces(*STATES)
+    page.get_by_role("checkbox", name="Splats").check()
+    still(page)
+    keep(page, pictures_folder / "scene-states.webp")
+    lit = picture(page, ".track canvas").max(axis=2) > 0.3
+    signs = {}
+    for state, part in zip(STATES, np.array_split(lit, len(STATES), axis=1), strict=True):
+        inner = part[:, 8:-8]
+        signs[state] = (int(inner.any(1).sum()), float(inner.any(0).mean()))
+    for one, (height_px, share) in signs.items():
+        alike = [name for name, sign in signs.items() if abs(sign[0] - height_px) < 1 and abs(sign[1] - share) < 0.15]
+        assert alike == [one], signs
+    slider = page.get_by_label("Frame", exact=True)
+    most = int(slider.get_attribute("max"))
+    for i, state in enumerate(STATES):
+        slider.fill(str(round(most * (i + 0.5) / len(STATES))))
+        page.locator(".scrubber output").filter(has_text=state).wait_for()
+        assert (slider.get_attribute("aria-valuetext") or "").endswith(state)
+    page.locator(".track canvas").hover()
+    assert (page.locator(".track").get_attribute("title") or "").startswith("degraded: ")
 
 
 @pytest.mark.slow

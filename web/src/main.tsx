@@ -1,3 +1,4 @@
+import "./styles/palette.css";
 import "./styles/base.css";
 import "./styles/parts.css";
 import "./styles/live.css";

@@ -107,7 +107,7 @@ function Gaps({ timeline: told, rateHz }: { timeline: Timeline; rateHz: number |
       <caption className="hidden">Gaps</caption>
       <thead>
         <tr>
-          <th scope="col">Gap at</th>
+          <th scope="col">Gap at (shaded in the plots)</th>
           <th scope="col" className="number">
             Frames missing
           </th>

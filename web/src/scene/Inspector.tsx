@@ -9,7 +9,8 @@ import { toast } from "../state/toasts";
 import { Icon } from "../ui/icons";
 import { JobBadge, Meter, Segmented, Stat, trackingHint } from "../ui/parts";
 import { type Bookmark, readBookmarks, writeBookmarks } from "./bookmarks";
-import { type Colouring, SPEED_COLOURS, STATE_COLOURS, STATES } from "./path";
+import type { Colouring } from "./path";
+import { MOST_WIDTH_PX, type Sign, SPEED_SIGNS, STATE_SIGNS, STATES } from "./signs";
 import type { Shown } from "./useScene";
 import type { Layers, Steering } from "./Viewer";
 
@@ -114,30 +115,56 @@ export function Inspector(props: InspectorProps): JSX.Element {
   );
 }
 
+/** What the path is drawn with; the band over time always shows the states. */
 function Legend({ colouring }: { colouring: Colouring }): JSX.Element {
-  if (colouring === "speed")
-    return (
-      <div className="legend speed">
-        <span>slow</span>
-        <svg viewBox="0 0 60 6" preserveAspectRatio="none" aria-hidden="true">
-          {SPEED_COLOURS.map((fill, i) => (
-            <rect key={fill} x={10 * i} width={10.2} height={6} fill={fill} />
-          ))}
-        </svg>
-        <span>fast</span>
-      </div>
-    );
   return (
-    <ul className="legend">
-      {STATES.map((state) => (
-        <li key={state} title={trackingHint[state]}>
-          <svg viewBox="0 0 14 6" aria-hidden="true">
-            <rect width="14" height="4" y="1" rx="2" fill={STATE_COLOURS[state]} />
+    <>
+      {colouring === "speed" && (
+        <div className="legend speed" title="Each of the widths and colours is a fifth of the highest speed">
+          <span>slow</span>
+          {SPEED_SIGNS.map((sign) => (
+            <Swatch key={sign.name} sign={sign} />
+          ))}
+          <span>fast</span>
+        </div>
+      )}
+      <ul className="legend" aria-label="States of the tracking">
+        {STATES.map((state) => (
+          <li key={state} title={trackingHint[state]}>
+            <Swatch sign={STATE_SIGNS[state]} />
+            {state}
+          </li>
+        ))}
+        <li title="Frames that are missing, in the band over time">
+          <svg className="swatch missing" viewBox={`0 0 ${SWATCH_PX} ${MOST_WIDTH_PX + 4}`} aria-hidden="true">
+            <rect className="glass" y={2} width={SWATCH_PX} height={MOST_WIDTH_PX} />
+            <rect className="ears" x={SWATCH_PX / 2 - 3} width={5} height={MOST_WIDTH_PX + 4} />
+            <rect className="cut" x={SWATCH_PX / 2 - 3} y={2} width={5} height={MOST_WIDTH_PX} />
           </svg>
-          {state}
+          missing
         </li>
-      ))}
-    </ul>
+      </ul>
+    </>
+  );
+}
+
+const SWATCH_PX = 32;
+
+function Swatch({ sign }: { sign: Sign }): JSX.Element {
+  const middle = MOST_WIDTH_PX / 2 + 2;
+  return (
+    <svg className="swatch" viewBox={`0 0 ${SWATCH_PX} ${2 * middle}`} aria-hidden="true">
+      <rect className="glass" y={1} width={SWATCH_PX} height={2 * middle - 2} rx={2} />
+      <line
+        x1={0}
+        x2={SWATCH_PX}
+        y1={middle}
+        y2={middle}
+        stroke={`var(--${sign.colour})`}
+        strokeWidth={sign.width_px}
+        strokeDasharray={sign.dash_px?.join(" ")}
+      />
+    </svg>
   );
 }
 

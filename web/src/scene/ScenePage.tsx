@@ -16,7 +16,7 @@ import {
   useService,
   wordsOf,
 } from "../state/store";
-import { colour, useDark } from "../state/theme";
+import { useDark } from "../state/theme";
 import { toast } from "../state/toasts";
 import { Empty, Loading, trackingHint, Trouble } from "../ui/parts";
 import { Inspector } from "./Inspector";
@@ -136,7 +136,7 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   useEffect(() => viewer?.setLayers(layers), [viewer, layers]);
   useEffect(() => viewer?.steer(steering), [viewer, steering]);
   useEffect(() => viewer?.setRiding(at.ride), [viewer, at.ride]);
-  useEffect(() => viewer?.setColours(colour("viewport"), colour("line"), colour("accent")), [viewer, dark]);
+  useEffect(() => viewer?.recolour(), [viewer, dark]);
   const linked = at.camera;
   useEffect(() => {
     // Only what came from a link or the history: what the viewer itself has put there is where it is already.

@@ -6,9 +6,11 @@ import { timeline as askTimeline } from "../api/calls";
 import { count, duration } from "../state/format";
 import { adjust, route } from "../state/route";
 import { useAsked } from "../state/useAsked";
-import { colour, useDark } from "../state/theme";
+import { useDark } from "../state/theme";
 import { Icon } from "../ui/icons";
-import { type Path, STATE_COLOURS } from "./path";
+import { trackingHint } from "../ui/parts";
+import { type Path, rowAt, stateAt } from "./path";
+import { type Missing, paint } from "./band";
 
 /** A capture is played in so many seconds, however short it was. */
 const PLAYED_S = 10;
@@ -37,6 +39,7 @@ export function Scrubber({
   const dark = useDark();
   const told = useAsked(version === 0 ? null : `${jobId} ${version}`, () => askTimeline(jobId));
   const gaps = told.value?.gaps;
+  const state = path === null || row < 0 ? null : stateAt(path, row);
 
   useEffect(() => {
     if (!playing || last <= first) return;
@@ -57,8 +60,8 @@ export function Scrubber({
 
   useEffect(() => {
     const canvas = strip.current;
-    if (canvas !== null && path !== null) paint(canvas, path, first, last, gaps ?? []);
-  }, [path, first, last, gaps, dark]);
+    if (canvas !== null && path !== null) paint(canvas, path, gaps ?? []);
+  }, [path, gaps, dark]);
 
   const time = frameRateHz === null ? null : frame / frameRateHz;
   const slowed = frameRateHz === null || last <= first ? null : (PLAYED_S * frameRateHz) / (last - first);
@@ -73,12 +76,19 @@ export function Scrubber({
       >
         <Icon name={playing ? "pause" : "start"} />
       </button>
-      <div className="track">
+      <div
+        className="track"
+        onPointerMove={(event) => {
+          const box = event.currentTarget.getBoundingClientRect();
+          const at = first + ((event.clientX - box.left) / Math.max(box.width, 1)) * (last - first);
+          if (path !== null) event.currentTarget.title = inWords(path, gaps ?? [], at);
+        }}
+      >
         <canvas ref={strip} aria-hidden="true" />
         <input
           type="range"
           aria-label="Frame"
-          aria-valuetext={`frame ${frame}${time === null ? "" : `, ${duration(time)}`}`}
+          aria-valuetext={[`frame ${frame}`, time === null ? null : duration(time), state].filter(Boolean).join(", ")}
           min={first}
           max={Math.max(last, first + 1)}
           step={1}
@@ -91,7 +101,11 @@ export function Scrubber({
         />
       </div>
       <output>
-        {time === null ? "–" : duration(time)} <span className="dim">frame {count(frame)}</span>
+        {time === null ? "–" : duration(time)}{" "}
+        <span className="dim">
+          frame {count(frame)}
+          {state !== null && ` · ${state}`}
+        </span>
       </output>
       <button
         type="button"
@@ -107,34 +121,12 @@ export function Scrubber({
   );
 }
 
-/** How the tracking went: a band in the colours of the states, cut where frames are missing. */
-function paint(
-  canvas: HTMLCanvasElement,
-  path: Path,
-  first: number,
-  last: number,
-  gaps: readonly { first: number; count: number }[],
-): void {
-  const ratio = window.devicePixelRatio;
-  const width = Math.max(1, Math.round(canvas.clientWidth * ratio));
-  const height = Math.max(1, Math.round(canvas.clientHeight * ratio));
-  canvas.width = width;
-  canvas.height = height;
-  const pen = canvas.getContext("2d");
-  if (pen === null || last <= first) return;
-  const place = (frame: number): number => ((frame - first) / (last - first)) * width;
-  const n = path.frames.length;
-  for (let i = 0; i < n;) {
-    const state = path.states[i] ?? "track";
-    let end = i + 1;
-    while (end < n && (path.states[end] ?? "track") === state) end += 1;
-    const from = place(path.frames[i] ?? 0);
-    const to = place(path.frames[Math.min(end, n - 1)] ?? 0);
-    pen.fillStyle = STATE_COLOURS[state];
-    pen.fillRect(from, 0, Math.max(to - from, 1), height);
-    i = end;
-  }
-  pen.fillStyle = colour("paper");
-  for (const gap of gaps)
-    pen.fillRect(place(gap.first), 0, Math.max((gap.count / (last - first)) * width, ratio), height);
+/** What the band shows at a frame. */
+function inWords(path: Path, gaps: readonly Missing[], frame: number): string {
+  const gap = gaps.find((one) => frame >= one.first && frame < one.first + one.count);
+  if (gap !== undefined) return `${count(gap.count)} frames are missing, lost by: ${gap.cause}`;
+  const row = rowAt(path, frame);
+  if (row < 0) return "";
+  const state = stateAt(path, row);
+  return `${state}: ${trackingHint[state]}`;
 }

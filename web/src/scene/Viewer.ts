@@ -14,16 +14,16 @@ import {
 } from "three";
 import { FlyControls } from "three/addons/controls/FlyControls.js";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
-import { Line2 } from "three/addons/lines/Line2.js";
-import { LineGeometry } from "three/addons/lines/LineGeometry.js";
 import { LineMaterial } from "three/addons/lines/LineMaterial.js";
 import { LineSegments2 } from "three/addons/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "three/addons/lines/LineSegmentsGeometry.js";
 
 import type { Sensor } from "../api/types";
+import { colour } from "../state/theme";
 import { type Placement, placementOf, pointOf, projectionOf } from "./axes";
 import { axisNames } from "./axisNames";
-import { type Colouring, colours, type Path, quantile, thinned } from "./path";
+import { type Colouring, type Path, quantile } from "./path";
+import { OVERLAY_ORDER, PathLines } from "./PathLines";
 
 export type Steering = "orbit" | "fly";
 
@@ -35,11 +35,8 @@ export interface Layers {
   axes: boolean;
 }
 
-const PATH_PX = 3;
 const FRUSTUM_PX = 1.6;
-const MOST_PATH_POINTS = 20_000;
 const SAMPLE = 20_000;
-const PATH_ORDER = 10;
 
 /** Blur of the service's own renderer, px^2 added to the projected covariance, so that both show the same picture. */
 const DILATION_PX2 = 0.3;
@@ -72,10 +69,10 @@ export class Viewer {
   private fly: FlyControls | null = null;
   private steering: Steering = "orbit";
   private mesh: SplatMesh | null = null;
-  private readonly line = new Line2(new LineGeometry(), new LineMaterial({ linewidth: PATH_PX, vertexColors: true }));
+  private readonly path = new PathLines();
   private readonly frustum = new LineSegments2(new LineSegmentsGeometry(), new LineMaterial({ linewidth: FRUSTUM_PX }));
   private grid = new GridHelper(1, 1);
-  private gridColour = "#808080";
+  private gridColour = new Color();
   private readonly axes = new AxesHelper(1);
   private layers: Layers = { splats: true, path: true, frustum: true, grid: true, axes: true };
   private extent: Extent | null = null;
@@ -105,16 +102,16 @@ export class Viewer {
       enableLod: false,
     });
     this.turned.quaternion.set(1, 0, 0, 0);
-    this.world.add(this.spark, this.turned, this.line, this.frustum, this.axes);
-    for (const overlay of [this.line, this.frustum]) {
-      overlay.renderOrder = PATH_ORDER;
-      overlay.frustumCulled = false;
-      overlay.material.depthTest = false;
-      overlay.material.transparent = true;
-      overlay.visible = false;
-    }
+    this.world.add(this.spark, this.turned, this.path, this.frustum, this.axes);
+    this.frustum.renderOrder = OVERLAY_ORDER;
+    this.frustum.frustumCulled = false;
+    this.frustum.material.depthTest = false;
+    this.frustum.material.transparent = true;
+    this.frustum.visible = false;
+    this.path.visible = false;
     // Of the capture's world, OpenCV's: y points down and z ahead.
     this.axes.scale.set(1, -1, -1);
+    this.axes.setColors(new Color(colour("axis-x")), new Color(colour("axis-y")), new Color(colour("axis-z")));
     const names = axisNames();
     names.scale.set(1, -1, -1);
     this.axes.add(names);
@@ -143,6 +140,7 @@ export class Viewer {
     this.canvas.removeEventListener("focus", this.flyWhileFocused);
     this.canvas.removeEventListener("blur", this.flyWhileFocused);
     this.mesh?.dispose();
+    this.path.clear();
     this.canvas.removeEventListener("webglcontextlost", this.onLost);
     this.canvas.removeEventListener("webglcontextrestored", this.draw);
     this.renderer.dispose();
@@ -166,6 +164,7 @@ export class Viewer {
       if (this.camera.matrix.elements.some((value, i) => value !== before[i])) this.onMoved();
       this.draw(); // keys are held between events
     }
+    this.path.dashFor(this.camera, this.canvas.clientHeight);
     this.renderer.render(this.world, this.riding ? this.rider : this.camera);
   };
 
@@ -175,15 +174,14 @@ export class Viewer {
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
-    for (const overlay of [this.line, this.frustum]) overlay.material.resolution.set(width, height);
     this.draw();
   }
 
-  /** Background, grid and frustum in the colours of the theme. */
-  setColours(background: string, lines: string, frustum: string): void {
-    this.renderer.setClearColor(new Color(background), 1);
-    this.frustum.material.color.set(frustum);
-    this.gridColour = lines;
+  /** Take background, grid and frustum in the colours of the theme as it is now. */
+  recolour(): void {
+    this.renderer.setClearColor(new Color(colour("viewport")), 1);
+    this.frustum.material.color.set(colour("accent"));
+    this.gridColour.set(colour("line"));
     this.buildGrid();
     this.draw();
   }
@@ -196,7 +194,7 @@ export class Viewer {
   private show(): void {
     const { layers } = this;
     if (this.mesh !== null) this.mesh.visible = layers.splats;
-    this.line.visible = layers.path && !this.riding && this.line.geometry.instanceCount > 0;
+    this.path.visible = layers.path && !this.riding;
     // Before there is a scene nothing tells how large a frustum would be of use.
     const placed = this.extent !== null && this.placement !== null && this.sensor !== null;
     this.frustum.visible = layers.frustum && !this.riding && placed;
@@ -248,7 +246,7 @@ export class Viewer {
     this.extent = null;
     this.placed = false;
     this.placement = null;
-    this.line.geometry.instanceCount = 0;
+    this.path.clear();
     this.show();
   }
 
@@ -290,26 +288,7 @@ export class Viewer {
   }
 
   setPath(path: Path, by: Colouring): void {
-    const rows = thinned(path.times.length, MOST_PATH_POINTS);
-    if (rows.length >= 2) {
-      const tinted = colours(path, by);
-      const points = new Float32Array(3 * rows.length);
-      const tints = new Float32Array(3 * rows.length);
-      const tint = new Color();
-      rows.forEach((row, i) => {
-        points[3 * i] = path.positions[3 * row] ?? 0;
-        points[3 * i + 1] = -(path.positions[3 * row + 1] ?? 0);
-        points[3 * i + 2] = -(path.positions[3 * row + 2] ?? 0);
-        tint.setRGB(tinted[3 * row] ?? 0, tinted[3 * row + 1] ?? 0, tinted[3 * row + 2] ?? 0, "srgb");
-        tints.set([tint.r, tint.g, tint.b], 3 * i);
-      });
-      this.line.geometry.dispose();
-      this.line.geometry = new LineGeometry();
-      this.line.geometry.setPositions(points);
-      this.line.geometry.setColors(tints);
-    } else {
-      this.line.geometry.instanceCount = 0;
-    }
+    this.path.set(path, by);
     this.show();
   }
 

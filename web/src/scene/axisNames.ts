@@ -2,19 +2,21 @@
 
 import { CanvasTexture, Group, Sprite, SpriteMaterial } from "three";
 
+import { colour } from "../state/theme";
+
 const SIDE_PX = 64;
 const SIZE = 0.22;
 
-/** x, y and z of the OpenCV world at the ends of axes of length 1, in three.js' axes. */
+/** The ends of axes of length 1 of the OpenCV world, in three.js' axes. */
 const ENDS = [
-  { name: "x", at: [1.12, 0, 0], colour: "#ff7a6b" },
-  { name: "y", at: [0, -1.12, 0], colour: "#7fd65c" },
-  { name: "z", at: [0, 0, -1.12], colour: "#6aa9ff" },
+  { name: "x", at: [1.12, 0, 0] },
+  { name: "y", at: [0, -1.12, 0] },
+  { name: "z", at: [0, 0, -1.12] },
 ] as const;
 
 export function axisNames(): Group {
   const group = new Group();
-  for (const { name, at, colour } of ENDS) {
+  for (const { name, at } of ENDS) {
     const canvas = document.createElement("canvas");
     canvas.width = canvas.height = SIDE_PX;
     const pen = canvas.getContext("2d");
@@ -23,9 +25,9 @@ export function axisNames(): Group {
     pen.textAlign = "center";
     pen.textBaseline = "middle";
     pen.lineWidth = 6;
-    pen.strokeStyle = "#05070a";
+    pen.strokeStyle = colour("glass");
     pen.strokeText(name, SIDE_PX / 2, SIDE_PX / 2);
-    pen.fillStyle = colour;
+    pen.fillStyle = colour(`axis-${name}`);
     pen.fillText(name, SIDE_PX / 2, SIDE_PX / 2);
     const sprite = new Sprite(new SpriteMaterial({ map: new CanvasTexture(canvas), depthTest: false }));
     sprite.position.fromArray(at);

@@ -1,22 +1,12 @@
 /** The path of the camera over time: where it was, how it tracked, how fast it went. */
 
 import type { Pose, TrackingState, Trajectory } from "../api/types";
+import { type Sign, SPEED_SIGNS, STATE_SIGNS, STATES } from "./signs";
 
 export type Colouring = "state" | "speed";
 
-/** Okabe and Ito's palette, told apart by people with any common colour blindness; the legend names each. */
-export const STATE_COLOURS: Record<TrackingState, string> = {
-  boot: "#56b4e9",
-  track: "#009e73",
-  degraded: "#e69f00",
-  lost: "#d55e00",
-  reloc: "#cc79a7",
-};
-export const STATES = Object.keys(STATE_COLOURS) as TrackingState[];
-
-/** From slow to fast, as in the colour map cividis, which reads the same without red or green. */
-export const SPEED_COLOURS = ["#00224e", "#35456c", "#666970", "#948e77", "#c8b866", "#fee838"] as const;
-const SPEED_RGB = SPEED_COLOURS.map(rgbOf);
+/** Poses whose state nobody has noted were tracked. */
+const USUAL: TrackingState = "track";
 
 export interface Path {
   frames: Float64Array;
@@ -73,29 +63,30 @@ export function speeds(path: Path, reach = 4): Float32Array {
   return result;
 }
 
-function rgbOf(hex: string): [number, number, number] {
-  const n = Number.parseInt(hex.slice(1), 16);
-  return [(n >> 16) / 255, ((n >> 8) & 255) / 255, (n & 255) / 255];
-}
+export const stateAt = (path: Path, row: number): TrackingState => path.states[row] ?? USUAL;
 
-/** [3 n] colours of the poses, sRGB, 0 to 1. */
-export function colours(path: Path, by: Colouring): Float32Array {
-  const n = path.times.length;
-  const result = new Float32Array(3 * n);
-  if (by === "state") {
-    for (let i = 0; i < n; i += 1) result.set(rgbOf(STATE_COLOURS[path.states[i] ?? "track"]), 3 * i);
-    return result;
-  }
-  const speed = speeds(path);
-  const fastest = Math.max(1e-12, quantile(speed, 0.98));
-  for (let i = 0; i < n; i += 1) {
-    const at = Math.min((speed[i] ?? 0) / fastest, 1) * (SPEED_RGB.length - 1);
-    const below = Math.min(Math.floor(at), SPEED_RGB.length - 2);
-    const a = SPEED_RGB[below] ?? [0, 0, 0];
-    const b = SPEED_RGB[below + 1] ?? a;
-    for (let k = 0; k < 3; k += 1) result[3 * i + k] = (a[k] ?? 0) + (at - below) * ((b[k] ?? 0) - (a[k] ?? 0));
+/** Rows that follow each other in one state: `[first, end)`. */
+export function runs(path: Path): { state: TrackingState; first: number; end: number }[] {
+  const result: { state: TrackingState; first: number; end: number }[] = [];
+  for (let row = 0; row < path.states.length; row += 1) {
+    const state = stateAt(path, row);
+    const before = result.at(-1);
+    if (before?.state === state) before.end = row + 1;
+    else result.push({ state, first: row, end: row + 1 });
   }
   return result;
+}
+
+export const signsBy = (by: Colouring): readonly Sign[] =>
+  by === "state" ? STATES.map((state) => STATE_SIGNS[state]) : SPEED_SIGNS;
+
+/** [n] which of `signsBy` each pose has; the fastest class begins at four fifths of what the fastest 2 % exceed. */
+export function classes(path: Path, by: Colouring): Uint8Array {
+  if (by === "state") return Uint8Array.from(path.states, (_, row) => STATES.indexOf(stateAt(path, row)));
+  const speed = speeds(path);
+  const fastest = Math.max(1e-12, quantile(speed, 0.98));
+  const most = SPEED_SIGNS.length;
+  return Uint8Array.from(speed, (v) => Math.min(Math.floor((v / fastest) * most), most - 1));
 }
 
 export function quantile(values: Float32Array, share: number): number {

@@ -3,7 +3,8 @@ import { expect, it } from "vitest";
 
 import type { Trajectory } from "../api/types";
 import { placementOf, projectionOf } from "./axes";
-import { colours, pathOf, rowAt, speeds, STATE_COLOURS, thinned } from "./path";
+import { classes, pathOf, rowAt, runs, signsBy, speeds, thinned } from "./path";
+import { SPEED_SIGNS, STATE_SIGNS, STATES } from "./signs";
 import { readBookmarks, writeBookmarks } from "./bookmarks";
 
 const straight = (n: number): Trajectory => ({
@@ -62,20 +63,36 @@ it("goes on with live poses where the published path ends", () => {
   expect([...path.frames.slice(-3)]).toEqual([796, 804, 812]);
 });
 
-it("measures speed and colours by state", () => {
+it("measures speed and draws by state", () => {
   const path = pathOf(straight(50));
   for (const speed of speeds(path)) expect(speed).toBeCloseTo(0.01 / (8 / 20_000), 2);
-  const tinted = colours(path, "state");
-  const hex = (i: number): string =>
-    `#${[...tinted.slice(3 * i, 3 * i + 3)]
-      .map((x) =>
-        Math.round(255 * x)
-          .toString(16)
-          .padStart(2, "0"),
-      )
-      .join("")}`;
-  expect(hex(0)).toBe(STATE_COLOURS.boot);
-  expect(hex(49)).toBe(STATE_COLOURS.track);
+  const drawn = [...classes(path, "state")].map((which) => signsBy("state")[which]?.name);
+  expect(drawn.slice(0, 3)).toEqual(["boot", "boot", "track"]);
+  expect(drawn.at(-1)).toBe("track");
+  expect(runs(path)).toEqual([
+    { state: "boot", first: 0, end: 2 },
+    { state: "track", first: 2, end: 50 },
+  ]);
+});
+
+it("draws what is faster by a later class", () => {
+  const slower = straight(200);
+  slower.positions = slower.times_s.map((_, i) => [0.00005 * i * i, 0, 0]);
+  const drawn = [...classes(pathOf(slower), "speed")];
+  expect(drawn).toEqual([...drawn].sort((a, b) => a - b));
+  expect(new Set(drawn).size).toBe(SPEED_SIGNS.length);
+});
+
+it("tells states and speeds apart without their colours: by dashes or by width", () => {
+  for (const signs of [STATES.map((state) => STATE_SIGNS[state]), SPEED_SIGNS]) {
+    for (const [i, one] of signs.entries()) {
+      for (const other of signs.slice(i + 1)) {
+        const [a, b] = [one, other].map(({ dash_px: dash }) => (dash === null ? 1 : dash[0] / (dash[0] + dash[1])));
+        const apart = Math.abs(one.width_px - other.width_px) >= 1 || Math.abs((a ?? 0) - (b ?? 0)) > 0.15;
+        expect(apart, `${one.name} and ${other.name}`).toBe(true);
+      }
+    }
+  }
 });
 
 it("thins evenly and keeps both ends", () => {

@@ -48,6 +48,12 @@ const subscribe = (listener: () => void): (() => void) => {
 export const useTheme = (): Theme => useSyncExternalStore(subscribe, () => chosen);
 export const useDark = (): boolean => useSyncExternalStore(subscribe, isDark);
 
-/** A colour of the style sheet, for canvases. */
-export const colour = (name: string): string =>
-  getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+/** A colour of the style sheet as it is in this theme, for canvases: the variable itself is of both themes. */
+export function colour(name: string): string {
+  const probe = document.createElement("i");
+  probe.style.color = `var(--${name})`;
+  document.body.append(probe);
+  const resolved = getComputedStyle(probe).color;
+  probe.remove();
+  return resolved;
+}

@@ -15,7 +15,7 @@ export interface Sign {
 export const MOST_WIDTH_PX = 7;
 
 export const STATE_SIGNS: Record<TrackingState, Sign> = {
-  boot: { name: "boot", colour: "state-boot", width_px: 2, dash_px: [2, 4] },
+  boot: { name: "boot", colour: "state-boot", width_px: 2.5, dash_px: [3, 3] },
   track: { name: "track", colour: "state-track", width_px: 3, dash_px: null },
   degraded: { name: "degraded", colour: "state-degraded", width_px: 4.5, dash_px: [11, 4] },
   lost: { name: "lost", colour: "state-lost", width_px: MOST_WIDTH_PX, dash_px: [3, 9] },

@@ -9,7 +9,7 @@ from spiked.errors import SpikedError
 from spiked_service.announcer import Announcer
 from spiked_service.backoff import Backoff
 from spiked_service.child import Child, Spare
-from spiked_service.judging import judged
+from spiked_service.judging import judged, salvaged
 from spiked_service.messages import (
     News,
     PreviewTaken,
@@ -28,7 +28,6 @@ from spiked_service.store.rows import (
     Counters,
     Grade,
     JobState,
-    Judgement,
     ReconstructionRow,
     Recorded,
 )
@@ -274,7 +273,7 @@ class LiveCapture:
             if self._stream is not None and not self._stream.ended:
                 self._stream.stop()
             self._settle()
-        self._reconstructions.recording_closed()
+        self._reconstructions.look_again()
 
     def _follow_recorder(self) -> None:
         with self._lock:
@@ -302,8 +301,10 @@ class LiveCapture:
                 self._set(reason=account.trouble)
 
     def _not_recorded(self, reason: str) -> None:
+        """What was written before stays: its recorder can have died with the ring, behind which nothing can be read."""
         self._fail(reason)
-        self._set(verdict=Judgement(Grade.BAD, (reason,)))
+        recording, verdict = salvaged(self._folder.recording(self.id), reason)
+        self._set(recording=recording, verdict=verdict)
         if self._stream is not None:
             self._stream.bury(Role.RECORDER)
 
@@ -337,6 +338,7 @@ class LiveCapture:
         self._set(state=state, counters=counters, ended_at=datetime.now(UTC))
         self._over.set()
         self._on_change(self)
+        self._reconstructions.look_again()
 
     def _fail(self, reason: str) -> None:
         """The first trouble is the reason that counts."""

@@ -9,20 +9,21 @@ from urllib.parse import urlencode
 
 from spiked_driver import open_source
 
-from spiked.errors import ConfigurationError, RecordingError
-from spiked.recording import recover, sidecar_path
+from spiked.errors import ConfigurationError
+from spiked.recording import sidecar_path
 from spiked.sensor import Sensor
 from spiked_service.announcer import Announcer
 from spiked_service.capture import LiveCapture
 from spiked_service.errors import BusyError
 from spiked_service.ids import new_id
+from spiked_service.judging import salvaged
 from spiked_service.messages import AcquisitionOrder, PreviewTaken
 from spiked_service.reconstructions import Reconstructions
 from spiked_service.snapshot import Snapshot
 from spiked_service.standby import Standby
 from spiked_service.store.catalogue import Catalogue, Page, StoreError
 from spiked_service.store.folder import DataFolder
-from spiked_service.store.rows import CaptureRow, CaptureState, Grade, Judgement, Origin, Plan, Recorded, UploadRow
+from spiked_service.store.rows import CaptureRow, CaptureState, Judgement, Origin, Plan, Recorded, UploadRow
 from spiked_service.stream import Stream
 
 _CLOSE_S = 1.0
@@ -62,7 +63,9 @@ class Captures:
         while self._interrupted:
             row = self._interrupted[0]
             self._announce.log("warning", "the service ended during this capture", row.id)
-            recording, verdict = self._salvaged(row)
+            recording, verdict = None, None
+            if row.plan.record:
+                recording, verdict = salvaged(self._folder.recording(row.id), "the service ended during the capture")
             self._catalogue.captures.set(
                 row.id,
                 state=CaptureState.FAILED,
@@ -378,25 +381,6 @@ class Captures:
             saved = self._catalogue.captures.find(capture.id)
             if saved is not None and saved.state.over:
                 self._live.pop(capture.id, None)
-
-    def _salvaged(self, row: CaptureRow) -> tuple[Recorded | None, Judgement | None]:
-        if not row.plan.record:
-            return None, None
-        path = self._folder.recording(row.id)
-        if not sidecar_path(path).exists():
-            return None, Judgement(Grade.BAD, ("no frame was recorded",))
-        try:
-            found = recover(path, finish=True)
-        except RecordingError as error:
-            return None, Judgement(Grade.BAD, (str(error),))
-        lost = sum(gap.count for gap in found.sidecar.gaps)
-        size = found.frames * found.sidecar.sensor().frame_bytes
-        reasons = [f"the service ended during the capture; the recording holds its first {found.frames} frames"]
-        if lost:
-            reasons.append(f"{lost} of {lost + found.frames} frames were lost")
-        if not found.frames:
-            return Recorded(0, 0), Judgement(Grade.BAD, ("no frame was recorded", *reasons))
-        return Recorded(found.frames, size, lost=lost), Judgement(Grade.DEGRADED, tuple(reasons))
 
     def _tick(self) -> None:
         while not self._closing.wait(_TICK_S):

@@ -256,8 +256,8 @@ class Reconstructions:
                 self._catalogue.reconstructions.remove(row.id)
             self._unsaved.pop(row.id, None)
 
-    def recording_closed(self) -> None:
-        """A capture's recording can be read now: somebody may wait for it."""
+    def look_again(self) -> None:
+        """A capture's recording can be read now, or there will be none: a job may wait for that."""
         with self._lock:
             self._wake.notify_all()
 

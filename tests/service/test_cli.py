@@ -1,10 +1,14 @@
 """The command line as its users meet it: in a process of its own."""
 
 import json
+import os
+import re
 import signal
 import socket
 import subprocess
 import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -141,10 +145,31 @@ def test_ctrl_c_keeps_what_there_is(room: Path, tmp_path: Path) -> None:
             if line.startswith("refining"):
                 break
         process.send_signal(signal.SIGINT)
-        process.stderr.read()
-    assert process.returncode == 130
+        told = process.stderr.read()
+    assert process.returncode == 130, told
     assert len(Trajectory.read_tum(tmp_path / "out" / "trajectory.tum")) > 480
     assert len(Scene.read_ply(tmp_path / "out" / "scene.ply")) > 100
+
+
+def test_ctrl_c_in_the_middle_of_a_line(room: Path, tmp_path: Path) -> None:
+    end, stuffed = os.pipe()
+    os.set_blocking(stuffed, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(stuffed, b"." * 4096)
+    os.set_blocking(stuffed, True)
+    with subprocess.Popen(command("reconstruct", room / "room.dat", "-o", tmp_path / "out"), stderr=stuffed) as process:
+        os.close(stuffed)
+        writes = re.compile(r"(1 0x2|64 0x2) ")  # the number of write on x86-64 and arm64, and the standard error
+        deadline = time.monotonic() + 60
+        while not writes.match(Path(f"/proc/{process.pid}/syscall").read_text()):
+            assert time.monotonic() < deadline, "it never waits for its line to be read"
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        with os.fdopen(end, errors="replace") as told:
+            text = told.read()
+    assert process.returncode == 130, text
+    assert "stopping; writing what there is" in text
 
 
 def test_a_service_beyond_loopback_needs_a_token() -> None:

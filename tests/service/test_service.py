@@ -128,6 +128,33 @@ def test_serving_a_device_that_cannot_be_opened_ends_with_one_line(tmp_path: Pat
     assert done.stderr.startswith("error: ") and "none.dat" in done.stderr and done.stderr.count("\n") == 1
 
 
+def test_when_acquisition_and_recorder_die_together_what_was_written_is_kept_and_reconstructed(
+    daemon: Callable[..., Any],
+) -> None:
+    one = daemon()
+    started = one.http.post("captures", json={"source": f"{SMALL}&pace=1", "options": {"steps": 5}}).json()
+
+    def capture() -> dict[str, Any]:
+        return dict(one.http.get(f"captures/{started['id']}").json())
+
+    wait_for(lambda: bool(capture()["counters"]) and capture()["counters"]["received"] > 600, "frames come")
+    workers = one.workers()
+    workers["recorder"].suspend()  # a process can be killed at any moment: here before it sees the other's death
+    workers["acquisition"].kill()
+    wait_for(lambda: not Path(f"/dev/shm/spiked-{started['id']}").exists(), "the ring is gone")
+    workers["recorder"].kill()
+    wait_for(lambda: capture()["state"] == "failed", "the capture has failed")
+    kept = capture()
+    assert kept["verdict"]["grade"] == "degraded"
+    assert kept["recording"]["frames"] > 200
+    assert f"holds its first {kept['recording']['frames']} frames" in kept["verdict"]["reasons"][0]
+
+    def jobs() -> list[dict[str, Any]]:
+        return list(one.http.get("reconstructions").json()["items"])
+
+    wait_for(lambda: all(job["state"] in ("complete", "failed") for job in jobs()), "no job waits for ever")
+
+
 def test_one_capture_at_a_time_and_the_account_of_frames(daemon: Callable[..., Any]) -> None:
     one = daemon()
     started = one.http.post("captures", json={"source": SMALL, "frames": 400, "options": {"steps": 10}})

@@ -1,6 +1,7 @@
 """`spiked reconstruct`: a recording in; scene, trajectory, report and pictures out."""
 
 import json
+import os
 import signal
 import time
 from collections.abc import Iterator
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from spiked_service.watch import Watch
 
 INTERRUPTED = 130
+_STDERR = 2
 _FEED_SHARE = 0.3
 """Part of the progress bar for feeding; the refinement has the rest."""
 
@@ -140,7 +142,8 @@ class _Interrupt:
         if self._set:
             raise KeyboardInterrupt
         self._set = True
-        messages.print("stopping; writing what there is (Ctrl-C again to leave at once)")
+        # Past Python's own buffers: the signal may have come in the middle of a line that is being written there.
+        os.write(_STDERR, b"stopping; writing what there is (Ctrl-C again to leave at once)\n")
 
 
 @contextmanager

@@ -120,6 +120,10 @@ def patched(*changes: tuple[object, str, object]) -> Iterator[None]:
         yield
 
 
+WINDOWED = (Reconstructor, "_passing", lambda self, view, path: None)
+"""Fast motion is looked at by windows, too."""
+
+
 def splines(spacing: int, degree: int) -> Callable[[], Iterator[None]]:
     """Only splines of this kind."""
     cubic = ((spacing,), ()) if degree == 3 else ((), (spacing,))
@@ -151,10 +155,12 @@ def rows() -> list[Row]:
             patches=lambda: patched((views, "make_view", counted), (Mapper, "_slope", pooled_binomial)),
             window_frames=32,
         ),
-        Row("mosaic loss", COLOUR, steps_share=0.4),
-        Row("demosaic first", COLOUR, patches=lambda: patched((mapping, "levels", demosaic_first)), steps_share=0.4),
+        Row("charge between the spikes of 24 frames (as it is)", COLOUR, steps_share=0.4),
         Row("full size from the start", COLOUR, patches=lambda: patched((reconstructor, "COARSE_SHARE", 1e-9)),
             steps_share=0.4),
+        Row("windows and sub-frames, mosaic loss", COLOUR, patches=lambda: patched(WINDOWED), steps_share=0.4),
+        Row("windows and sub-frames, demosaic first", COLOUR,
+            patches=lambda: patched(WINDOWED, (mapping, "levels", demosaic_first)), steps_share=0.4),
         Row("path: as it is", path=True),
         Row("path: counted windows", path=True, patches=lambda: patched((views, "make_view", counted))),
     ]  # fmt: skip

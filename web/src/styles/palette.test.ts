@@ -154,7 +154,5 @@ it("is the one place that has colours", () => {
   );
   expect(files.length).toBeGreaterThan(30);
   for (const name of files)
-    expect(readFileSync(join(SOURCES, name), "utf8"), name).not.toMatch(
-      /#[0-9a-fA-F]{3,8}\b|\brgba?\(|\bhsla?\(/,
-    );
+    expect(readFileSync(join(SOURCES, name), "utf8"), name).not.toMatch(/#[0-9a-fA-F]{3,8}\b|\brgba?\(|\bhsla?\(/);
 });

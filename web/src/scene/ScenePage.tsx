@@ -16,7 +16,6 @@ import {
   useService,
   wordsOf,
 } from "../state/store";
-import { useDark } from "../state/theme";
 import { toast } from "../state/toasts";
 import { Empty, Loading, trackingHint, Trouble } from "../ui/parts";
 import { Inspector } from "./Inspector";
@@ -92,7 +91,6 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   const [colouring, setColouring] = useState<Colouring>("state");
   const [steering, setSteering] = useState<Steering>("orbit");
   const [full, setFull] = useState(false);
-  const dark = useDark();
   const sensor = capture.sensor;
   const path = usePath(job);
   const { shown, loading, problem } = useScene(viewer, job, full);
@@ -136,7 +134,6 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   useEffect(() => viewer?.setLayers(layers), [viewer, layers]);
   useEffect(() => viewer?.steer(steering), [viewer, steering]);
   useEffect(() => viewer?.setRiding(at.ride), [viewer, at.ride]);
-  useEffect(() => viewer?.recolour(), [viewer, dark]);
   const linked = at.camera;
   useEffect(() => {
     // Only what came from a link or the history: what the viewer itself has put there is where it is already.

@@ -72,7 +72,7 @@ export class Viewer {
   private readonly path = new PathLines();
   private readonly frustum = new LineSegments2(new LineSegmentsGeometry(), new LineMaterial({ linewidth: FRUSTUM_PX }));
   private grid = new GridHelper(1, 1);
-  private gridColour = new Color();
+  private readonly gridColour = new Color();
   private readonly axes = new AxesHelper(1);
   private layers: Layers = { splats: true, path: true, frustum: true, grid: true, axes: true };
   private extent: Extent | null = null;
@@ -108,6 +108,10 @@ export class Viewer {
     this.frustum.material.depthTest = false;
     this.frustum.material.transparent = true;
     this.frustum.visible = false;
+    const around = canvas.parentElement ?? document.body;
+    this.renderer.setClearColor(new Color(colour("viewport")), 1);
+    this.frustum.material.color.set(colour("accent", around));
+    this.gridColour.set(colour("line", around));
     this.path.visible = false;
     // Of the capture's world, OpenCV's: y points down and z ahead.
     this.axes.scale.set(1, -1, -1);
@@ -174,15 +178,6 @@ export class Viewer {
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
-    this.draw();
-  }
-
-  /** Take background, grid and frustum in the colours of the theme as it is now. */
-  recolour(): void {
-    this.renderer.setClearColor(new Color(colour("viewport")), 1);
-    this.frustum.material.color.set(colour("accent"));
-    this.gridColour.set(colour("line"));
-    this.buildGrid();
     this.draw();
   }
 

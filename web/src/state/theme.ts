@@ -48,11 +48,11 @@ const subscribe = (listener: () => void): (() => void) => {
 export const useTheme = (): Theme => useSyncExternalStore(subscribe, () => chosen);
 export const useDark = (): boolean => useSyncExternalStore(subscribe, isDark);
 
-/** A colour of the style sheet as it is in this theme, for canvases: the variable itself is of both themes. */
-export function colour(name: string): string {
+/** A colour of the style sheet as it is inside an element, for canvases: the variable itself is of both themes. */
+export function colour(name: string, within: Element = document.body): string {
   const probe = document.createElement("i");
   probe.style.color = `var(--${name})`;
-  document.body.append(probe);
+  within.append(probe);
   const resolved = getComputedStyle(probe).color;
   probe.remove();
   return resolved;

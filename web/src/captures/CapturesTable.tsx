@@ -182,7 +182,7 @@ function Row({
       </td>
       <td>
         {job === null ? (
-          <span className="dim">{jobs === 0 ? "none" : "…"}</span>
+          <span className="dim">{jobs === 0 ? "not reconstructed" : "…"}</span>
         ) : (
           <Badge tone={jobTone[job.state]}>{job.state === "running" ? job.stage : job.state}</Badge>
         )}

@@ -20,8 +20,10 @@ VIEW_PERIOD_S = 0.5
 RATE_HZ = 20_000
 WIDTH, HEIGHT = 96, 64
 START_S = 240.0
-GROWTH_BYTES = 24 << 20
-"""Memory may grow by so much, whatever the length: caches fill, and malloc keeps what it once had."""
+FLAT_BYTES = 3 << 20
+"""What is left of growth when the events to be remembered are full, which takes about three minutes."""
+FILLING_BYTES = 10 << 20
+"""Before that, they and malloc's heaps still fill."""
 
 
 class Memory:
@@ -40,13 +42,18 @@ class Memory:
                 usage = processes[role].memory_info()
                 self.bytes.setdefault(role, []).append(usage.rss - usage.shared)  # the ring is shared
 
+    def thirds(self) -> dict[str, list[int]]:
+        """Medians of the three thirds of the time."""
+        return {role: [int(statistics.median(part)) for part in _split(seen)] for role, seen in self.bytes.items()}
+
     def growth(self) -> dict[str, int]:
-        """From the second quarter to the last, medians."""
-        grown = {}
-        for role, seen in self.bytes.items():
-            quarter = max(1, len(seen) // 4)
-            grown[role] = int(statistics.median(seen[-quarter:]) - statistics.median(seen[quarter : 2 * quarter]))
-        return grown
+        """From the middle third to the last."""
+        return {role: last - middle for role, (_, middle, last) in self.thirds().items()}
+
+
+def _split(seen: list[int]) -> list[list[int]]:
+    third = len(seen) // 3
+    return [seen[:third], seen[third:-third], seen[-third:]]
 
 
 @contextmanager
@@ -99,7 +106,7 @@ def a_scene(daemon: Any, recording: Path) -> str:
     return str(job["id"])
 
 
-def soak(daemon: Any, tmp_path: Path, seconds: float) -> None:
+def soak(daemon: Any, tmp_path: Path, seconds: float, may_grow: int) -> None:
     recording = recorded(tmp_path / "small", WIDTH, HEIGHT)
     scene = a_scene(daemon, recorded(tmp_path / "room", 400, 250))
     repeats = int(seconds * RATE_HZ / 1280) + 1
@@ -145,16 +152,16 @@ def soak(daemon: Any, tmp_path: Path, seconds: float) -> None:
         "views": len(ms),
         "view_ms_median": statistics.median(ms),
         "growth_mib": {role: round(grown / 2**20, 1) for role, grown in memory.growth().items()},
-        "memory_mib": {role: round(seen[-1] / 2**20) for role, seen in memory.bytes.items()},
+        "memory_mib": {role: [round(one / 2**20, 1) for one in thirds] for role, thirds in memory.thirds().items()},
         "files": (memory.files[0], memory.files[-1]),
     }
     print(json.dumps(report))
-    assert all(grown < GROWTH_BYTES for grown in memory.growth().values()), report
+    assert all(grown < may_grow for grown in memory.growth().values()), report
     assert memory.files[-1] <= memory.files[0] + 20, report
 
 
 def test_many_clients_for_a_minute(daemon: Callable[..., Any], tmp_path: Path) -> None:
-    soak(daemon(), tmp_path, 60)
+    soak(daemon(), tmp_path, 60, FILLING_BYTES)
 
 
 @pytest.mark.slow
@@ -162,4 +169,4 @@ def test_many_clients_for_a_minute(daemon: Callable[..., Any], tmp_path: Path) -
 def test_many_clients_for_ten_minutes(daemon: Callable[..., Any], tmp_path: Path) -> None:
     if os.statvfs(tmp_path).f_bavail * os.statvfs(tmp_path).f_frsize < 20 << 30:
         pytest.skip("needs 20 GiB for the recording")
-    soak(daemon(), tmp_path, 600)
+    soak(daemon(), tmp_path, 600, FLAT_BYTES)

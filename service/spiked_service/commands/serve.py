@@ -16,6 +16,7 @@ from spiked_service.console import output
 from spiked_service.daemon import Daemon
 from spiked_service.geometry import parse_intrinsics
 from spiked_service.live import LiveSettings
+from spiked_service.memory import limit_arenas
 from spiked_service.snapshot import Snapshot
 from spiked_service.store.rows import CaptureState, Plan
 
@@ -76,6 +77,7 @@ def serve(
         "log_format": log_format,
     }
     given = dict(setting(text) for text in set_ or []) | {k: v for k, v in flags.items() if v is not None}
+    limit_arenas()
     settings = LiveSettings(given, config)
     devices = settings.now.devices
     with Daemon(settings) as daemon:

@@ -79,7 +79,7 @@ class Catalogue:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._local = threading.local()
+        self._readers: list[sqlite3.Connection] = []
         self._writing = threading.RLock()
         with _told(path):
             self._writer = _connect(path)
@@ -108,12 +108,8 @@ class Catalogue:
             self._writer.execute("COMMIT")
 
     def read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-        """Rows of a query, by a connection that only reads and belongs to this thread."""
-        with _told(self._path):
-            connection = getattr(self._local, "connection", None)
-            if connection is None:
-                connection = self._local.connection = _connect(self._path)
-                connection.execute("PRAGMA query_only = ON")
+        """Rows of a query, by a connection that only reads."""
+        with _told(self._path), self._reader() as connection:
             return list(connection.execute(query, values).fetchall())
 
     def capture_page(
@@ -180,8 +176,29 @@ class Catalogue:
         with self.transaction() as connection:
             connection.execute("DELETE FROM versions WHERE reconstruction_id = ?", (reconstruction_id,))
 
+    @contextmanager
+    def _reader(self) -> Iterator[sqlite3.Connection]:
+        """One that nobody uses just now, or a new one: as many as ever read at the same time.
+
+        Not one for each thread: threads come and go with requests, and a connection, which Python's sqlite3 makes part
+        of a cycle, would hold its files until the garbage collector comes to it.
+        """
+        try:
+            connection = self._readers.pop()
+        except IndexError:
+            connection = _connect(self._path)
+            connection.execute("PRAGMA query_only = ON")
+        try:
+            yield connection
+        except BaseException:
+            connection.close()
+            raise
+        self._readers.append(connection)
+
     def close(self) -> None:
-        """Write the log back into the file and close it; readers of other threads close with their threads."""
+        """Write the log back into the file and close it."""
+        while self._readers:
+            self._readers.pop().close()
         with self._writing:
             with suppress(sqlite3.Error):
                 self._writer.execute("PRAGMA wal_checkpoint(TRUNCATE)")

@@ -1,11 +1,13 @@
 """The catalogue keeps rows whatever happens around it."""
 
+import gc
 import sqlite3
 import threading
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+import psutil
 import pytest
 from spiked_service.ids import is_id, new_id
 from spiked_service.reconstruction_options import ReconstructionOptions
@@ -102,6 +104,27 @@ def test_changes_from_many_threads_are_all_kept(catalogue: Catalogue) -> None:
     for thread in threads:
         thread.join()
     assert catalogue.captures.get(row.id).frames_planned == 200
+
+
+def test_threads_that_come_and_go_leave_no_open_files(catalogue: Catalogue, tmp_path: Path) -> None:
+    def files() -> int:
+        return sum(one.path.startswith(str(tmp_path)) for one in psutil.Process().open_files())
+
+    catalogue.captures.where()
+    before = files()
+    gc.disable()  # as in a service that makes no garbage for minutes
+    try:
+        for _ in range(20):
+            thread = threading.Thread(target=catalogue.captures.where)
+            thread.start()
+            thread.join()
+        assert files() == before
+    finally:
+        gc.enable()
+    with pytest.raises(StoreError):
+        catalogue.read("SELECT nothing FROM nowhere")
+    catalogue.close()
+    assert files() == 0
 
 
 def test_an_exception_in_a_transaction_undoes_all_of_it(catalogue: Catalogue) -> None:

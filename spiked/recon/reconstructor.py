@@ -37,7 +37,9 @@ COARSE_SHARE = 0.6
 """Part of the refinement in which large images are looked at with fewer, larger pixels: a quarter of the work each."""
 SMALL_PIXELS = 130_000
 """Images up to here get all the steps that the options say."""
-FAST_STEPS = 1.6
+LARGE_POWER = 0.35
+"""The steps of larger ones fall with this power of their pixels: each costs more, and they have more to settle."""
+FAST_STEPS = 1.9
 """Times as many steps for views of fast motion, which cost less each and say less of what is fine."""
 YOUNG_STEPS = 800
 """Steps that a map which grows with the frames is looked at coarsely."""
@@ -484,9 +486,9 @@ class Reconstructor:
         return float(np.percentile([self._apart(*both) for both in poses], 90)) > STALE_PX
 
     def _steps(self) -> int:
-        """Steps of the refinement: fewer with the root of a large image's pixels, more where the motion is fast."""
+        """Steps of the refinement: fewer for large images, more where the motion is fast."""
         pixels = self.camera.width * self.camera.height
-        share = min(1.0, float(np.sqrt(SMALL_PIXELS / pixels)))
+        share = min(1.0, (SMALL_PIXELS / pixels) ** LARGE_POWER)
         fast = float(np.mean([self._views[i].frames is not None for i in self._mappable()]))
         return round(self.options.steps * share * (1 + (FAST_STEPS - 1) * fast))
 

@@ -488,7 +488,7 @@ class Reconstructor:
     def _steps(self) -> int:
         """Steps of the refinement: fewer for large images, more where the motion is fast."""
         pixels = self.camera.width * self.camera.height
-        share = min(1.0, (SMALL_PIXELS / pixels) ** LARGE_POWER)
+        share = min(1.0, float((SMALL_PIXELS / pixels) ** LARGE_POWER))
         fast = float(np.mean([self._views[i].frames is not None for i in self._mappable()]))
         return round(self.options.steps * share * (1 + (FAST_STEPS - 1) * fast))
 

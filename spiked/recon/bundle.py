@@ -96,14 +96,7 @@ class Bundle:
             while damping < 1e6:
                 step = system.solve(damping, blend, (inertia.hessian(), inertia.gradient(spline)))
                 moved = spline.move(step.poses[:, :3], step.poses[:, 3:])
-                rotations, centres = moved.poses(times)
-                trial = replace(
-                    self,
-                    rotations=rotations,
-                    centres=centres,
-                    points=self.points + step.points,
-                    intrinsics=_scaled(self.intrinsics, step.log_focal),
-                )
+                trial = self._moved(*moved.poses(times), step)
                 cost = trial.cost(scale_px) + share * inertia.energy(moved)
                 if cost < current:
                     break
@@ -144,13 +137,12 @@ class Bundle:
         rotations, centres = self.rotations.copy(), self.centres.copy()
         rotations[free] = exp_so3(step.poses[:, :3]) @ rotations[free]
         centres[free] += step.poses[:, 3:]
-        return replace(
-            self,
-            rotations=rotations,
-            centres=centres,
-            points=self.points + step.points,
-            intrinsics=_scaled(self.intrinsics, step.log_focal),
-        )
+        return self._moved(rotations, centres, step)
+
+    def _moved(self, rotations: Array, centres: Array, step: "_Step") -> "Bundle":
+        """With these poses, and points and focal length as the step says."""
+        points, intrinsics = self.points + step.points, _scaled(self.intrinsics, step.log_focal)
+        return replace(self, rotations=rotations, centres=centres, points=points, intrinsics=intrinsics)
 
     def _linearise(self, scale_px: float, free: NDArray[np.bool_]) -> "_System":
         local, k = self._local(), self.intrinsics

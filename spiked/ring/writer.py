@@ -16,9 +16,9 @@ from spiked.ring.status import ReaderPlace, RingStatus, read_places, read_status
 from spiked.sensor import Sensor
 
 DEFAULT_BYTES = 128 << 20
+"""A ring's pixels unless the number of slots is given: half a second of a 400x250 camera at 20 kHz."""
 MOST_BACKLOG_BYTES = 512 << 20
 """Of a ring from which a reader that pauses shall catch up."""
-"""A ring's pixels unless the number of slots is given: half a second of a 400x250 camera at 20 kHz."""
 _LOOK_AGAIN_S = 0.1
 
 

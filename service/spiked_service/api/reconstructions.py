@@ -113,14 +113,10 @@ class Results:
             raise GoneError(f"version {version} of reconstruction {row.id} is not kept")
         if published is None:
             named = "" if version is None else f" {version}"
-            if row.state.over and row.version:
-                raise NothingError(
-                    f"reconstruction {row.id} is {row.state} and has no version{named}; GET versions lists what it has"
-                )
             if row.state.over:
-                raise NothingError(
-                    f"reconstruction {row.id} is {row.state} and has published nothing; :restart begins it again"
-                )
+                none = "has published nothing; :restart begins it again"
+                some = f"has no version{named}; GET versions lists what it has"
+                raise NothingError(f"reconstruction {row.id} is {row.state} and {some if row.version else none}")
             raise NotReadyError(f"reconstruction {row.id} has no version{named} yet; it is at stage {row.stage}")
         sensor = self._captures.get(row.capture_id).row.sensor
         if sensor is not None and published.intrinsics is not None:

@@ -86,6 +86,8 @@ class Verdict:
     winner: Hypothesis | None
     reason: str
     tried: list[Hypothesis]
+    ids: NDArray[np.int64]
+    """[P] of the tracks that the hypotheses are about."""
     wanted_parallax_px: float = 0.0
     """Parallax that would do, where there was too little for the noise that was seen."""
 
@@ -94,10 +96,14 @@ def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = 0.8) -> Verd
     """Try all guesses on `views`. Accepts when there is enough parallax for the noise of the tracks, inliers > 60 % and
     every different outcome, the depth-reversed one above all, is clearly worse."""
     if len(views.ids) < 30:
-        return Verdict(None, f"only {len(views.ids)} tracks span the views; more texture or light is needed", [])
+        return Verdict(
+            None, f"only {len(views.ids)} tracks span the views; more texture or light is needed", [], views.ids
+        )
     rotation_only = parallax_px(views)
     if rotation_only < min_parallax_px:
-        return Verdict(None, f"parallax {rotation_only:.1f} px is below {min_parallax_px:g}: {MORE_MOTION}", [])
+        return Verdict(
+            None, f"parallax {rotation_only:.1f} px is below {min_parallax_px:g}: {MORE_MOTION}", [], views.ids
+        )
     rng = np.random.default_rng(seed)
     count = len(views.ids)
     starts: dict[Guess, Callable[[], Bundle | None]] = {
@@ -114,24 +120,24 @@ def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = 0.8) -> Verd
         wanted = PARALLAX_NOISES * tried[0].noise_px()
         if rotation_only < wanted and tried[0].inliers > LEAST_INLIERS:
             reason = f"parallax {rotation_only:.1f} px is below {wanted:.1f} for tracks this noisy: {MORE_MOTION}"
-            return Verdict(None, reason, tried, wanted)
+            return Verdict(None, reason, tried, views.ids, wanted)
     best = min(tried, key=lambda h: h.cost)
     rival = _converge(Guess.MIRROR, _mirrored(views, best.bundle), rotation_only)
     tried.append(rival)
     if rival.cost < best.cost * 0.98:
         best = rival
-    return _judge(best, tried)
+    return _judge(best, tried, views.ids)
 
 
-def _judge(best: Hypothesis, tried: list[Hypothesis]) -> Verdict:
+def _judge(best: Hypothesis, tried: list[Hypothesis], ids: NDArray[np.int64]) -> Verdict:
     if best.inliers < LEAST_INLIERS:
-        return Verdict(None, f"only {best.inliers:.0%} of the tracks agree with one rigid scene", tried)
+        return Verdict(None, f"only {best.inliers:.0%} of the tracks agree with one rigid scene", tried, ids)
     for rival in tried:
         if rival is not best and _likeness(rival, best) < SAME and not _clearly_worse(rival, best):
             name = "its depth-reversed twin" if _likeness(rival, best) < 0 else "another one"
             reason = f"the scene and {name} explain the tracks equally well: {MORE_MOTION}"
-            return Verdict(None, reason, tried)
-    return Verdict(best, "accepted", tried)
+            return Verdict(None, reason, tried, ids)
+    return Verdict(best, "accepted", tried, ids)
 
 
 def _likeness(a: Hypothesis, b: Hypothesis) -> float:
@@ -160,6 +166,23 @@ def _converge(guess: Guess, bundle: Bundle, parallax: float) -> Hypothesis:
         bundle.centres /= depth
     inliers = float(np.mean(np.linalg.norm(bundle.residuals(), axis=1) < INLIER_PX))
     return Hypothesis(guess, bundle, cost, inliers, parallax)
+
+
+def converge_without(one: Hypothesis, tracks: NDArray[np.bool_]) -> Hypothesis:
+    """A hypothesis adjusted anew without some of its `tracks` [P]."""
+    bundle = one.bundle
+    seen = ~tracks[bundle.point]
+    row = np.cumsum(~tracks) - 1
+    rest = Bundle(
+        bundle.rotations.copy(),
+        bundle.centres.copy(),
+        bundle.points[~tracks],
+        bundle.camera[seen],
+        row[bundle.point[seen]],
+        bundle.pixels[seen],
+        bundle.intrinsics,
+    )
+    return _converge(one.guess, rest, one.parallax_px)
 
 
 def _bundle(views: Views, rotations: Array, centres: Array, points: Array) -> Bundle:

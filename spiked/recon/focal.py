@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass, replace
 
-from spiked.recon.bootstrap import MORE_MOTION, SCALE_PX, Verdict, Views, bootstrap, parallax_px
+from spiked.recon.bootstrap import MORE_MOTION, SCALE_PX, Verdict, Views, parallax_px
+from spiked.recon.movers import first_map
 from spiked.sensor import Intrinsics
 
 FIELDS_OF_VIEW_DEG = (60.0, 42.0, 80.0, 30.0, 100.0)
@@ -39,11 +40,11 @@ def try_fields(views: Views, seed: int, min_parallax_px: float) -> tuple[Verdict
     turning = min(parallax_px(one) for one in tried)
     if turning < min_parallax_px:
         reason = f"parallax {turning:.1f} px is below {min_parallax_px:g} for any focal length: {MORE_MOTION}"
-        return Verdict(None, reason, []), views.intrinsics
+        return Verdict(None, reason, [], views.ids), views.intrinsics
     best: tuple[float, Verdict, Intrinsics] | None = None
     first: Verdict | None = None
     for one in tried:
-        verdict = bootstrap(one, seed, min_parallax_px)
+        verdict = first_map(one, seed, min_parallax_px)
         first = first or verdict
         if verdict.winner is None:
             continue

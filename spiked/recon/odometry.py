@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.pose import Array, exp_so3, hat, log_so3, mean_rotation
-from spiked.recon.bootstrap import INLIER_PX, LEAST_INLIERS, MORE_MOTION, SCALE_PX, Views, bootstrap
+from spiked.recon.bootstrap import INLIER_PX, LEAST_INLIERS, MORE_MOTION, SCALE_PX, Views
 from spiked.recon.bundle import Bundle
 from spiked.recon.certainty import path_error
 from spiked.recon.focal import CORRELATED, Focal, try_fields
-from spiked.recon.smooth import clock_of, coarsest
+from spiked.recon.movers import first_map
+from spiked.recon.smooth import Bursts, bursts, clock_of, coarsest
 from spiked.recon.stamps import Stamps, delays
-from spiked.recon.tracks import Picture, Tracks, search
+from spiked.recon.tracks import Picture, Tracks, flow, search
 from spiked.sensor import Intrinsics
 from spiked.spline import Spline, Waypoints
 
@@ -86,6 +87,15 @@ STILL_PX = 0.12
 """Less motion from view to view than this is none: tracks are not better."""
 STOOD_PX = 0.3
 """And so far from the first view of a bootstrap the camera has hardly moved: it may as well begin later."""
+HOPELESS_CHI2 = 25.0
+"""Beyond this, five times as far off as noise explains, the points contradict a pose: what was followed is not them."""
+FOUND_CHI2 = 4.0
+"""A place is found again only where points agree to twice their noise: smears seem to agree with much."""
+RECALL_PX = (0.5, 4.0)
+"""How exactly a point that is looked for where the pose says has to lead back to where it was seen, and how near that
+place it may be found."""
+LAST_VIEWS = 8
+"""The state at the end is that of most of so many views: one noisy view says nothing about a recording."""
 KEY_EVERY = 8
 """Every eighth posed view is kept for relocalisation."""
 STEADY = 1.25
@@ -194,7 +204,7 @@ class Odometry:
 
     def _review(self) -> None:
         """Judge every pose by the path and the points as they are in the end."""
-        last: tuple[Fit, int] | None = None
+        judged: list[tuple[Fit, int]] = []
         for view in self.views:
             if view.rotation is None or view.centre is None:
                 continue
@@ -202,9 +212,12 @@ class Odometry:
             view.inliers, view.chi2, view.sigma_px = fit.inliers, fit.chi2, fit.sigma_px
             if view.state in (State.TRACK, State.DEGRADED):
                 view.state = State.TRACK if self._doubt(fit, len(view.ids)) is None else State.DEGRADED
-            last = fit, len(view.ids)
-        if last is not None and self.state in (State.TRACK, State.DEGRADED):
-            self._judge(*last)
+            judged.append((fit, len(view.ids)))
+        if judged and self.state in (State.TRACK, State.DEGRADED):
+            last = judged[-LAST_VIEWS:]
+            doubtful = [one for one in last if self._doubt(*one) is not None]
+            sound = [one for one in last if self._doubt(*one) is None]
+            self._judge(*(doubtful if len(doubtful) > len(sound) else sound)[-1])
             if self.path_error is not None and self.path_error > WORST_PATH_ERROR:
                 about = f"about {self.path_error:.0%}"
                 self._become(
@@ -236,7 +249,7 @@ class Odometry:
         pixels = np.stack([_pick(self.views[k], common) for k in chosen])
         views = Views(pixels, common, self.intrinsics)
         if self.focal is None:
-            verdict = bootstrap(views, self.seed, self._boot_parallax)
+            verdict = first_map(views, self.seed, self._boot_parallax)
         else:
             verdict, self.intrinsics = try_fields(views, self.seed, self._boot_parallax)
         if verdict.winner is None:
@@ -245,7 +258,7 @@ class Odometry:
                 self._boot_views = int(1.2 * count) + 1
             self._become(State.BOOT, verdict.reason)
             return
-        bundle, self._noise_px = verdict.winner.bundle, verdict.winner.noise_px()
+        bundle, self._noise_px, common = verdict.winner.bundle, verdict.winner.noise_px(), verdict.ids
         error = np.linalg.norm(bundle.residuals().reshape(len(chosen), -1, 2), axis=2)
         good = np.median(error, 0) < INLIER_PX
         self.points[common[good]] = bundle.points[good]
@@ -289,14 +302,20 @@ class Odometry:
         if not known:
             known = [v for v in self.views if v.rotation is not None][-2:]
         fit = self._fit(view, *predict(known[-2:], view.time))
-        if fit.points < MIN_POINTS or fit.inliers < 0.35:
+        if (why := _hopeless(fit)) is not None:
             found = self._relocalise(picture)
             if found is None:
-                self._become(State.LOST, f"{fit.points} known points in view, {fit.inliers:.0%} agree with one pose")
+                if fit.chi2 > HOPELESS_CHI2:
+                    self._tracks.forget()  # they follow smears: what they are now is not what they were
+                self._become(State.LOST, f"{why}: {self._why_lost()}")
                 return
             fit = found
         self._accept(view, fit)
-        count = len(self.views)
+        self._tie_newest(fit)
+
+    def _tie_newest(self, fit: Fit) -> None:
+        """Adjust what the newest view, just posed, adds to, and judge it by that."""
+        view, count = self.views[-1], len(self.views)
         if count % 4 == 0:
             self._triangulate(range(max(0, count - 48), count))
         # Points that were found lately lie where few views put them: that they are off is no news before they were
@@ -306,10 +325,19 @@ class Odometry:
             self.settle()
         elif count % 8 == 0 or off:
             self._adjust_recent()
-        if off and view.rotation is not None and view.centre is not None:
+        if view.rotation is None or view.centre is None:
+            self._become(State.LOST, f"the path as a whole contradicts this view: {self._why_lost()}")
+            return
+        if off:
             fit = self._fit(view, view.rotation, view.centre)
             self._accept(view, fit)
         self._judge(fit, len(view.ids))
+
+    def _why_lost(self) -> str:
+        """What a user may make of it."""
+        if len(self.views[-1].ids) < 2 * MIN_POINTS:
+            return "too little in view can be told apart (blank, dark or blurred)"
+        return "the camera moved too fast to be followed, or something hides what it knew"
 
     def _judge(self, fit: Fit, tracks: int) -> None:
         if (why := self._doubt(fit, tracks)) is not None:
@@ -397,12 +425,38 @@ class Odometry:
                 continue
             view.ids, view.pixels = ids[good], at[good]
             fit = self._fit(view, key.rotation, key.centre)
-            if fit.inliers > 0.6 and fit.points >= MIN_POINTS:
+            if fit.points >= MIN_POINTS and fit.inliers > 0.6 and fit.chi2 < FOUND_CHI2:
+                fit = self._recall(picture, fit)
                 self._tracks.resume(len(self.views) - 1, view.ids, view.pixels)
-                self._become(State.RELOC, f"found again by {fit.points} points of an earlier view")
+                self._become(State.RELOC, f"found again by {fit.points} points of earlier views")
                 return fit
         view.ids, view.pixels = self._tracks.ids.copy(), self._tracks.at.copy()
         return None
+
+    def _recall(self, picture: Picture, fit: Fit) -> Fit:
+        """Also find the points of the other key views in the newest one, whose pose is about known now: each that is
+        found again ties what follows to what was."""
+        view, k = self.views[-1], self.intrinsics
+        height, width = picture.shape
+        for number in sorted(self._keys, reverse=True):
+            _, ids, pixels = self._known(number)
+            new = ~np.isin(ids, view.ids)
+            ids, pixels = ids[new], pixels[new]
+            local = (self.points[ids] - fit.centre) @ fit.rotation
+            guess = local[:, :2] / np.maximum(local[:, 2:], 1e-6) * [k.fx, k.fy] + [k.cx, k.cy]
+            inside = (local[:, 2] > 1e-6) & (guess > 8).all(1) & (guess < [width - 8, height - 8]).all(1)
+            if not inside.any():
+                continue
+            ids, guess = ids[inside], guess[inside]
+            at, good = flow(self._keys[number], picture, pixels[inside], guess, RECALL_PX[0], levels=1)
+            good &= np.linalg.norm(at - guess, axis=1) < RECALL_PX[1]
+            view.ids, view.pixels = np.concatenate([view.ids, ids[good]]), np.concatenate([view.pixels, at[good]])
+        fit = self._fit(view, fit.rotation, fit.centre)
+        local = (self.points[view.ids] - fit.centre) @ fit.rotation
+        there = local[:, :2] / np.maximum(local[:, 2:], 1e-6) * [k.fx, k.fy] + [k.cx, k.cy]
+        agree = np.linalg.norm(there - view.pixels, axis=1) < 2 * INLIER_PX
+        view.ids, view.pixels = view.ids[agree], view.pixels[agree]
+        return self._fit(view, fit.rotation, fit.centre)
 
     def _triangulate(self, span: range) -> None:
         """Positions for tracks that have none, from the posed views of `span`."""
@@ -547,6 +601,12 @@ class Odometry:
         times = np.array([self.views[n].time for n in numbers])
         start = self._coarsest(times, bundle)
         spline, _ = bundle.optimise_spline(start, times, 8, SCALE_PX / 2, tolerance=1e-3)
+        if (wrong := self._contradicted(bundle, numbers)) and len(posed) - len(wrong) >= BOOT_VIEWS:
+            for n in wrong:  # smeared views, posed by what they seemed to show, would bend the path
+                self.views[n].rotation = self.views[n].centre = None
+                self.views[n].state = State.LOST
+            self.settle()
+            return
         self._noise_px = bundle.noise_px()
         if self.focal is not None:
             self.intrinsics = bundle.intrinsics
@@ -560,6 +620,19 @@ class Odometry:
             for n, rotation, centre in zip(others, rotations, centres, strict=True):
                 self.views[n].rotation, self.views[n].centre = rotation, centre
         self._triangulate(range(max(0, len(self.views) - 200), len(self.views)))
+
+    def _contradicted(self, bundle: Bundle, numbers: list[int]) -> list[int]:
+        """Which of the views `numbers` are where the points, adjusted with them in a bundle, say that they are not."""
+        size = np.linalg.norm(bundle.residuals(), axis=1)
+        noise = max(1.3 * bundle.noise_px(), LEAST_NOISE_PX)
+        chi2 = np.zeros(len(numbers))
+        for row, n in enumerate(numbers):
+            seen = size[bundle.camera == row]
+            if len(seen):
+                chi2[row] = (np.median(seen) / (1.1774 * np.hypot(noise, self.views[n].unsure_px))) ** 2
+        # Their neighbours on a spline are drawn along: only the worst of each few are wrong for sure.
+        around = np.lib.stride_tricks.sliding_window_view(np.pad(chi2, 2), 5).max(1)
+        return [n for n, own, most in zip(numbers, chi2, around, strict=True) if own > HOPELESS_CHI2 and own == most]
 
     def _spread(self, posed: list[int]) -> list[int]:
         """At most GLOBAL_VIEWS of these views with the first and the last, fewer of them where little moves."""
@@ -587,12 +660,23 @@ class Odometry:
         bundle.rotations = rotation @ bundle.rotations
         return replace(spline, rotations=rotation @ spline.rotations, centres=carry(spline.centres))
 
+    def _bursts(self, times: Array, bundle: Bundle) -> Bursts:
+        """Where a bundle's views, at `times`, say that the camera moved much faster than before and after."""
+        turns = np.linalg.norm(log_so3(bundle.rotations[1:] @ bundle.rotations[:-1].swapaxes(1, 2)), axis=1)
+        depth = np.median(
+            ((bundle.points[bundle.point] - bundle.centres[bundle.camera])[:, None] @ bundle.rotations[bundle.camera])[
+                :, 0, 2
+            ]
+        )
+        shifts = np.linalg.norm(np.diff(bundle.centres, axis=0), axis=1) / max(depth, 1e-6)
+        return bursts(times, self.intrinsics.fx * (turns + shifts))
+
     def _coarsest(self, times: Array, bundle: Bundle) -> Spline:
         margin = 0.5 * max(v.length for v in self.views)
         span = (self.views[0].time - margin, self.views[-1].time + margin)
         hessians = bundle.pose_hessians(SCALE_PX)
         still = np.array([v.motion_px < STILL_PX for v in self.views])
-        clock = clock_of(np.array([v.time for v in self.views]), still)
+        clock = clock_of(np.array([v.time for v in self.views]), still, self._bursts(times, bundle))
         return coarsest(times, bundle.rotations, bundle.centres, hessians, len(bundle.camera), span, clock)
 
 
@@ -614,6 +698,15 @@ def _steady(bundle: Bundle, ids: NDArray[np.int64]) -> tuple[Bundle, NDArray[np.
         bundle, points=bundle.points[left], camera=bundle.camera[keep], point=point, pixels=bundle.pixels[keep]
     )
     return kept, ids[left]
+
+
+def _hopeless(fit: Fit) -> str | None:
+    """Why a view cannot be where the points say, or None."""
+    if fit.points < MIN_POINTS or fit.inliers < 0.35:
+        return f"{fit.points} known points in view, {fit.inliers:.0%} agree with one pose"
+    if fit.chi2 > HOPELESS_CHI2:
+        return f"points lie {np.sqrt(fit.chi2):.0f} times as far off as their noise explains"
+    return None
 
 
 def _kind(reason: str) -> str:

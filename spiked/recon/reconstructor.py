@@ -557,6 +557,9 @@ class Reconstructor:
         after = np.clip(np.searchsorted(times, frames), 1, len(times) - 1)
         near = np.where(np.abs(times[after - 1] - frames) < np.abs(times[after] - frames), after - 1, after)
         kept = np.abs(times[near] - frames) <= 1.5 * reach[near]
+        for view in self._odometry.views:
+            if view.rotation is None:  # it was looked at, and nobody knows where from
+                kept &= np.abs(frames - view.time) > 0.5 * view.length
         if self._bridged:
             smooth = np.array([n in self._bridged for n in numbers]) & (np.diff(numbers, prepend=-2) == 1)
             kept |= smooth[after] & (frames > times[after - 1]) & (frames < times[after])

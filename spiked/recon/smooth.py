@@ -24,6 +24,12 @@ MOST_KNOTS = 128
 STILL_TICKS = 8.0
 GAP_TICKS = 128.0
 """Frames at most that pass, on the clock of the knots, from view to view while a camera stands still or else."""
+BURST = 4.0
+"""Times as fast as in the views around it is a burst, for which the clock of the knots runs faster..."""
+BURST_PX = 10.0
+"""... where the image moves so far between two views."""
+AROUND = 6
+"""Views on either side that say what is usual."""
 RARELY = 0.5
 """Above this share of the frames the clock is that of the frames."""
 NOISE_PX = 0.1
@@ -92,12 +98,42 @@ def coarsest(
     return min(good, key=lambda one: len(one.spline.centres)).spline
 
 
-def clock_of(times: Array, still: Array) -> Clock | None:
-    """The clock of a path with views at `times` [n], in which the camera stood `still` [n] since the view before: that
-    time, and long gaps, needs no more knots than one ordinary view. None where there is little of it."""
+@dataclass(frozen=True)
+class Bursts:
+    """Spans [n] of frames in which a camera moves `factors` [n] times as fast as around them."""
+
+    begins: Array
+    ends: Array
+    factors: Array
+
+    def at(self, times: Array) -> Array:
+        """The factor at each time, 1 outside."""
+        inside = (times[:, None] > self.begins) & (times[:, None] < self.ends)
+        return np.asarray(np.where(inside, self.factors, 1.0).max(1, initial=1.0))
+
+
+def bursts(times: Array, motion_px: Array) -> Bursts:
+    """Where the image moves `motion_px` [n - 1] between views at `times` [n] so fast that no spline of even knots
+    follows, and no camera that goes on as it went."""
     steps = np.diff(times)
-    short = np.minimum(steps, np.where(still[1:], STILL_TICKS, GAP_TICKS))
-    if len(steps) == 0 or short.sum() > RARELY * steps.sum():
+    speed = motion_px / np.maximum(steps, 1e-9)
+    factor = np.ones(len(steps))
+    for k in np.flatnonzero(motion_px > BURST_PX):
+        around = np.concatenate([speed[max(0, k - AROUND) : k], speed[k + 1 : k + 1 + AROUND]])
+        if len(around):
+            factor[k] = speed[k] / max(float(np.median(around)), 1e-3)
+    quick = factor > BURST
+    return Bursts(times[:-1][quick], times[1:][quick], factor[quick])
+
+
+def clock_of(times: Array, still: Array, fast: Bursts | None = None) -> Clock | None:
+    """The clock of a path with views at `times` [n], in which the camera stood `still` [n] since the view before: that
+    time, and long gaps, needs no more knots than one ordinary view, and a burst of speed more. None where there is
+    little of either."""
+    steps = np.diff(times)
+    quick = np.ones(len(steps)) if fast is None else fast.at(0.5 * (times[1:] + times[:-1]))
+    short = np.minimum(steps * quick, np.where(still[1:] & (quick == 1), STILL_TICKS, GAP_TICKS))
+    if len(steps) == 0 or (short.sum() > RARELY * steps.sum() and quick.max() == 1):
         return None
     return Clock(times, times[0] + np.concatenate([[0.0], np.cumsum(short)]))
 

@@ -55,6 +55,10 @@ class Tracks:
             del self.pictures[old]
         return motion
 
+    def forget(self) -> None:
+        """Let go of all tracks, where what they follow cannot be what they followed."""
+        self.ids, self.at, self.born, self.birthplace = self.ids[:0], self.at[:0], self.born[:0], self.birthplace[:0]
+
     def resume(self, window: int, ids: NDArray[np.int64], at: Array) -> None:
         """Continue tracks that were found again in the newest window."""
         fresh = ~np.isin(self.ids, ids)

@@ -4,17 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+import staging
 from numpy.typing import ArrayLike
+from staging import SENSOR
 
-from spiked.evaluate import score_trajectory
-from spiked.recon import Options, Reconstructor, State
-from spiked.sensor import Intrinsics, Sensor
+from spiked.recon import Reconstructor, State
 from spiked.simulate import MotionKind, SimulatedCamera
 from spiked.simulate.motion import Array, Motion, StandThenMove, make_motion
 from spiked.simulate.room import Room
-from spiked.trajectory import Trajectory
-
-SENSOR = Sensor(240, 160, 20000.0, intrinsics=Intrinsics.from_fov(240, 160, 60))
 
 
 def path(kind: MotionKind = MotionKind.ARC, seed: int = 2) -> Motion:
@@ -56,22 +53,23 @@ class After:
         )
 
 
+@dataclass(frozen=True)
+class Bursting:
+    """A path on which the camera moves `times` as fast for `frames` frames from `begin` on."""
+
+    base: Motion
+    begin: float
+    frames: float
+    times: float
+
+    def poses(self, frames: ArrayLike) -> tuple[Array, Array]:
+        now = np.atleast_1d(np.asarray(frames, np.float64))
+        return self.base.poses(now + (self.times - 1) * np.clip(now - self.begin, 0, self.frames))
+
+
 def followed(motion: Motion, count: int, lost: tuple[int, int] | None = None) -> tuple[Reconstructor, float, float]:
     """The path without a map, its error in percent and its coverage."""
-    camera = SimulatedCamera(SENSOR, seed=2, motion=motion)
-    frames = camera.next_frames(count)
-    reconstructor = Reconstructor(SENSOR, Options(steps=0))
-    for first in range(0, count, 40):
-        if lost is not None and lost[0] <= first < lost[1]:
-            if first == lost[0]:
-                reconstructor.gap(first, lost[1] - lost[0])
-            continue
-        reconstructor.feed(first, frames[first : first + 40])
-    reconstructor.finish()
-    k = np.arange(count)
-    truth = Trajectory((k + 0.5) / SENSOR.frame_rate_hz, *camera.truth(k))
-    score = score_trajectory(truth, reconstructor.trajectory(), SENSOR.frame_rate_hz)
-    return reconstructor, np.inf if score.errors is None else score.errors.ate_percent, score.coverage
+    return staging.followed(SimulatedCamera(SENSOR, seed=2, motion=motion), count, lost)
 
 
 @pytest.mark.parametrize("still", [320, 10_000], ids=["a_moment", "half_a_second"])
@@ -102,3 +100,15 @@ def test_a_camera_that_turns_first() -> None:
 def test_a_short_gap_leaves_the_path_whole() -> None:
     _, error, coverage = followed(path(), 600, lost=(320, 360))
     assert error < 3 and coverage > 0.9
+
+
+def test_a_burst_of_six_pixels_a_frame_is_told_and_the_path_goes_on_behind_it() -> None:
+    """Half of what was in view is gone after 20 frames, none of which shows more than smears."""
+    reconstructor, error, coverage = followed(Bursting(path(), 400, 20, 20), 700)
+    assert reconstructor.status().state is State.TRACK, reconstructor.status().reason
+    assert error < 3 and 0.9 < coverage < 0.99, (error, coverage)
+    changes = reconstructor._odometry.changes
+    assert any(state is State.LOST and "too fast" in reason for _, state, reason in changes), changes
+    assert any(state is State.RELOC and "found again" in reason for _, state, reason in changes), changes
+    times = reconstructor.trajectory().times_s * SENSOR.frame_rate_hz
+    assert not ((times > 408) & (times < 416)).any(), "no poses are invented in the burst"

@@ -18,7 +18,7 @@ WEB := $(shell find web -path web/node_modules -prune -o -type f -print)
 PAGE := service/spiked_service/page/index.html
 NPM_CI := web/node_modules/.package-lock.json
 
-.PHONY: demo test test-slow lint bench page api wheel clean
+.PHONY: demo test test-slow validation lint bench page api wheel clean
 .DELETE_ON_ERROR:
 
 # Without Node the daemon runs all the same; its page then says how to build it.
@@ -32,6 +32,10 @@ test: lint $(PAGE) $(VENV)/.chromium $(VENV)/.mocks
 
 test-slow: $(VENV)/.native $(PAGE) $(VENV)/.chromium $(VENV)/.mocks $(VENV)/.guest
 	$(BIN)/pytest -m slow
+
+# the figures that the method has to hold, printed; half an hour on two cores, without the slow ones two minutes
+validation: $(VENV)/.native
+	$(BIN)/pytest -m validation
 
 lint: $(VENV)/.native $(NPM_CI)
 	$(BIN)/ruff check .

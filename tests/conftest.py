@@ -120,3 +120,22 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("pictures") / "noise.dat"
     np.random.default_rng(3).integers(0, 256, (200, COMPACT_BYTES), np.uint8).tofile(path)
     return path
+
+
+_FIGURES = pytest.StashKey[list[tuple[str, str, str]]]()
+
+
+@pytest.fixture
+def figure(request: pytest.FixtureRequest) -> Callable[[str, object, str], None]:
+    """Notes a figure of the validation list, `figure(what, value, bound)`, to be printed when all tests have run."""
+    figures = request.config.stash.setdefault(_FIGURES, [])
+    return lambda what, value, bound: figures.append((what, str(value), bound))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Print the figures of the validation list."""
+    figures = config.stash.get(_FIGURES, [])
+    if figures:
+        terminalreporter.section("validation")
+    for what, value, bound in figures:
+        terminalreporter.write_line(f"{what:58s} {value:>16s}   ({bound})")

@@ -99,21 +99,6 @@ def test_given_poses_are_kept(shaken: tuple[SimulatedCamera, np.ndarray, Traject
     assert len(reconstructor.scene()) > 500
 
 
-@pytest.mark.parametrize("lost", [1, 10, 100])
-def test_a_gap_is_crossed(shaken: tuple[SimulatedCamera, np.ndarray, Trajectory], lost: int) -> None:
-    _, frames, truth = shaken
-    reconstructor = Reconstructor(sensor(), Options(steps=0))
-    at = 300
-    feed(reconstructor, frames[:at])
-    reconstructor.gap(at, lost)
-    feed(reconstructor, frames[at + lost :], first=at + lost)
-    reconstructor.finish()
-    assert reconstructor.status().state is State.TRACK, reconstructor.report()["states"]
-    score = score_trajectory(truth, reconstructor.trajectory(), 20000.0)
-    assert score.errors is not None and score.errors.ate_percent < 5.0
-    assert finite(reconstructor)
-
-
 def test_a_recording_of_forty_frames_says_that_it_is_too_short() -> None:
     reconstructor = Reconstructor(sensor())
     feed(reconstructor, SimulatedCamera(sensor(), seed=1).next_frames(40))

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from spiked.sensor import Intrinsics, Mosaic
 
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "colours")
 BACKGROUND = 0.15
+Figure = Callable[[str, object, str], None]
 
 
 class Case:
@@ -77,8 +79,9 @@ def test_images_match_the_oracle(name: str) -> None:
     assert np.abs(image.depth - depth.detach().numpy()).max() < 1e-4
 
 
+@pytest.mark.validation
 @pytest.mark.parametrize("name", CASES)
-def test_gradients_match_the_oracle(name: str) -> None:
+def test_gradients_match_the_oracle(name: str, figure: Figure) -> None:
     case = Case(name)
     rasteriser, _ = case.forward()
     gradients = rasteriser.backward(case.d_values)
@@ -89,15 +92,19 @@ def test_gradients_match_the_oracle(name: str) -> None:
     }
     errors["rotation"] = relative(gradients.rotation, parameters.turns.grad.numpy())
     errors["centre"] = relative(gradients.centre, parameters.centres.grad.numpy())
+    figure(f"gradients, {name}: worst relative error", f"{max(errors.values()):.1e}", "< 1e-4")
     assert max(errors.values()) < 1e-4, errors
 
 
+@pytest.mark.validation
 @pytest.mark.parametrize("name", CASES)
-def test_moving_the_camera_is_moving_the_scene_back(name: str) -> None:
+def test_moving_the_camera_is_moving_the_scene_back(name: str, figure: Figure) -> None:
     case = Case(name, seed=5)
     rasteriser, _ = case.forward()
     gradients = rasteriser.backward(case.d_values)
-    assert relative(gradients.centre.sum(0), -gradients.means.astype(np.float64).sum(0)) < 1e-5
+    error = relative(gradients.centre.sum(0), -gradients.means.astype(np.float64).sum(0))
+    figure(f"translation identity, {name}", f"{error:.1e}", "< 1e-5")
+    assert error < 1e-5
 
 
 def test_pixels_without_weight_are_black_and_move_nothing() -> None:

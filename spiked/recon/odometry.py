@@ -89,6 +89,9 @@ STOOD_PX = 0.3
 """And so far from the first view of a bootstrap the camera has hardly moved: it may as well begin later."""
 HOPELESS_CHI2 = 25.0
 """Beyond this, five times as far off as noise explains, the points contradict a pose: what was followed is not them."""
+STRAY_NOISES, STRAY_PX = 6.0, (0.5, 2.0)
+"""A point that lies off by so many times the noise of the tracks, within these bounds, in a third of its views is
+forgotten: what moves slowly by itself would else stay."""
 FOUND_CHI2 = 4.0
 """A place is found again only where points agree to twice their noise: smears seem to agree with much."""
 RECALL_PX = (0.5, 4.0)
@@ -562,9 +565,8 @@ class Odometry:
         for n, rotation, centre in zip(numbers, bundle.rotations, bundle.centres, strict=True):
             self.views[n].rotation, self.views[n].centre = rotation, centre
         error = np.linalg.norm(bundle.residuals(), axis=1)
-        bad = np.bincount(bundle.point, error > 2 * INLIER_PX, len(ids)) > 0.3 * np.bincount(
-            bundle.point, minlength=len(ids)
-        )
+        stray = error > np.clip(STRAY_NOISES * bundle.noise_px(), *STRAY_PX)
+        bad = np.bincount(bundle.point, stray, len(ids)) > 0.3 * np.bincount(bundle.point, minlength=len(ids))
         self.points[ids] = np.where(bad[:, None], np.nan, bundle.points)
 
     def triangulate_all(self) -> None:

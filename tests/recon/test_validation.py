@@ -110,5 +110,5 @@ def _quality(maps: PixelMaps, lighting: Lighting, frames: int = 480) -> float:
         seen: Array = camera.view(truth.rotations[at], truth.centres[at]).astype(float)
         rendered = reconstructor.view(rotation[0], centre[0])[..., 0].astype(float)
         factor = (rendered * seen).sum() / (rendered**2).sum()
-        figures.append(psnr(factor * rendered / reconstructor.white, seen / reconstructor.white))
+        figures.append(psnr(factor * rendered / camera.gain, seen / camera.gain))
     return float(np.mean(figures))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 import spiked.native._motion as _motion
 from spiked.blocks import aligned_window
 from spiked.pose import Array
-from spiked.recon.tracks import Picture, flow, picture
+from spiked.recon.tracks import Picture, flow, picture, white_of
 from spiked.sensor import BitOrder, Sensor
 
 Image = NDArray[np.float32]
@@ -226,7 +226,7 @@ def _small(count: NDArray[np.uint16]) -> Picture:
     height, width = count.shape
     even = count[: height // 2 * 2, : width // 2 * 2].astype(np.float32)
     half = cv2.resize(even, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-    return picture(half, max(float(np.percentile(half, 99.5)), 1e-6))
+    return picture(half, white_of(half))
 
 
 def _coarse_motion(a: Picture, b: Picture, sensor: Sensor) -> Field | None:

@@ -10,6 +10,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+import spiked.native._odometry as _odometry
 from spiked.pose import Array, exp_so3, hat, log_so3, mean_rotation
 from spiked.recon.bootstrap import INLIER_PX, LEAST_INLIERS, MORE_MOTION, SCALE_PX, Views
 from spiked.recon.bundle import Bundle
@@ -107,6 +108,8 @@ FOCAL_ROUNDS = 4
 SAME_FOCAL = 2e-3
 """In the end the whole path is adjusted so many times more, at most, until an unknown focal length changes no more than
 this."""
+FIT_SCALES_PX = (4.0, 2.0, 1.0, *[SCALE_PX] * 5)
+"""Scales of the robust loss in the rounds that align one view."""
 GLOBAL_VIEWS = 100
 """At most so many views enter the adjustment of the whole path."""
 
@@ -368,37 +371,15 @@ class Odometry:
         if len(points) < 6:
             return Fit(rotation, centre, 0.0, len(points))
         k = self.intrinsics
-        error = np.zeros((len(points), 2))
-        scales = (4.0, 2.0, 1.0, *[SCALE_PX] * 5)
-        for scale in scales if move else scales[-1:]:
-            local = (points - centre) @ rotation
-            z = np.maximum(local[:, 2], 1e-6)
-            error = np.stack([k.fx * local[:, 0] / z + k.cx, k.fy * local[:, 1] / z + k.cy], 1) - pixels
-            error[local[:, 2] <= 1e-6] = 1e3
-            zero = np.zeros_like(z)
-            rows = np.stack(
-                [
-                    np.stack([k.fx / z, zero, -k.fx * local[:, 0] / z**2], 1),
-                    np.stack([zero, k.fy / z, -k.fy * local[:, 1] / z**2], 1),
-                ],
-                1,
-            )
-            by_point = rows @ rotation.T
-            jacobian = np.concatenate([by_point @ hat(points - centre), -by_point], 2)
-            weight = 1 / (1 + (error**2).sum(1) / scale**2)
-            weighted = jacobian * weight[:, None, None]
-            hessian = np.einsum("mki,mkj->ij", weighted, jacobian)
-            gradient = np.einsum("mki,mk->i", weighted, error)
-            if not move:
-                break
-            step = -np.linalg.solve(hessian + 1e-9 * np.eye(6) * np.trace(hessian), gradient)
-            rotation, centre = exp_so3(step[:3]) @ rotation, centre + step[3:]
-        size = np.linalg.norm(error, axis=1)
+        rotation, centre = rotation.copy(), centre.copy()
+        size, hessian = np.empty(len(points)), np.empty((6, 6))
+        scales = np.array(FIT_SCALES_PX if move else FIT_SCALES_PX[-1:])
+        _odometry.fit_pose(points, pixels, k.fx, k.fy, k.cx, k.cy, scales, rotation, centre, size, hessian, move)
         inliers = float(np.mean(size < 1.5 * INLIER_PX))
         noise = float(np.hypot(max(1.3 * self._noise_px, LEAST_NOISE_PX), view.unsure_px))
         chi2 = float((np.median(size) / (1.1774 * noise)) ** 2)
         depth = float(np.median((points - centre) @ rotation[:, 2]))
-        covariance = max(chi2, 1.0) * noise**2 * np.linalg.inv(hessian + 1e-9 * np.eye(6) * np.trace(hessian))
+        covariance = max(chi2, 1.0) * noise**2 * np.asarray(np.linalg.inv(hessian))
         return Fit(rotation, centre, inliers, len(points), chi2, self._displacement(covariance, rotation, depth))
 
     def _displacement(self, covariance: Array, rotation: Array, depth: float) -> float:

@@ -22,7 +22,7 @@ from spiked.recon.odometry import SAME_FOCAL, WORST_PATH_ERROR, Odometry, State
 from spiked.recon.options import Options
 from spiked.recon.passage import Passage
 from spiked.recon.refine import align_spline
-from spiked.recon.tracks import picture
+from spiked.recon.tracks import picture, white_of
 from spiked.recon.views import Image, View, Windows, luminance
 from spiked.render import Camera
 from spiked.scene import Scene
@@ -233,9 +233,8 @@ class Reconstructor:
 
     def _add(self, view: View) -> None:
         grey = luminance(view.rate, self.sensor.mosaic) if view.sharp is None else view.sharp
-        white = float(np.percentile(grey, 99.5))
         delay = view.delay if view.sharp is None else None
-        image = picture(grey, max(white, 1e-6))
+        image = picture(grey, white_of(grey))
         posed = self._odometry.add(view.time, view.end - view.begin, image, self._given(view), delay)
         self._views.append(view)
         self._broken = False

@@ -6,15 +6,13 @@ one side, and all tracks are seen early or late: there the path would lag behind
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+import spiked.native._odometry as _odometry
 from spiked.pose import Array
 from spiked.recon.tracks import Picture
 
-WINDOW_PX = 13
-"""Edge of what a track is recognised by."""
 UNSURE = 0.25
 """Part of a shift to the view's time that may be wrong: the pixels around a track looked at different times."""
 NEAR = 8
@@ -26,14 +24,9 @@ def delays(image: Picture, delay: NDArray[np.floating], at: Array) -> Array:
 
     delay [H, W] is each pixel's own; those with the steepest slopes say most about where a track is.
     """
-    along = cv2.Scharr(image, cv2.CV_32F, 1, 0)
-    down = cv2.Scharr(image, cv2.CV_32F, 0, 1)
-    weight = along**2 + down**2 + 1.0
-    size = (WINDOW_PX, WINDOW_PX)
-    mean = cv2.boxFilter(weight * delay.astype(np.float32), -1, size) / cv2.boxFilter(weight, -1, size)
-    height, width = image.shape
-    x, y = np.clip(at.astype(int), 0, [width - 1, height - 1]).T
-    return np.asarray(mean[y, x], float)
+    out = np.empty(len(at))
+    _odometry.delays(image, np.ascontiguousarray(delay, np.float16).view(np.uint16), np.ascontiguousarray(at), out)
+    return out
 
 
 @dataclass(frozen=True)

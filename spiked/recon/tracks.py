@@ -4,23 +4,35 @@ Each track keeps the window where it was born and is re-aligned against it, so t
 """
 
 from dataclasses import dataclass, field
-from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+import spiked.native._odometry as _odometry
 from spiked.pose import Array
 
 Picture = NDArray[np.uint8]
+Pyramid = list[NDArray[np.float32]]
+"""See `pyramid`."""
+WINDOW_PX = 13
+"""Edge of what a track is recognised by."""
+LEVELS = 4
+"""Times that a picture is halved to follow tracks from one view to the next."""
 SURE = 0.6
 """With so many of the points found, no other place is tried."""
 
 
 def picture(rate: NDArray[np.float32], white: float) -> Picture:
     """Rates [H, W] as 8-bit values, square root for even contrast (noise grows with the rate); `white` becomes 255."""
-    scaled = np.sqrt(np.clip(rate / white, 0, 1)) * 255
-    return np.asarray(cv2.GaussianBlur(scaled.astype(np.float32), (0, 0), 0.8) + 0.5, np.uint8)
+    scaled = np.empty(rate.shape, np.float32)
+    _odometry.root(np.ascontiguousarray(rate, np.float32), white, scaled)
+    return np.asarray(cv2.convertScaleAbs(cv2.GaussianBlur(scaled, (0, 0), 0.8)), np.uint8)
+
+
+def white_of(rate: NDArray[np.float32]) -> float:
+    """The rate that is shown as white, brighter than 99.5 % of the pixels."""
+    return max(float(_odometry.quantile(np.ascontiguousarray(rate, np.float32), 0.995)), 1e-6)
 
 
 @dataclass
@@ -39,16 +51,18 @@ class Tracks:
     """Positions [live, 2] px (pixel centres at +0.5) in the newest window."""
     born: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     birthplace: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    pictures: dict[int, Picture] = field(default_factory=dict)
+    pictures: dict[int, Pyramid] = field(default_factory=dict)
+    """Of the newest window and those in which tracks were born."""
+    newest_picture: Picture | None = None
     newest: int = -1
 
     def add(self, window: int, image: Picture) -> float:
         """Follow all tracks into a window and start new ones; returns the median motion in px (0 without tracks)."""
-        motion = 0.0
-        if self.newest >= 0 and len(self.ids):
-            motion = self._follow(image)
-        self.newest = window
-        self.pictures[window] = image
+        motion, levels = 0.0, pyramid(image, LEVELS)
+        if self.newest_picture is not None and len(self.ids):
+            motion = self._follow(image, levels)
+        self.newest, self.newest_picture = window, image
+        self.pictures[window] = levels
         if len(self.ids) < 0.7 * self.target:
             self._start(window, image)
         for old in set(self.pictures) - set(self.born.tolist()) - {window}:
@@ -68,18 +82,15 @@ class Tracks:
         self.born = np.concatenate([np.full(count, window), self.born[fresh]])
         self.birthplace = np.concatenate([at, self.birthplace[fresh]])
 
-    def _follow(self, image: Picture) -> float:
-        before = self.pictures[self.newest]
-        if self.far:
-            moved, good = search(before, image, self.at)
+    def _follow(self, image: Picture, levels: Pyramid) -> float:
+        if self.far and self.newest_picture is not None:
+            moved, good = search(self.newest_picture, image, self.at)
         else:
-            moved, good = flow(before, image, self.at, self.at, self.reach_px, levels=4)
+            moved, good = follow(self.pictures[self.newest], levels, self.at, self.at, self.reach_px)
         motion = float(np.median(np.linalg.norm(moved - self.at, axis=1)[good])) if good.any() else 0.0
         for window in np.unique(self.born[good]):
             rows = np.flatnonzero(good & (self.born == window))
-            refined, ok = flow(
-                self.pictures[window], image, self.birthplace[rows], moved[rows], self.reach_px, levels=0
-            )
+            refined, ok = follow(self.pictures[window], levels, self.birthplace[rows], moved[rows], self.reach_px, 0)
             near = np.linalg.norm(refined - moved[rows], axis=1) < 1.5
             moved[rows] = np.where((ok & near)[:, None], refined, moved[rows])
             good[rows] &= ok & near
@@ -110,20 +121,26 @@ def flow(
     a: Picture, b: Picture, start: Array, guess: Array, reach_px: float, levels: int
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Positions in `b` of the points `start` of `a`, and which came back to where they started."""
-    p = (start - 0.5).astype(np.float32)[:, None]
-    q = (guess - 0.5).astype(np.float32)[:, None]
-    lucas_kanade = partial(
-        cv2.calcOpticalFlowPyrLK,
-        winSize=(13, 13),
-        maxLevel=levels,
-        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003),
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        minEigThreshold=1e-4,
-    )
-    forth, ok, _ = lucas_kanade(a, b, p, q.copy())
-    back, ok2, _ = lucas_kanade(b, a, forth, p.copy())
-    close = np.linalg.norm(back[:, 0] - p[:, 0], axis=1) < reach_px
-    return forth[:, 0].astype(float) + 0.5, (ok[:, 0] == 1) & (ok2[:, 0] == 1) & close
+    return follow(pyramid(a, levels), pyramid(b, levels), start, guess, reach_px)
+
+
+def follow(
+    a: Pyramid, b: Pyramid, start: Array, guess: Array, reach_px: float, levels: int | None = None
+) -> tuple[Array, NDArray[np.bool_]]:
+    """As `flow`, for pictures that are used again; with `levels` only so many of the smaller ones are looked at."""
+    at, good = np.array(guess, float), np.empty(len(guess), bool)
+    count = len(a) if levels is None else levels + 1
+    _odometry.follow(a[:count], b[:count], np.ascontiguousarray(start), at, reach_px, good)
+    return at, good
+
+
+def pyramid(image: Picture, levels: int) -> Pyramid:
+    """A picture and up to so many smaller ones, each half the size of the one before, all with a margin."""
+    small = [image]
+    while len(small) <= levels and min(small[-1].shape) > 2 * WINDOW_PX:
+        small.append(np.asarray(cv2.pyrDown(small[-1]), np.uint8))
+    margin = [_odometry.MARGIN_PX] * 4
+    return [np.asarray(cv2.copyMakeBorder(one, *margin, cv2.BORDER_REPLICATE), np.float32) for one in small]
 
 
 def search(a: Picture, b: Picture, points: Array) -> tuple[Array, NDArray[np.bool_]]:

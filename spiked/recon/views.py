@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+import spiked.native._odometry as _odometry
 from spiked.blocks import Window, aligned_window
 from spiked.calibration import Calibration
 from spiked.recon.motion import Sharpener, drift, speed
@@ -14,6 +15,8 @@ from spiked.sensor import Mosaic, Sensor
 
 Image = NDArray[np.float32]
 
+JITTER = 1.2e-3
+"""Squared relative jitter of one interval between spikes."""
 LATE_PERCENT = 10.0
 """Pixels, of a hundred, that may begin before the span over which a view is rendered, or end after it: the darkest ones
 gather charge for so long that sub-frames over all of it would be too long to be straight."""
@@ -98,14 +101,24 @@ def make_view(
     frames: NDArray[np.uint8] | None = None,
 ) -> View:
     """The view of a spike-aligned window, in light instead of spikes where the camera is calibrated."""
-    rate = window.rate(fill=True)
-    variance = np.nan_to_num(window.variance(jitter=1.2e-3), nan=0.0)
-    deviation = np.where(window.valid, np.sqrt(variance), window.rate_bound()).astype(np.float32)
+    shape = window.spikes.shape
+    rate, deviation = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    delay, duration = np.empty(shape, np.float16), np.empty(shape, np.float16)
+    _odometry.measure(
+        window.spikes,
+        window.start_offset,
+        window.stop_offset,
+        window.frames,
+        window.end - window.begin,
+        0.5 * (window.begin + window.end) - window.first_frame,
+        JITTER,
+        rate,
+        deviation,
+        delay.view(np.uint16),
+        duration.view(np.uint16),
+    )
     if calibration is not None:
         rate, deviation = calibration.apply(rate, deviation)
-    middle = 0.5 * (window.begin + window.end)
-    delay = np.nan_to_num(window.centre() - middle, nan=0.0).astype(np.float16)
-    duration = np.where(window.valid, window.duration(), window.end - window.begin).astype(np.float16)
     count = float(window.count.mean())
     return View(window.begin, window.end, rate, deviation, delay, duration, count, after_gap, sharp, first, frames)
 

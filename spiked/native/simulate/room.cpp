@@ -7,7 +7,7 @@
 #include <limits>
 #include <thread>
 
-#include "clones.hpp"
+#include "../clones.hpp"
 
 namespace spiked::simulate {
 namespace {

@@ -4,7 +4,7 @@
 #include <cmath>
 #include <vector>
 
-#include "clones.hpp"
+#include "../clones.hpp"
 
 namespace spiked::simulate {
 namespace {

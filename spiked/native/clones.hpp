@@ -2,7 +2,7 @@
 
 // A function compiled once for each instruction set and chosen when the module is loaded, where GCC can do that.
 #if defined(__x86_64__) && defined(__linux__) && defined(__GNUC__) && !defined(__clang__)
-#define SPIKED_CLONES __attribute__((target_clones("arch=x86-64-v4", "avx2", "default")))
+#define SPIKED_CLONES __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
 #else
 #define SPIKED_CLONES
 #endif

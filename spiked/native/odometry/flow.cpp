@@ -1,0 +1,219 @@
+// Pyramidal Lucas-Kanade: where small windows of one picture are in another, and whether they come back.
+// (J.-Y. Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000: the gradients are those of the
+// first picture, so that one matrix serves all iterations.)
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+#include <vector>
+
+#include "../clones.hpp"
+#include "arrays.hpp"
+
+namespace spiked {
+namespace {
+
+constexpr int kWindow = 13;  // px
+constexpr float kHalf = 0.5f * (kWindow - 1);
+constexpr int kLanes = 16;  // a row of the window and what fills up a vector
+constexpr int kRing = kWindow + 2;
+constexpr int kIterations = 30;
+constexpr float kStill2 = 0.003f * 0.003f;  // px^2, a step that ends the search
+constexpr float kSwing = 0.01f;             // px; two steps that cancel to this do, too
+constexpr float kLeastEdge = 0.1f;  // mean squared gradient a px across the weakest direction, in grey levels squared
+
+// A loop over lanes: one vector each, rather than unrolled before anybody sees that.
+#define SPIKED_LANES _Pragma("GCC unroll 1") _Pragma("GCC ivdep")
+constexpr int kMargin = 24;  // px around a picture that repeat its edge
+
+// A picture without its margin; a place may lie half a window beyond the edge.
+struct Gray {
+    // The row from (x, y) on.
+    const float* at(float x, float y) const {
+        return data + static_cast<int64_t>(y) * stride + static_cast<int64_t>(x);
+    }
+    bool holds(float x, float y) const {
+        return x >= -kHalf && y >= -kHalf && x < static_cast<float>(width) + kHalf &&
+               y < static_cast<float>(height) + kHalf;
+    }
+
+    const float* data;
+    int width, height;
+    int64_t stride;
+};
+
+struct Window {
+    float value[kWindow][kLanes], across[kWindow][kLanes], down[kWindow][kLanes];
+};
+
+struct Matrix {
+    float xx, xy, yy;
+};
+
+// One row between pixels, `a` of the way from each to the next.
+inline void between(const float* __restrict row, float a, float* __restrict out) {
+    SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
+        const float here = row[x], next = row[x + 1];
+        out[x] = here + a * (next - here);
+    }
+}
+
+// The window whose corner is at (left + a, top + b), with its gradients (Scharr), which are 0 beyond its last column.
+inline Matrix cut(const float* corner, int64_t stride, float a, float b, Window& window) {
+    float ring[kRing][kLanes + 4], before[kLanes], after[kLanes];
+    between(corner, a, before);
+    for (int y = 0; y < kRing; ++y) {
+        between(corner + (y + 1) * stride, a, after);
+        SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
+            ring[y][x] = before[x] + b * (after[x] - before[x]);
+            before[x] = after[x];
+        }
+        for (int x = kLanes; x < kLanes + 4; ++x) ring[y][x] = 0;
+    }
+    float xx[kLanes] = {}, xy[kLanes] = {}, yy[kLanes] = {};
+    for (int y = 0; y < kWindow; ++y) {
+        const float *p = ring[y], *q = ring[y + 1], *r = ring[y + 2];
+        SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
+            const float inside = x < kWindow ? 1.0f / 32 : 0.0f;
+            const float dx = inside * (3 * (p[x + 2] - p[x] + r[x + 2] - r[x]) + 10 * (q[x + 2] - q[x]));
+            const float dy = inside * (3 * (r[x] - p[x] + r[x + 2] - p[x + 2]) + 10 * (r[x + 1] - p[x + 1]));
+            window.value[y][x] = q[x + 1];
+            window.across[y][x] = dx;
+            window.down[y][x] = dy;
+            xx[x] += dx * dx;
+            xy[x] += dx * dy;
+            yy[x] += dy * dy;
+        }
+    }
+    Matrix sum = {};
+    SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
+        sum.xx += xx[x];
+        sum.xy += xy[x];
+        sum.yy += yy[x];
+    }
+    return sum;
+}
+
+// The sums over the window of its gradients times the difference to another picture.
+inline void differ(const float* corner, int64_t stride, float a, float b, const Window& window, float* across,
+                   float* down) {
+    float before[kLanes], after[kLanes], u[kLanes] = {}, v[kLanes] = {};
+    between(corner, a, before);
+    for (int y = 0; y < kWindow; ++y) {
+        between(corner + (y + 1) * stride, a, after);
+        SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
+            const float difference = before[x] + b * (after[x] - before[x]) - window.value[y][x];
+            u[x] += difference * window.across[y][x];
+            v[x] += difference * window.down[y][x];
+            before[x] = after[x];
+        }
+    }
+    *across = *down = 0;
+    SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
+        *across += u[x];
+        *down += v[x];
+    }
+}
+
+// Whether a place was found for the window around (x, y) of `from` in `to`, near (*u, *v), which it is put to.
+SPIKED_CLONES bool align(const Gray& from, const Gray& to, float x, float y, float* u, float* v) {
+    if (!from.holds(x, y)) return false;
+    const float left = std::floor(x - kHalf), top = std::floor(y - kHalf);
+    Window window;
+    const Matrix g = cut(from.at(left - 1, top - 1), from.stride, x - kHalf - left, y - kHalf - top, window);
+    const float spread = std::sqrt((g.xx - g.yy) * (g.xx - g.yy) + 4 * g.xy * g.xy);
+    if (g.xx + g.yy - spread < 2 * kLeastEdge * kWindow * kWindow) return false;
+    const float scale = 1 / (g.xx * g.yy - g.xy * g.xy);
+    float last_u = 0, last_v = 0;
+    for (int n = 0; n < kIterations; ++n) {
+        if (!to.holds(*u, *v)) return false;
+        const float column = std::floor(*u - kHalf), row = std::floor(*v - kHalf);
+        float across, down;
+        differ(to.at(column, row), to.stride, *u - kHalf - column, *v - kHalf - row, window, &across, &down);
+        const float du = (g.xy * down - g.yy * across) * scale, dv = (g.xy * across - g.xx * down) * scale;
+        *u += du;
+        *v += dv;
+        if (du * du + dv * dv <= kStill2) break;
+        if (n > 0 && std::fabs(du + last_u) < kSwing && std::fabs(dv + last_v) < kSwing) {
+            *u -= 0.5f * du;
+            *v -= 0.5f * dv;
+            break;
+        }
+        last_u = du;
+        last_v = dv;
+    }
+    return to.holds(*u, *v);
+}
+
+using Pictures = std::vector<Array<const float, 2>>;
+
+std::vector<Gray> grays(const Pictures& pictures) {
+    std::vector<Gray> out;
+    for (const auto& one : pictures) {
+        if (one.shape(0) <= 2 * kMargin || one.shape(1) <= 2 * kMargin) {
+            throw std::invalid_argument("a picture has no pixels within its margin");
+        }
+        const auto stride = static_cast<int64_t>(one.shape(1));
+        out.push_back({one.data() + kMargin * stride + kMargin, static_cast<int>(stride) - 2 * kMargin,
+                       static_cast<int>(one.shape(0)) - 2 * kMargin, stride});
+    }
+    return out;
+}
+
+// From the smallest picture to the full one; (x, y) and (*u, *v) are in px of that, pixel centres at whole numbers.
+bool descend(const std::vector<Gray>& from, const std::vector<Gray>& to, float x, float y, float* u, float* v) {
+    bool found = false;
+    for (int level = static_cast<int>(from.size()) - 1; level >= 0; --level) {
+        const float scale = 1.0f / static_cast<float>(1 << level);
+        float at_u = *u * scale, at_v = *v * scale;
+        found = align(from[level], to[level], x * scale, y * scale, &at_u, &at_v);
+        *u = at_u / scale;
+        *v = at_v / scale;
+    }
+    return found;
+}
+
+void follow(const Pictures& a, const Pictures& b, const Array<const double, 2>& start, const Array<double, 2>& at,
+            float reach, const Array<bool, 1>& good) {
+    const size_t count = start.shape(0);
+    if (a.empty() || a.size() != b.size() || a.size() > 16) {
+        throw std::invalid_argument("expected as many levels, 1 to 16, of both pictures");
+    }
+    if (start.shape(1) != 2 || at.shape(0) != count || at.shape(1) != 2 || good.shape(0) != count) {
+        throw std::invalid_argument("expected start and at [n, 2], good [n]");
+    }
+    const std::vector<Gray> first = grays(a), second = grays(b);
+    for (size_t i = 0; i < first.size(); ++i) {
+        if (first[i].width != second[i].width || first[i].height != second[i].height) {
+            throw std::invalid_argument("both pictures must have the same size");
+        }
+    }
+    nb::gil_scoped_release release;
+    for (size_t n = 0; n < count; ++n) {
+        const float x = static_cast<float>(start.data()[2 * n] - 0.5);
+        const float y = static_cast<float>(start.data()[2 * n + 1] - 0.5);
+        float u = static_cast<float>(at.data()[2 * n] - 0.5), v = static_cast<float>(at.data()[2 * n + 1] - 0.5);
+        bool found = descend(first, second, x, y, &u, &v);
+        at.data()[2 * n] = u + 0.5;
+        at.data()[2 * n + 1] = v + 0.5;
+        if (found) {
+            float back_x = x, back_y = y;
+            found = descend(second, first, u, v, &back_x, &back_y) && std::hypot(back_x - x, back_y - y) < reach;
+        }
+        good.data()[n] = found;
+    }
+}
+
+}  // namespace
+
+void bind_flow(nb::module_& m) {
+    m.attr("MARGIN_PX") = kMargin;
+    m.def("follow", &follow,
+          "For each place of `start` [n, 2] in the first of pictures `a`, each half the size of the one before and\n"
+          "with MARGIN_PX around it that repeat its edge, where\n"
+          "it is in `b`: `at` [n, 2] holds guesses and is changed. `good` [n]: found, and less than `reach` px apart\n"
+          "when followed back. Pixel centres are at +0.5.");
+}
+
+}  // namespace spiked

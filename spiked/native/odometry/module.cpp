@@ -1,0 +1,9 @@
+// What the odometry does for every view, compiled: tracks, poses, adjustment.
+#include "arrays.hpp"
+
+NB_MODULE(_odometry, m) {
+    spiked::bind_normal(m);
+    spiked::bind_pose(m);
+    spiked::bind_flow(m);
+    spiked::bind_light(m);
+}

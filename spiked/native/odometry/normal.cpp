@@ -1,0 +1,268 @@
+// Normal equations of poses and points, robustly weighted, with the points' part taken out (Schur complement).
+// (B. Triggs et al., "Bundle adjustment - a modern synthesis", 1999.)
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <stdexcept>
+#include <vector>
+
+#include "arrays.hpp"
+#include "camera.hpp"
+
+namespace spiked {
+namespace {
+
+using In2 = Array<const double, 2>;
+using In3 = Array<const double, 3>;
+using Index = Array<const int64_t, 1>;
+using Index2 = Array<const int64_t, 2>;
+
+constexpr double kWorst = 1e6;   // a squared error, in units of the scale, beyond which none is worse
+constexpr double kLeast = 1e-9;  // added to the diagonal of a point's Hessian
+
+// What was seen: checked once, then indexed freely.
+struct Observed {
+    Observed(const In3& rotations, const In2& centres, const In2& points, const Index& camera, const Index& point,
+             const In2& pixels)
+        : rotations(rotations.data()),
+          centres(centres.data()),
+          points(points.data()),
+          pixels(pixels.data()),
+          camera(camera.data()),
+          point(point.data()),
+          cameras(static_cast<int64_t>(centres.shape(0))),
+          point_count(static_cast<int64_t>(points.shape(0))),
+          count(static_cast<int64_t>(camera.shape(0))) {
+        if (rotations.shape(0) != centres.shape(0) || rotations.shape(1) != 3 || rotations.shape(2) != 3 ||
+            centres.shape(1) != 3 || points.shape(1) != 3 || pixels.shape(1) != 2) {
+            throw std::invalid_argument("expected rotations [C, 3, 3], centres [C, 3], points [P, 3], pixels [M, 2]");
+        }
+        if (point.shape(0) != camera.shape(0) || pixels.shape(0) != camera.shape(0)) {
+            throw std::invalid_argument("camera, point and pixels must have one entry for each observation");
+        }
+        for (int64_t m = 0; m < count; ++m) {
+            if (this->camera[m] < 0 || this->camera[m] >= cameras || this->point[m] < 0 ||
+                this->point[m] >= point_count) {
+                throw std::invalid_argument("an observation names a camera or point that does not exist");
+            }
+        }
+    }
+
+    Seen look(const Pinhole& k, int64_t m) const {
+        return spiked::look(k, {rotations + 9 * camera[m], centres + 3 * camera[m]}, points + 3 * point[m],
+                            pixels + 2 * m);
+    }
+
+    // Observation numbers by point: those of p are order[first[p]] to order[first[p + 1] - 1].
+    void by_point(std::vector<int64_t>& first, std::vector<int64_t>& order) const {
+        first.assign(point_count + 1, 0);
+        order.resize(count);
+        for (int64_t m = 0; m < count; ++m) ++first[point[m] + 1];
+        for (int64_t p = 0; p < point_count; ++p) first[p + 1] += first[p];
+        std::vector<int64_t> next(first.begin(), first.end() - 1);
+        for (int64_t m = 0; m < count; ++m) order[next[point[m]]++] = m;
+    }
+
+    const double *rotations, *centres, *points, *pixels;
+    const int64_t *camera, *point;
+    int64_t cameras, point_count, count;
+};
+
+double cauchy_square(const Seen& seen, double scale) {
+    if (!seen.in_front) return 2 * kWorst;
+    const double u = seen.error[0] / scale, v = seen.error[1] / scale;
+    return std::min(u * u, kWorst) + std::min(v * v, kWorst);
+}
+
+void residuals(const In3& rotations, const In2& centres, const In2& points, const Index& camera, const Index& point,
+               const In2& pixels, double fx, double fy, double cx, double cy, const Array<double, 2>& out) {
+    const Observed observed(rotations, centres, points, camera, point, pixels);
+    if (out.shape(0) != camera.shape(0) || out.shape(1) != 2) throw std::invalid_argument("out must be [M, 2]");
+    for (int64_t m = 0; m < observed.count; ++m) {
+        const Seen seen = observed.look({fx, fy, cx, cy}, m);
+        for (int i = 0; i < 2; ++i) {
+            out.data()[2 * m + i] = seen.in_front ? seen.error[i] : std::numeric_limits<double>::infinity();
+        }
+    }
+}
+
+double cost(const In3& rotations, const In2& centres, const In2& points, const Index& camera, const Index& point,
+            const In2& pixels, double fx, double fy, double cx, double cy, double scale) {
+    const Observed observed(rotations, centres, points, camera, point, pixels);
+    double sum = 0;
+    for (int64_t m = 0; m < observed.count; ++m) {
+        sum += std::log1p(cauchy_square(observed.look({fx, fy, cx, cy}, m), scale));
+    }
+    return sum / static_cast<double>(observed.count);
+}
+
+// The inverse of the lower Cholesky factor of a symmetric 3x3 matrix, row-major; its upper part is zero.
+void inverse_root(const double* v, double* out) {
+    const double a = std::sqrt(v[0]), b = v[3] / a, c = v[6] / a;
+    const double d = std::sqrt(std::max(v[4] - b * b, kLeast)), e = (v[7] - b * c) / d;
+    const double f = std::sqrt(std::max(v[8] - c * c - e * e, kLeast));
+    out[0] = 1 / a;
+    out[1] = out[2] = out[5] = 0;
+    out[3] = -b / (a * d);
+    out[4] = 1 / d;
+    out[6] = (b * e - c * d) / (a * d * f);
+    out[7] = -e / (d * f);
+    out[8] = 1 / f;
+}
+
+void linearise(const In3& rotations, const In2& centres, const In2& points, const Index& camera, const Index& point,
+               const In2& pixels, double fx, double fy, double cx, double cy, double scale, double damping,
+               const Index2& slots, const In2& shares, bool focal, const Array<double, 2>& hessian,
+               const Array<double, 1>& gradient, const Array<double, 2>& eliminated, const Array<double, 2>& pull,
+               const Array<double, 3>& roots, const Array<double, 3>& pose_hessian) {
+    const Observed observed(rotations, centres, points, camera, point, pixels);
+    const Pinhole k = {fx, fy, cx, cy};
+    const int64_t size = static_cast<int64_t>(hessian.shape(0)), unknown = size - focal;
+    const int64_t each = static_cast<int64_t>(slots.shape(1));
+    const auto count = static_cast<size_t>(observed.point_count), cameras = static_cast<size_t>(observed.cameras);
+    if (static_cast<int64_t>(hessian.shape(1)) != size || static_cast<int64_t>(gradient.shape(0)) != size ||
+        static_cast<int64_t>(eliminated.shape(1)) != size || eliminated.shape(0) != 3 * count ||
+        pull.shape(0) != count || pull.shape(1) != 3 || roots.shape(0) != count || roots.shape(1) != 3 ||
+        roots.shape(2) != 3 || pose_hessian.shape(0) != cameras || pose_hessian.shape(1) != 6 ||
+        pose_hessian.shape(2) != 6 || unknown % 6) {
+        throw std::invalid_argument(
+            "expected hessian [D, D], gradient [D], eliminated [3 P, D], pull [P, 3], roots [P, 3, 3], "
+            "pose_hessian [C, 6, 6] with D six times the slots, and one more for a free focal length");
+    }
+    if (slots.shape(0) != cameras || shares.shape(0) != cameras || shares.shape(1) != slots.shape(1)) {
+        throw std::invalid_argument("slots and shares must be [C, K]");
+    }
+    for (size_t i = 0; i < cameras * slots.shape(1); ++i) {
+        if (slots.data()[i] < -1 || slots.data()[i] >= unknown / 6) {
+            throw std::invalid_argument("a slot is -1 for a fixed pose, or below the number of slots");
+        }
+    }
+    nb::gil_scoped_release release;
+    std::fill_n(hessian.data(), size * size, 0.0);
+    std::fill_n(gradient.data(), size, 0.0);
+    std::fill_n(eliminated.data(), 3 * observed.point_count * size, 0.0);
+    std::fill_n(pose_hessian.data(), 36 * observed.cameras, 0.0);
+    std::vector<double> pose_gradient(6 * cameras), pose_focal(6 * cameras), cross(3 * size);
+    std::vector<char> touched(unknown / 6 + 1);
+    std::vector<int64_t> used, first, order;
+    observed.by_point(first, order);
+    double focal_hessian = 0, focal_gradient = 0;
+    for (int64_t p = 0; p < observed.point_count; ++p) {
+        double v[9] = {}, g[3] = {}, by_focal[3] = {};
+        used.clear();
+        for (int64_t n = first[p]; n < first[p + 1]; ++n) {
+            const int64_t m = order[n], c = observed.camera[m];
+            const Seen seen = observed.look(k, m);
+            if (!seen.in_front) continue;
+            const double weight = 1 / (1 + cauchy_square(seen, scale));
+            double block[6][3] = {};
+            double* own = pose_hessian.data() + 36 * c;
+            for (int row = 0; row < 2; ++row) {
+                const double* b = seen.by_point[row];
+                double a[6];
+                by_pose(b, seen.ray, a);
+                const double error = weight * seen.error[row];
+                for (int i = 0; i < 3; ++i) {
+                    const double wb = weight * b[i];
+                    for (int j = 0; j <= i; ++j) v[3 * i + j] += wb * b[j];
+                    for (int j = 0; j < 6; ++j) block[j][i] += wb * a[j];
+                    g[i] += b[i] * error;
+                }
+                for (int i = 0; i < 6; ++i) {
+                    const double wa = weight * a[i];
+                    for (int j = 0; j <= i; ++j) own[6 * i + j] += wa * a[j];
+                    pose_gradient[6 * c + i] += a[i] * error;
+                }
+                if (focal) {
+                    const double f = seen.error[row] + observed.pixels[2 * m + row] - (row ? cy : cx);
+                    focal_hessian += weight * f * f;
+                    focal_gradient += f * error;
+                    for (int i = 0; i < 3; ++i) by_focal[i] += weight * f * b[i];
+                    for (int i = 0; i < 6; ++i) pose_focal[6 * c + i] += weight * f * a[i];
+                }
+            }
+            for (int64_t s = 0; s < each; ++s) {
+                const int64_t slot = slots.data()[c * each + s];
+                const double share = shares.data()[c * each + s];
+                if (slot < 0 || share == 0) continue;
+                if (!touched[slot]) {
+                    touched[slot] = 1;
+                    used.push_back(slot);
+                }
+                double* into = cross.data() + 18 * slot;
+                for (int i = 0; i < 6; ++i)
+                    for (int j = 0; j < 3; ++j) into[3 * i + j] += share * block[i][j];
+            }
+        }
+        for (int i = 0; i < 3; ++i) v[4 * i] = v[4 * i] * (1 + damping) + kLeast;
+        double* root = roots.data() + 9 * p;
+        inverse_root(v, root);
+        for (int a = 0; a < 3; ++a) {
+            double sum = 0;
+            for (int b = 0; b <= a; ++b) sum += root[3 * a + b] * g[b];
+            pull.data()[3 * p + a] = sum;
+        }
+        for (const int64_t slot : used) {
+            touched[slot] = 0;
+            double* from = cross.data() + 18 * slot;
+            for (int a = 0; a < 3; ++a) {
+                double* to = eliminated.data() + (3 * p + a) * size + 6 * slot;
+                for (int i = 0; i < 6; ++i) {
+                    double sum = 0;
+                    for (int b = 0; b <= a; ++b) sum += root[3 * a + b] * from[3 * i + b];
+                    to[i] = sum;
+                }
+            }
+            std::fill_n(from, 18, 0.0);
+        }
+        if (focal) {
+            for (int a = 0; a < 3; ++a) {
+                double sum = 0;
+                for (int b = 0; b <= a; ++b) sum += root[3 * a + b] * by_focal[b];
+                eliminated.data()[(3 * p + a) * size + unknown] = sum;
+            }
+        }
+    }
+    for (int64_t c = 0; c < observed.cameras; ++c) {
+        double* own = pose_hessian.data() + 36 * c;
+        for (int i = 0; i < 6; ++i)
+            for (int j = i + 1; j < 6; ++j) own[6 * i + j] = own[6 * j + i];
+        for (int64_t s = 0; s < each; ++s) {
+            const int64_t slot = slots.data()[c * each + s];
+            const double share = shares.data()[c * each + s];
+            if (slot < 0 || share == 0) continue;
+            for (int i = 0; i < 6; ++i) {
+                double* row = hessian.data() + (6 * slot + i) * size;
+                gradient.data()[6 * slot + i] += share * pose_gradient[6 * c + i];
+                for (int64_t t = 0; t < each; ++t) {
+                    const int64_t other = slots.data()[c * each + t];
+                    const double both = share * shares.data()[c * each + t];
+                    if (other < 0 || both == 0) continue;
+                    for (int j = 0; j < 6; ++j) row[6 * other + j] += both * own[6 * i + j];
+                }
+                if (focal) {
+                    row[unknown] += share * pose_focal[6 * c + i];
+                    hessian.data()[unknown * size + 6 * slot + i] += share * pose_focal[6 * c + i];
+                }
+            }
+        }
+    }
+    if (focal) {
+        hessian.data()[size * size - 1] = focal_hessian;
+        gradient.data()[unknown] = focal_gradient;
+    }
+}
+
+}  // namespace
+
+void bind_normal(nb::module_& m) {
+    m.def("residuals", &residuals,
+          "Image minus observation in px, [M, 2]; infinite for a point at or behind its camera.");
+    m.def("cost", &cost, "Mean over observations of the Cauchy loss log(1 + e^2 / scale^2).");
+    m.def("linearise", &linearise,
+          "Hessian [D, D] and gradient [D] of what the poses are made of: slots [C, K] of six numbers each, with\n"
+          "shares [C, K], and the logarithm of the focal length where it is free. Each point's damped 3x3 Hessian V\n"
+          "is taken out: with roots R = chol(V)^-1, `eliminated` holds the rows R cross^T and `pull` R gradient.");
+}
+
+}  // namespace spiked

@@ -1,0 +1,110 @@
+// One pose by known points: robust Gauss-Newton.
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+
+#include "arrays.hpp"
+#include "camera.hpp"
+
+namespace spiked {
+namespace {
+
+constexpr double kBehind = 1e3;  // px, the error of a point that is not in front of the camera
+
+// Solves the symmetric positive definite 6x6 system a x = b in place (Cholesky); false where it is not definite.
+bool solve6(double* a, double* b) {
+    for (int j = 0; j < 6; ++j) {
+        double pivot = a[6 * j + j];
+        for (int k = 0; k < j; ++k) pivot -= a[6 * j + k] * a[6 * j + k];
+        if (!(pivot > 0)) return false;
+        pivot = std::sqrt(pivot);
+        a[6 * j + j] = pivot;
+        for (int i = j + 1; i < 6; ++i) {
+            double sum = a[6 * i + j];
+            for (int k = 0; k < j; ++k) sum -= a[6 * i + k] * a[6 * j + k];
+            a[6 * i + j] = sum / pivot;
+        }
+    }
+    for (int i = 0; i < 6; ++i) {
+        for (int k = 0; k < i; ++k) b[i] -= a[6 * i + k] * b[k];
+        b[i] /= a[6 * i + i];
+    }
+    for (int i = 5; i >= 0; --i) {
+        for (int k = i + 1; k < 6; ++k) b[i] -= a[6 * k + i] * b[k];
+        b[i] /= a[6 * i + i];
+    }
+    return true;
+}
+
+// rotation <- Exp(phi) rotation (Rodrigues).
+void turn(const double* phi, double* rotation) {
+    const double square = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2], angle = std::sqrt(square);
+    const double a = angle < 1e-4 ? 1 - square / 6 : std::sin(angle) / angle;
+    const double b = angle < 1e-4 ? 0.5 - square / 24 : (1 - std::cos(angle)) / square;
+    const double x = phi[0], y = phi[1], z = phi[2];
+    const double e[9] = {1 - b * (y * y + z * z), b * x * y - a * z,       b * x * z + a * y,
+                         b * x * y + a * z,       1 - b * (x * x + z * z), b * y * z - a * x,
+                         b * x * z - a * y,       b * y * z + a * x,       1 - b * (x * x + y * y)};
+    double out[9];
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j)
+            out[3 * i + j] = e[3 * i] * rotation[j] + e[3 * i + 1] * rotation[3 + j] + e[3 * i + 2] * rotation[6 + j];
+    std::copy_n(out, 9, rotation);
+}
+
+void fit_pose(const Array<const double, 2>& points, const Array<const double, 2>& pixels, double fx, double fy,
+              double cx, double cy, const Array<const double, 1>& scales, const Array<double, 2>& rotation,
+              const Array<double, 1>& centre, const Array<double, 1>& error, const Array<double, 2>& hessian,
+              bool move) {
+    const size_t count = points.shape(0);
+    if (points.shape(1) != 3 || pixels.shape(0) != count || pixels.shape(1) != 2 || error.shape(0) != count ||
+        rotation.shape(0) != 3 || rotation.shape(1) != 3 || centre.shape(0) != 3 || hessian.shape(0) != 6 ||
+        hessian.shape(1) != 6) {
+        throw std::invalid_argument(
+            "expected points [n, 3], pixels [n, 2], rotation [3, 3], centre [3], error [n], hessian [6, 6]");
+    }
+    const Pinhole k = {fx, fy, cx, cy};
+    const Pose pose = {rotation.data(), centre.data()};
+    for (size_t round = 0; round < scales.shape(0); ++round) {
+        const double scale = scales.data()[round];
+        double h[36] = {}, g[6] = {};
+        for (size_t n = 0; n < count; ++n) {
+            Seen seen = look(k, pose, points.data() + 3 * n, pixels.data() + 2 * n);
+            if (!seen.in_front) seen.error[0] = seen.error[1] = kBehind;
+            const double square = seen.error[0] * seen.error[0] + seen.error[1] * seen.error[1];
+            error.data()[n] = std::sqrt(square);
+            const double weight = 1 / (1 + square / (scale * scale));
+            for (int row = 0; row < 2; ++row) {
+                double a[6];
+                by_pose(seen.by_point[row], seen.ray, a);
+                for (int i = 0; i < 6; ++i) {
+                    const double wa = weight * a[i];
+                    for (int j = 0; j <= i; ++j) h[6 * i + j] += wa * a[j];
+                    g[i] -= wa * seen.error[row];
+                }
+            }
+        }
+        double trace = 0;
+        for (int i = 0; i < 6; ++i) {
+            trace += h[7 * i];
+            for (int j = i + 1; j < 6; ++j) h[6 * i + j] = h[6 * j + i];
+        }
+        for (int i = 0; i < 6; ++i) h[7 * i] += 1e-9 * trace;
+        std::copy_n(h, 36, hessian.data());
+        if (!move || !solve6(h, g)) break;
+        turn(g, rotation.data());
+        for (int i = 0; i < 3; ++i) centre.data()[i] += g[3 + i];
+    }
+}
+
+}  // namespace
+
+void bind_pose(nb::module_& m) {
+    m.def(
+        "fit_pose", &fit_pose,
+        "Gauss-Newton with Cauchy weights, one step for each of `scales` (px): changes rotation and centre in place;\n"
+        "`error` [n] (px) and `hessian` [6, 6] are those before the last step. Without `move` they are only looked "
+        "at.");
+}
+
+}  // namespace spiked

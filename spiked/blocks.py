@@ -239,14 +239,25 @@ def _widened(block: Block, offset: Offsets, shift: int) -> NDArray[np.uint16]:
 
 
 def aligned_window(
-    frames: NDArray[np.uint8], sensor: Sensor, first_frame: int, begin: int, end: int, *, instruction_set: str = ""
+    frames: NDArray[np.uint8],
+    sensor: Sensor,
+    first_frame: int,
+    begin: int,
+    end: int,
+    *,
+    out: Window | None = None,
+    instruction_set: str = "",
 ) -> Window:
     """The spike-aligned window of the nominal [begin, end), both absolute, in stored frames uint8 [n, frame_bytes].
 
     `frames` begins with the absolute index `first_frame` and should reach beyond the nominal window by the longest
-    interval of interest. Raises ValueError unless first_frame <= begin < end <= first_frame + n and n <= 65534.
+    interval of interest. With `out`, an earlier window of this sensor, its arrays are written and the result refers to
+    them. Raises ValueError unless first_frame <= begin < end <= first_frame + n and n <= 65534.
     """
-    spikes, start, stop, count = (np.empty((sensor.height, sensor.width), np.uint16) for _ in range(4))
+    if out is None:
+        spikes, start, stop, count = (np.empty((sensor.height, sensor.width), np.uint16) for _ in range(4))
+    else:
+        spikes, start, stop, count = out.spikes, out.start_offset, out.stop_offset, out.count
     _blocks.aligned_window(
         frames,
         _layout(sensor),

@@ -63,11 +63,12 @@ class Bundle:
             free[0] = False
         else:
             free &= ~fixed
-        parts = _Parts.of_poses(free)
+        parts, room = _Parts.of_poses(free), None
         damping, current = 1e-3, self.cost(scale_px)
         for _ in range(iterations):
             while damping < 1e6:
-                trial = self._stepped(self._linearise(scale_px, parts, damping).solve(damping), free)
+                room = self._linearise(scale_px, parts, damping, room)
+                trial = self._stepped(room.solve(damping), free)
                 cost = trial.cost(scale_px)
                 if cost < current:
                     break
@@ -88,13 +89,14 @@ class Bundle:
         """As `optimise`, with the poses tied to a spline at `times` [C] (frames): returns spline and cost."""
         self.rotations, self.centres = spline.poses(times)
         inertia = Inertia.of(spline, spline.basis_matrix(times), self.noise_px())
-        parts = _Parts.of_knots(spline, times)
+        parts, room = _Parts.of_knots(spline, times), None
         share = 2 / (scale_px**2 * len(self.camera))  # of the energy: the cost is a mean in units of the scale
         damping, current = 1e-4, self.cost(scale_px) + share * inertia.energy(spline)
         for _ in range(iterations):
             prior = inertia.hessian(), inertia.gradient(spline)
             while damping < 1e6:
-                step = self._linearise(scale_px, parts, damping).solve(damping, prior)
+                room = self._linearise(scale_px, parts, damping, room)
+                step = room.solve(damping, prior)
                 moved = spline.move(step.poses[:, :3], step.poses[:, 3:])
                 trial = self._moved(*moved.poses(times), step)
                 cost = trial.cost(scale_px) + share * inertia.energy(moved)
@@ -142,10 +144,13 @@ class Bundle:
         points, intrinsics = self.points + step.points, _scaled(self.intrinsics, step.log_focal)
         return replace(self, rotations=rotations, centres=centres, points=points, intrinsics=intrinsics)
 
-    def _linearise(self, scale_px: float, parts: "_Parts", damping: float = 0.0) -> "_System":
+    def _linearise(
+        self, scale_px: float, parts: "_Parts", damping: float = 0.0, room: "_System | None" = None
+    ) -> "_System":
+        """The normal equations; written over earlier ones of the same size, if given."""
         size = 6 * parts.count + self.focal_free
         cameras, points = len(self.centres), len(self.points)
-        system = _System(
+        system = room or _System(
             np.empty((size, size)),
             np.empty(size),
             np.empty((3 * points, size)),

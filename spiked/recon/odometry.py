@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import spiked.native._odometry as _odometry
-from spiked.pose import Array, exp_so3, hat, log_so3, mean_rotation
+from spiked.pose import Array, exp_so3, log_so3, mean_rotation
 from spiked.recon.bootstrap import INLIER_PX, LEAST_INLIERS, MORE_MOTION, SCALE_PX, Views
 from spiked.recon.bundle import Bundle
 from spiked.recon.certainty import path_error
@@ -110,8 +110,25 @@ SAME_FOCAL = 2e-3
 this."""
 FIT_SCALES_PX = (4.0, 2.0, 1.0, *[SCALE_PX] * 5)
 """Scales of the robust loss in the rounds that align one view."""
-GLOBAL_VIEWS = 100
-"""At most so many views enter the adjustment of the whole path."""
+SLOW_FRAMES = 16
+"""Shorter views see fast motion."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What the adjustment of the whole path may cost."""
+
+    views: int
+    """At most so many enter it."""
+    free_views: int
+    """And so many its first part, in which each has a pose of its own: that takes time with the cube of them."""
+    rounds: int
+    """Of each part, at most."""
+
+
+MEANWHILE, LAST = Effort(48, 24, 4), Effort(100, 32, 8)
+FAST = Effort(100, 100, 8)
+"""Kinks take all of the views: with 32 of 100 free ones the error of garden_fast was 4 %."""
 
 
 @dataclass
@@ -328,7 +345,7 @@ class Odometry:
         # adjusted together with the poses.
         off = fit.chi2 > WORST_CHI2 and fit.inliers > WORST_INLIERS
         if count >= self._next_global:
-            self.settle()
+            self.settle(final=False)
         elif count % 8 == 0 or off:
             self._adjust_recent()
         if view.rotation is None or view.centre is None:
@@ -379,21 +396,8 @@ class Odometry:
         noise = float(np.hypot(max(1.3 * self._noise_px, LEAST_NOISE_PX), view.unsure_px))
         chi2 = float((np.median(size) / (1.1774 * noise)) ** 2)
         depth = float(np.median((points - centre) @ rotation[:, 2]))
-        covariance = max(chi2, 1.0) * noise**2 * np.asarray(np.linalg.inv(hessian))
-        return Fit(rotation, centre, inliers, len(points), chi2, self._displacement(covariance, rotation, depth))
-
-    def _displacement(self, covariance: Array, rotation: Array, depth: float) -> float:
-        """Root mean square motion (px, one direction) of the image of a plane at `depth` under errors of a pose with
-        this covariance [6, 6] of (rotation, centre)."""
-        k = self.intrinsics
-        across, down = np.linspace(-1, 1, 5) * k.cx / k.fx, np.linspace(-1, 1, 5) * k.cy / k.fy
-        x, y = (g.ravel() for g in np.meshgrid(across, down))
-        one, zero = np.ones_like(x), np.zeros_like(x)
-        rows = np.stack([np.stack([k.fx * one, zero, -k.fx * x], 1), np.stack([zero, k.fy * one, -k.fy * y], 1)], 1)
-        by_point = rows @ rotation.T / max(depth, 1e-6)
-        ray = depth * np.stack([x, y, one], 1) @ rotation.T
-        jacobian = np.concatenate([by_point @ hat(ray), -by_point], 2)
-        return float(np.sqrt(max(np.einsum("nki,ij,nkj->", jacobian, covariance, jacobian), 0.0) / (2 * len(x))))
+        seen_px = _odometry.displacement(hessian, rotation, k.fx, k.fy, k.cx, k.cy, max(depth, 1e-6))
+        return Fit(rotation, centre, inliers, len(points), chi2, float(np.sqrt(max(chi2, 1.0)) * noise * seen_px))
 
     def _relocalise(self, picture: Picture) -> Fit | None:
         """Find known points of earlier key views in this one; on success they become tracks again."""
@@ -444,7 +448,7 @@ class Odometry:
 
     def _triangulate(self, span: range) -> None:
         """Positions for tracks that have none, from the posed views of `span`."""
-        rotations, _, rays, ids, centres, pixels = self._gather(span, known=False)
+        rotations, rays, ids, centres, pixels = self._unplaced(span)
         if len(ids) == 0:
             return
         unique, row = np.unique(ids, return_inverse=True)
@@ -466,43 +470,29 @@ class Odometry:
         good = wide & (worst < 2.0)
         self.points[unique[good]] = position[good]
 
-    def _gather(
-        self, span: range, known: bool
-    ) -> tuple[Array, NDArray[np.int64], Array, NDArray[np.int64], Array, Array]:
-        """Observations in the posed views of `span` of tracks with (or without) a position:
-        rotations, view number, unit world rays, ids, centres, pixels."""
+    def _unplaced(self, span: range) -> tuple[Array, Array, NDArray[np.int64], Array, Array]:
+        """Observations in the posed views of `span` of tracks without a position:
+        rotations, unit world rays, ids, centres, pixels."""
         k = self.intrinsics
-        columns: list[tuple[Array, ...]] = []
+        unknown = np.isnan(self.points[:, 0])
+        rows: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
+        ids, pixels = [np.zeros(0, np.int64)], [np.zeros((0, 2))]
+        rotations, centres = [np.eye(3)], [np.zeros(3)]
         for number in span:
             view = self.views[number]
             if view.rotation is None or view.centre is None:
                 continue
-            keep = np.isfinite(self.points[view.ids, 0]) == known
-            pixels = view.pixels[keep]
-            rays = np.column_stack([(pixels - [k.cx, k.cy]) / [k.fx, k.fy], np.ones(len(pixels))]) @ view.rotation.T
-            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-            n = len(pixels)
-            columns.append(
-                (
-                    np.tile(view.rotation, (n, 1, 1)),
-                    np.full(n, number),
-                    rays,
-                    view.ids[keep],
-                    np.tile(view.centre, (n, 1)),
-                    pixels,
-                )
-            )
-        if not columns:
-            return (
-                np.zeros((0, 3, 3)),
-                np.zeros(0, int),
-                np.zeros((0, 3)),
-                np.zeros(0, int),
-                np.zeros((0, 3)),
-                np.zeros((0, 2)),
-            )
-        a, b, c, d, e, f = (np.concatenate(column) for column in zip(*columns, strict=True))
-        return a, b, c, d, e, f
+            keep = np.flatnonzero(unknown[view.ids])
+            rows.append(np.full(len(keep), len(rotations)))
+            ids.append(view.ids[keep])
+            pixels.append(view.pixels[keep])
+            rotations.append(view.rotation)
+            centres.append(view.centre)
+        row, at = np.concatenate(rows), np.concatenate(pixels)
+        turned = np.stack(rotations)[row]
+        rays = np.column_stack([(at - [k.cx, k.cy]) / [k.fx, k.fy], np.ones(len(at))])
+        rays = np.einsum("mij,mj->mi", turned, rays / np.linalg.norm(rays, axis=1, keepdims=True))
+        return turned, rays, np.concatenate(ids), np.stack(centres)[row], at
 
     def _bundle(self, numbers: list[int]) -> tuple[Bundle, NDArray[np.int64]] | None:
         """A bundle of the posed views `numbers` and all points seen twice or more in them, with those points' ids."""
@@ -538,7 +528,7 @@ class Odometry:
         bundle, ids = made
         frozen = np.ones(len(numbers), bool)
         frozen[max(fixed, len(numbers) - free) :] = False
-        bundle.optimise(4, SCALE_PX, frozen)
+        bundle.optimise(3, SCALE_PX, frozen, tolerance=1e-3)
         self._take(bundle, ids, numbers)
 
     def _take(self, bundle: Bundle, ids: NDArray[np.int64], numbers: list[int]) -> None:
@@ -562,33 +552,34 @@ class Odometry:
         times, rotations, centres = zip(*posed, strict=True)
         return Waypoints(np.array(times), np.stack(rotations), np.stack(centres))
 
-    def settle(self) -> None:
-        """Adjust the whole path: freely first, then on the coarsest spline that follows it."""
+    def settle(self, final: bool = True) -> None:
+        """Adjust the whole path: freely first, then on the coarsest spline that follows it. Where it is not `final` and
+        the motion is slow, with fewer views and rounds."""
         if self.sparse:
             return
         posed = [n for n, v in enumerate(self.views) if v.rotation is not None]
         self._next_global = max(len(self.views) + 12, int(1.5 * len(self.views)))
         if len(posed) < BOOT_VIEWS:
             return
-        numbers = self._spread(posed)
+        effort = FAST if self.views[-1].length < SLOW_FRAMES else LAST if final else MEANWHILE
+        numbers = self._spread(posed, effort.views)
+        start = self._freely(self._spread(numbers, effort.free_views), effort.rounds)
         made = self._bundle(numbers)
-        if made is None:
+        if start is None or made is None:
             return
         bundle, ids = made
-        bundle.focal_free = self.focal is not None
-        bundle.optimise(8, SCALE_PX, tolerance=1e-3)
         if self.focal is not None:
+            bundle.focal_free = True
             every = ids
             bundle, ids = _steady(bundle, ids)
             self.points[np.setdiff1d(every, ids)] = np.nan  # found again below, where the path then says
         times = np.array([self.views[n].time for n in numbers])
-        start = self._coarsest(times, bundle)
-        spline, _ = bundle.optimise_spline(start, times, 8, SCALE_PX / 2, tolerance=1e-3)
+        spline, _ = bundle.optimise_spline(start, times, effort.rounds, SCALE_PX / 2, tolerance=1e-3)
         if (wrong := self._contradicted(bundle, numbers)) and len(posed) - len(wrong) >= BOOT_VIEWS:
             for n in wrong:  # smeared views, posed by what they seemed to show, would bend the path
                 self.views[n].rotation = self.views[n].centre = None
                 self.views[n].state = State.LOST
-            self.settle()
+            self.settle(final)
             return
         self._noise_px = bundle.noise_px()
         if self.focal is not None:
@@ -602,7 +593,7 @@ class Odometry:
             rotations, centres = self.spline.poses([self.views[n].time for n in others])
             for n, rotation, centre in zip(others, rotations, centres, strict=True):
                 self.views[n].rotation, self.views[n].centre = rotation, centre
-        self._triangulate(range(max(0, len(self.views) - 200), len(self.views)))
+        self._triangulate(range(max(0, len(self.views) - 2 * effort.views), len(self.views)))
 
     def _contradicted(self, bundle: Bundle, numbers: list[int]) -> list[int]:
         """Which of the views `numbers` are where the points, adjusted with them in a bundle, say that they are not."""
@@ -617,13 +608,24 @@ class Odometry:
         around = np.lib.stride_tricks.sliding_window_view(np.pad(chi2, 2), 5).max(1)
         return [n for n, own, most in zip(numbers, chi2, around, strict=True) if own > HOPELESS_CHI2 and own == most]
 
-    def _spread(self, posed: list[int]) -> list[int]:
-        """At most GLOBAL_VIEWS of these views with the first and the last, fewer of them where little moves."""
-        if len(posed) <= GLOBAL_VIEWS:
+    def _freely(self, numbers: list[int], rounds: int) -> Spline | None:
+        """The coarsest spline that follows some views, each adjusted freely with the points; these stay adjusted."""
+        made = self._bundle(numbers)
+        if made is None:
+            return None
+        bundle, ids = made
+        bundle.focal_free = self.focal is not None
+        bundle.optimise(rounds, SCALE_PX, tolerance=1e-3)
+        self.points[ids], self.intrinsics = bundle.points, bundle.intrinsics
+        return self._coarsest(np.array([self.views[n].time for n in numbers]), bundle)
+
+    def _spread(self, posed: list[int], most: int) -> list[int]:
+        """At most so many of these views with the first and the last, fewer of them where little moves."""
+        if len(posed) <= most:
             return posed
         motion = np.array([self.views[n].motion_px for n in posed])
         path = np.cumsum(np.minimum(motion, 2 * np.median(motion)) + 0.3 * motion.mean() + 1e-3)
-        at = np.searchsorted(path, np.linspace(path[0], path[-1], GLOBAL_VIEWS)).clip(0, len(posed) - 1)
+        at = np.searchsorted(path, np.linspace(path[0], path[-1], most)).clip(0, len(posed) - 1)
         return [posed[int(k)] for k in np.unique(at)]
 
     def _in_old_frame(self, spline: Spline, bundle: Bundle, numbers: list[int]) -> Spline:

@@ -60,14 +60,19 @@ def _velocity(last: _Seen, time: float, ids: NDArray[np.int64], at: Array, times
     """Motion of each track in px a frame. Where two views looked at nearly the same moments it is the one from before,
     and new tracks move as those around them."""
     velocity = np.zeros_like(at)
-    _, new, old = np.intersect1d(ids, last.ids, return_indices=True)
+    order = np.argsort(last.ids)
+    place = np.minimum(np.searchsorted(last.ids, ids, sorter=order), max(len(order) - 1, 0))
+    kept = last.ids[order[place]] == ids if len(order) else np.zeros(len(ids), bool)
+    new, old = np.flatnonzero(kept), order[place[kept]] if len(order) else order
     if len(new) < NEAR:
         return velocity
     apart = times[new] - last.times[old]
     sure = np.clip(2 * apart / (time - last.time) - 1, 0, 1)[:, None]
     moved = (at[new] - last.at[old]) / np.maximum(apart, 0.5)[:, None]
     velocity[new] = sure * moved + (1 - sure) * last.velocity[old]
-    rest = np.setdiff1d(np.arange(len(ids)), new)
+    rest = np.flatnonzero(~kept)
+    if len(rest) == 0:
+        return velocity
     distance = ((at[rest, None] - at[None, new]) ** 2).sum(2)
     near = np.argpartition(distance, NEAR - 1, axis=1)[:, :NEAR]
     velocity[rest] = np.median(velocity[new][near], axis=1)

@@ -19,20 +19,22 @@ WINDOW_PX = 13
 """Edge of what a track is recognised by."""
 LEVELS = 4
 """Times that a picture is halved to follow tracks from one view to the next."""
+NEAR_PX = 3.0
+"""After so much motion from one view to the next half the size is small enough to look at."""
 SURE = 0.6
 """With so many of the points found, no other place is tried."""
 
 
 def picture(rate: NDArray[np.float32], white: float) -> Picture:
     """Rates [H, W] as 8-bit values, square root for even contrast (noise grows with the rate); `white` becomes 255."""
-    scaled = np.empty(rate.shape, np.float32)
-    _odometry.root(np.ascontiguousarray(rate, np.float32), white, scaled)
-    return np.asarray(cv2.convertScaleAbs(cv2.GaussianBlur(scaled, (0, 0), 0.8)), np.uint8)
+    out = np.empty(rate.shape, np.uint8)
+    _odometry.picture(np.ascontiguousarray(rate, np.float32), white, out)
+    return out
 
 
 def white_of(rate: NDArray[np.float32]) -> float:
-    """The rate that is shown as white, brighter than 99.5 % of the pixels."""
-    return max(float(_odometry.quantile(np.ascontiguousarray(rate, np.float32), 0.995)), 1e-6)
+    """The rate that is shown as white, brighter than 99.5 % of the pixels in every fourth row."""
+    return max(float(_odometry.quantile(np.ascontiguousarray(rate[::4], np.float32), 0.995)), 1e-6)
 
 
 @dataclass
@@ -54,19 +56,23 @@ class Tracks:
     pictures: dict[int, Pyramid] = field(default_factory=dict)
     """Of the newest window and those in which tracks were born."""
     newest_picture: Picture | None = None
+    motion_px: float = np.inf
+    """Median motion to the newest window."""
     newest: int = -1
+    _spare: list[Pyramid] = field(default_factory=list)
+    """Room that the next picture may take."""
 
     def add(self, window: int, image: Picture) -> float:
         """Follow all tracks into a window and start new ones; returns the median motion in px (0 without tracks)."""
-        motion, levels = 0.0, pyramid(image, LEVELS)
+        motion, levels = 0.0, pyramid(image, LEVELS, self._spare.pop() if self._spare else None)
         if self.newest_picture is not None and len(self.ids):
             motion = self._follow(image, levels)
-        self.newest, self.newest_picture = window, image
+        self.newest, self.newest_picture, self.motion_px = window, image, motion
         self.pictures[window] = levels
         if len(self.ids) < 0.7 * self.target:
             self._start(window, image)
         for old in set(self.pictures) - set(self.born.tolist()) - {window}:
-            del self.pictures[old]
+            self._spare = [self.pictures.pop(old)]
         return motion
 
     def forget(self) -> None:
@@ -86,7 +92,11 @@ class Tracks:
         if self.far and self.newest_picture is not None:
             moved, good = search(self.newest_picture, image, self.at)
         else:
-            moved, good = follow(self.pictures[self.newest], levels, self.at, self.at, self.reach_px)
+            before = self.pictures[self.newest]
+            few = 1 if self.motion_px < NEAR_PX else LEVELS
+            moved, good = follow(before, levels, self.at, self.at, self.reach_px, few, back=False)
+            if few < LEVELS and good.sum() < SURE * len(good):
+                moved, good = follow(before, levels, self.at, self.at, self.reach_px, back=False)
         motion = float(np.median(np.linalg.norm(moved - self.at, axis=1)[good])) if good.any() else 0.0
         for window in np.unique(self.born[good]):
             rows = np.flatnonzero(good & (self.born == window))
@@ -125,22 +135,33 @@ def flow(
 
 
 def follow(
-    a: Pyramid, b: Pyramid, start: Array, guess: Array, reach_px: float, levels: int | None = None
+    a: Pyramid,
+    b: Pyramid,
+    start: Array,
+    guess: Array,
+    reach_px: float,
+    levels: int | None = None,
+    back: bool = True,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """As `flow`, for pictures that are used again; with `levels` only so many of the smaller ones are looked at."""
+    """As `flow`, for pictures that are used again; with `levels` only so many of the smaller ones are looked at, and
+    those that are found need not come `back`."""
     at, good = np.array(guess, float), np.empty(len(guess), bool)
-    count = len(a) if levels is None else levels + 1
-    _odometry.follow(a[:count], b[:count], np.ascontiguousarray(start), at, reach_px, good)
+    count = min(len(a), len(b)) if levels is None else levels + 1
+    _odometry.follow(a[:count], b[:count], np.ascontiguousarray(start), at, reach_px, back, good)
     return at, good
 
 
-def pyramid(image: Picture, levels: int) -> Pyramid:
-    """A picture and up to so many smaller ones, each half the size of the one before, all with a margin."""
+def pyramid(image: Picture, levels: int, into: Pyramid | None = None) -> Pyramid:
+    """A picture and up to so many smaller ones, each half the size of the one before, all with a margin; written over
+    one of the same size, if given."""
     small = [image]
     while len(small) <= levels and min(small[-1].shape) > 2 * WINDOW_PX:
         small.append(np.asarray(cv2.pyrDown(small[-1]), np.uint8))
-    margin = [_odometry.MARGIN_PX] * 4
-    return [np.asarray(cv2.copyMakeBorder(one, *margin, cv2.BORDER_REPLICATE), np.float32) for one in small]
+    margin = 2 * _odometry.MARGIN_PX
+    out = into or [np.empty((len(one) + margin, one.shape[1] + margin), np.float32) for one in small]
+    for one, framed in zip(small, out, strict=True):
+        _odometry.framed(one, framed)
+    return out
 
 
 def search(a: Picture, b: Picture, points: Array) -> tuple[Array, NDArray[np.bool_]]:

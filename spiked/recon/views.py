@@ -24,6 +24,8 @@ LEAST_INSIDE = 0.7
 """Part of a pixel's time that has to lie in that span."""
 MARGIN = 24
 """Frames looked at on both sides of a window for the spikes nearest to its edges."""
+STORE = 4
+"""Times as many frames have room as wait at once."""
 PROBE = 16
 """Frames that the motion is first judged from."""
 WINDOWS = (4, 8, 16, 32, 64)
@@ -135,11 +137,17 @@ class Windows:
         self._calibration = calibration
         if calibration is not None:
             calibration.check(sensor)
-        self._frames = np.zeros((0, sensor.frame_bytes), np.uint8)
+        self._store = np.zeros((0, sensor.frame_bytes), np.uint8)
+        self._shared = False
+        """Whether views hold parts of the store, which then has to stay as it is."""
+        self._frames = self._store
+        """Those that wait, the end of the `filled` part of the store."""
+        self._filled = 0
         self._first = 0
         self._next = 0
         self._gap = False
         self._sharpener: Sharpener | None = None
+        self._window: Window | None = None
 
     def feed(self, first_frame: int, frames: NDArray[np.uint8]) -> Iterator[View]:
         """Take frames uint8 [n, frame_bytes] in stored layout and yield the views that they complete."""
@@ -149,8 +157,21 @@ class Windows:
             self._gap = self._gap or expected > 0
             self._frames, self._first, self._next = self._frames[:0], first_frame, first_frame
             self._sharpener = None
-        self._frames = np.concatenate([self._frames, frames]) if len(self._frames) else frames
+        self._append(frames)
         yield from self._cut(final=False)
+
+    def _append(self, frames: NDArray[np.uint8]) -> None:
+        """Add frames to those that wait, which move to the front of a store that is full, or to a new one."""
+        waiting, count = len(self._frames), len(self._frames) + len(frames)
+        begin = self._filled - waiting
+        if begin + count > len(self._store):
+            if self._shared or 2 * count > len(self._store):
+                self._store, self._shared = np.empty((STORE * count, self.sensor.frame_bytes), np.uint8), False
+            self._store[:waiting] = self._frames
+            begin = 0
+        self._store[begin + waiting : begin + count] = frames
+        self._filled = begin + count
+        self._frames = self._store[begin : self._filled]
 
     @property
     def glance_frames(self) -> int:
@@ -164,7 +185,7 @@ class Windows:
         begin = first_frame + (len(frames) - length) // 2
         window = aligned_window(frames, self.sensor, first_frame, begin, begin + length)
         view = make_view(window, self._gap, self._calibration)
-        self._frames, self._first, self._next, self._gap = frames[:0], stop, stop, False
+        self._frames, self._first, self._next, self._gap = self._store[:0], stop, stop, False
         self._probed, self._sharpener = True, None
         return view
 
@@ -217,7 +238,7 @@ class Windows:
             low = max(self._first, begin - MARGIN)
             high = min(stop, end + MARGIN)
             part = self._frames[low - self._first : high - self._first]
-            window = aligned_window(part, self.sensor, low, begin, end)
+            self._window = window = aligned_window(part, self.sensor, low, begin, end, out=self._window)
             sharp = self._sharp(0.5 * (begin + end), high)
             self._next = end
             if sharp is None and self.sharpen and final:
@@ -226,11 +247,12 @@ class Windows:
             yield make_view(window, self._gap, self._calibration, sharp, first, frames)
             self._gap = False
         keep = max(self._first, min(self._next - MARGIN, stop))
-        self._frames, self._first = self._frames[keep - self._first :].copy(), keep
+        self._frames, self._first = self._frames[keep - self._first :], keep
 
     def _around(self, middle: int, stop: int) -> tuple[int, NDArray[np.uint8]]:
         """The frames about a moment; they share memory with those of other views."""
         first, last = max(self._first, middle - PASSAGE), min(stop, middle + PASSAGE)
+        self._shared = True
         return first, self._frames[first - self._first : last - self._first]
 
     def _sharp(self, time: float, stop: int) -> Image | None:

@@ -20,7 +20,6 @@ constexpr int kLanes = 16;  // a row of the window and what fills up a vector
 constexpr int kRing = kWindow + 2;
 constexpr int kIterations = 30;
 constexpr float kStill2 = 0.003f * 0.003f;  // px^2, a step that ends the search
-constexpr float kSwing = 0.01f;             // px; two steps that cancel to this do, too
 constexpr float kLeastEdge = 0.1f;  // mean squared gradient a px across the weakest direction, in grey levels squared
 
 // A loop over lanes: one vector each, rather than unrolled before anybody sees that.
@@ -125,7 +124,6 @@ SPIKED_CLONES bool align(const Gray& from, const Gray& to, float x, float y, flo
     const float spread = std::sqrt((g.xx - g.yy) * (g.xx - g.yy) + 4 * g.xy * g.xy);
     if (g.xx + g.yy - spread < 2 * kLeastEdge * kWindow * kWindow) return false;
     const float scale = 1 / (g.xx * g.yy - g.xy * g.xy);
-    float last_u = 0, last_v = 0;
     for (int n = 0; n < kIterations; ++n) {
         if (!to.holds(*u, *v)) return false;
         const float column = std::floor(*u - kHalf), row = std::floor(*v - kHalf);
@@ -135,13 +133,6 @@ SPIKED_CLONES bool align(const Gray& from, const Gray& to, float x, float y, flo
         *u += du;
         *v += dv;
         if (du * du + dv * dv <= kStill2) break;
-        if (n > 0 && std::fabs(du + last_u) < kSwing && std::fabs(dv + last_v) < kSwing) {
-            *u -= 0.5f * du;
-            *v -= 0.5f * dv;
-            break;
-        }
-        last_u = du;
-        last_v = dv;
     }
     return to.holds(*u, *v);
 }
@@ -174,8 +165,31 @@ bool descend(const std::vector<Gray>& from, const std::vector<Gray>& to, float x
     return found;
 }
 
+// A picture as floats, with the margin.
+void framed(const Array<const uint8_t, 2>& picture, const Array<float, 2>& out) {
+    const auto height = static_cast<int64_t>(picture.shape(0)), width = static_cast<int64_t>(picture.shape(1));
+    if (height == 0 || width == 0 || out.shape(0) != picture.shape(0) + 2 * kMargin ||
+        out.shape(1) != picture.shape(1) + 2 * kMargin) {
+        throw std::invalid_argument("expected a picture [H, W], and out with MARGIN_PX more on each side");
+    }
+    const int64_t stride = width + 2 * kMargin;
+    float* first = out.data() + kMargin * stride;
+    for (int64_t y = 0; y < height; ++y) {
+        const uint8_t* from = picture.data() + y * width;
+        float* to = first + y * stride;
+        std::fill_n(to, kMargin, static_cast<float>(from[0]));
+        std::copy_n(from, width, to + kMargin);
+        std::fill_n(to + kMargin + width, kMargin, static_cast<float>(from[width - 1]));
+    }
+    for (int64_t y = 0; y < kMargin; ++y) {
+        std::copy_n(first, stride, out.data() + y * stride);
+        std::copy_n(first + (height - 1) * stride, stride, first + (height + y) * stride);
+    }
+}
+
+// `back`: whether it also has to come back.
 void follow(const Pictures& a, const Pictures& b, const Array<const double, 2>& start, const Array<double, 2>& at,
-            float reach, const Array<bool, 1>& good) {
+            float reach, bool back, const Array<bool, 1>& good) {
     const size_t count = start.shape(0);
     if (a.empty() || a.size() != b.size() || a.size() > 16) {
         throw std::invalid_argument("expected as many levels, 1 to 16, of both pictures");
@@ -197,7 +211,7 @@ void follow(const Pictures& a, const Pictures& b, const Array<const double, 2>& 
         bool found = descend(first, second, x, y, &u, &v);
         at.data()[2 * n] = u + 0.5;
         at.data()[2 * n + 1] = v + 0.5;
-        if (found) {
+        if (found && back) {
             float back_x = x, back_y = y;
             found = descend(second, first, u, v, &back_x, &back_y) && std::hypot(back_x - x, back_y - y) < reach;
         }
@@ -209,10 +223,12 @@ void follow(const Pictures& a, const Pictures& b, const Array<const double, 2>& 
 
 void bind_flow(nb::module_& m) {
     m.attr("MARGIN_PX") = kMargin;
+    m.def("framed", &framed, "A picture [H, W] as floats, with MARGIN_PX around it that repeat its edge.");
     m.def("follow", &follow,
           "For each place of `start` [n, 2] in the first of pictures `a`, each half the size of the one before and\n"
           "with MARGIN_PX around it that repeat its edge, where\n"
-          "it is in `b`: `at` [n, 2] holds guesses and is changed. `good` [n]: found, and less than `reach` px apart\n"
+          "it is in `b`: `at` [n, 2] holds guesses and is changed. `good` [n]: found and, with `back`, less than "
+          "`reach` px apart\n"
           "when followed back. Pixel centres are at +0.5.");
 }
 

@@ -47,11 +47,13 @@ SPIKED_CLONES void measure_pixels(const uint16_t* __restrict spikes, const uint1
         const float first = start[i], last = stop[i], m = spikes[i];
         const float bound = (start[i] != kNever ? 2.0f : 1.0f) * per_frame;
         const float time = valid ? last - first : 1.0f;
-        const float p = m / time;
+        const float per_time = 1 / time, p = m * per_time;
         const float charge = p * p / 6 + span.jitter * m + (0.01f * m) * (0.01f * m);
+        const float noise = std::sqrt(charge) * per_time;
+        const uint16_t late = half(0.5f * (first + last) + 0.5f - span.middle);
         rate[i] = valid ? p : 0.5f * bound;
-        deviation[i] = valid ? std::sqrt(charge) / time : bound;
-        delay[i] = valid ? half(0.5f * (first + last) + 0.5f - span.middle) : 0;
+        deviation[i] = valid ? noise : bound;
+        delay[i] = valid ? late : 0;
         duration[i] = half(valid ? time : span.whole);
     }
 }
@@ -83,8 +85,10 @@ void measure(const Counts& spikes, const Counts& start, const Counts& stop, int 
                    deviation.data(), delay.data(), duration.data());
 }
 
-// The value below which so large a share of an image's values (none negative) are: those in the same of 65,536 steps,
+// The value below which so large a share of an image's values (none negative) are: those in the same of 8,192 steps,
 // the upper bits of a float, are told apart, no others.
+constexpr int kBinShift = 19;
+
 double quantile(const Array<const float, 2>& image, double share) {
     const size_t count = image.size();
     if (count == 0 || !(share >= 0 && share <= 1))
@@ -93,10 +97,10 @@ double quantile(const Array<const float, 2>& image, double share) {
         uint32_t bits;
         const float positive = value > 0 ? value : 0.0f;
         std::memcpy(&bits, &positive, 4);
-        return bits >> 16;
+        return bits >> kBinShift;
     };
     nb::gil_scoped_release release;
-    std::vector<uint32_t> bins(1 << 16);
+    std::vector<uint32_t> bins(1 << (32 - kBinShift));
     for (size_t i = 0; i < count; ++i) ++bins[step(image.data()[i])];
     const auto wanted = static_cast<size_t>(share * static_cast<double>(count - 1));
     size_t below = 0;
@@ -112,40 +116,95 @@ double quantile(const Array<const float, 2>& image, double share) {
     return *at;
 }
 
-SPIKED_CLONES void root_pixels(const float* __restrict rate, int64_t count, float scale, float* __restrict out) {
-    for (int64_t i = 0; i < count; ++i) {
-        out[i] = 255 * std::sqrt(std::min(std::max(rate[i] * scale, 0.0f), 1.0f));
+constexpr int kBlur = 3;  // px on either side that a Gaussian of 0.8 px is cut at
+using Taps = float[kBlur + 1];
+
+// 255 times the root of rate * scale, with `kBlur` px on either side mirrored about the edge, blurred along the row.
+SPIKED_CLONES void blurred_row(const float* __restrict rate, int64_t width, float scale, const Taps& taps,
+                               float* __restrict line, float* __restrict out) {
+    float* row = line + kBlur;
+    for (int64_t x = 0; x < width; ++x) row[x] = 255 * std::sqrt(std::min(std::max(rate[x] * scale, 0.0f), 1.0f));
+    for (int x = 1; x <= kBlur; ++x) {
+        row[-x] = row[x];
+        row[width - 1 + x] = row[width - 1 - x];
+    }
+    for (int64_t x = 0; x < width; ++x) {
+        out[x] = taps[0] * row[x] + taps[1] * (row[x - 1] + row[x + 1]) + taps[2] * (row[x - 2] + row[x + 2]) +
+                 taps[3] * (row[x - 3] + row[x + 3]);
     }
 }
 
-void root(const Array<const float, 2>& rate, double white, const Image& out) {
+SPIKED_CLONES void blurred_column(const float* const* rows, int64_t width, const Taps& taps, uint8_t* __restrict out) {
+    const float *a = rows[0], *b = rows[1], *c = rows[2], *d = rows[3], *e = rows[4], *f = rows[5], *g = rows[6];
+    for (int64_t x = 0; x < width; ++x) {
+        const float value =
+            taps[0] * d[x] + taps[1] * (c[x] + e[x]) + taps[2] * (b[x] + f[x]) + taps[3] * (a[x] + g[x]);
+        out[x] = static_cast<uint8_t>(static_cast<int>(value + 0.5f));
+    }
+}
+
+void picture(const Array<const float, 2>& rate, double white, const Array<uint8_t, 2>& out) {
     same_shape(rate, out);
-    root_pixels(rate.data(), static_cast<int64_t>(rate.size()), static_cast<float>(1 / white), out.data());
+    const auto height = static_cast<int64_t>(rate.shape(0)), width = static_cast<int64_t>(rate.shape(1));
+    if (height <= kBlur || width <= kBlur || !(white > 0)) {
+        throw std::invalid_argument("expected a picture of 4x4 pixels or more, and a positive white");
+    }
+    Taps taps;
+    float sum = 0;
+    for (int i = 0; i <= kBlur; ++i) {
+        taps[i] = std::exp(-0.5f * static_cast<float>(i * i) / (0.8f * 0.8f));
+        sum += (i ? 2 : 1) * taps[i];
+    }
+    for (float& tap : taps) tap /= sum;
+    nb::gil_scoped_release release;
+    constexpr int64_t kRows = 2 * kBlur + 1;
+    std::vector<float> rows(kRows * width), line(width + 2 * kBlur);  // row y is in place y modulo kRows
+    int64_t done = 0;
+    for (int64_t y = 0; y < height; ++y) {
+        for (; done < std::min(y + kBlur + 1, height); ++done) {
+            blurred_row(rate.data() + done * width, width, static_cast<float>(1 / white), taps, line.data(),
+                        rows.data() + done % kRows * width);
+        }
+        const float* around[kRows];
+        for (int64_t i = -kBlur; i <= kBlur; ++i) {
+            const int64_t at = y + i < 0 ? -(y + i) : y + i < height ? y + i : 2 * (height - 1) - (y + i);
+            around[i + kBlur] = rows.data() + at % kRows * width;
+        }
+        blurred_column(around, width, taps, out.data() + y * width);
+    }
 }
 
 // The mean delay in a window, of rows [top, bottom) and `columns` columns from `left` on, weighed by squared slopes.
-SPIKED_CLONES float steep_delay(const uint8_t* picture, const uint16_t* delay, int64_t stride, int64_t left,
-                                int64_t top, int64_t bottom, int columns) {
+template <int kLanes>
+inline float steep(const uint8_t* picture, const uint16_t* delay, int64_t stride, int64_t top, int64_t bottom,
+                   int columns) {
     float sum[kColumns] = {}, weights[kColumns] = {};
+    const int lanes = kLanes ? kLanes : columns;
     for (int64_t y = top; y < bottom; ++y) {
-        const uint8_t* q = picture + y * stride + left;
+        const uint8_t* q = picture + y * stride;
         const uint8_t *p = q - stride, *r = q + stride;
-        const uint16_t* d = delay + y * stride + left;
+        const uint16_t* d = delay + y * stride;
 #pragma GCC unroll 1
-        for (int x = 0; x < columns; ++x) {
+        for (int x = 0; x < lanes; ++x) {
             const int dx = 3 * (p[x + 1] - p[x - 1] + r[x + 1] - r[x - 1]) + 10 * (q[x + 1] - q[x - 1]);
             const int dy = 3 * (r[x - 1] - p[x - 1] + r[x + 1] - p[x + 1]) + 10 * (r[x] - p[x]);
-            const float weight = static_cast<float>(dx * dx + dy * dy) + 1;
+            const float weight = x < columns ? static_cast<float>(dx * dx + dy * dy) + 1 : 0.0f;
             sum[x] += weight * full(d[x]);
             weights[x] += weight;
         }
     }
     float all = 0, weight = 0;
-    for (int x = 0; x < columns; ++x) {
+    for (int x = 0; x < lanes; ++x) {
         all += sum[x];
         weight += weights[x];
     }
     return weight > 0 ? all / weight : 0;
+}
+
+SPIKED_CLONES float steep_delay(const uint8_t* picture, const uint16_t* delay, int64_t width, int64_t left, int64_t top,
+                                int64_t bottom, int columns) {
+    return left + kColumns < width ? steep<kColumns>(picture + left, delay + left, width, top, bottom, columns)
+                                   : steep<0>(picture + left, delay + left, width, top, bottom, columns);
 }
 
 void delays(const Array<const uint8_t, 2>& picture, const Array<const uint16_t, 2>& delay,
@@ -173,7 +232,7 @@ void bind_light(nb::module_& m) {
           "Rates and their deviations [H, W], and bits of half floats: frames from `middle` (counted from the first\n"
           "frame looked at) to the middle of each pixel's charge, and over which it came together; `whole` for none.");
     m.def("quantile", &quantile, "The value below which such a share of an image's values are; none may be negative.");
-    m.def("root", &root, "255 times the square root of rate / white, between 0 and 255.");
+    m.def("picture", &picture, "255 times the root of rate / white, at most 255, blurred by 0.8 px.");
     m.def("delays", &delays,
           "Mean of `delay` (bits of half floats) in the 13x13 pixels around each place, weighed by squared slopes.");
 }

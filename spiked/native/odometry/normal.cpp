@@ -6,6 +6,7 @@
 #include <stdexcept>
 #include <vector>
 
+#include "../clones.hpp"
 #include "arrays.hpp"
 #include "camera.hpp"
 
@@ -110,21 +111,148 @@ void inverse_root(const double* v, double* out) {
     out[8] = 1 / f;
 }
 
+// Six numbers of a pose, and two that fill up a vector.
+constexpr int kSix = 8;
+
+struct Job {
+    double scale, damping;
+    int64_t size, unknown, each;  // D, D without the focal length, slots of a pose
+    const int64_t* slots;
+    const double* shares;
+    double *hessian, *gradient, *eliminated, *pull, *roots;
+    bool focal;
+};
+
+// Sums over all observations of a pose: rows of kSix.
+struct PoseSums {
+    explicit PoseSums(int64_t cameras) : hessian(6 * kSix * cameras), gradient(kSix * cameras), focal(kSix * cameras) {}
+
+    std::vector<double> hessian, gradient, focal;
+};
+
+// Sums over all observations of a point.
+struct PointSums {
+    double hessian[9] = {}, gradient[3] = {}, focal[3] = {};
+};
+
+// One row (u or v) of an observation; `cross` [3][kSix] is this observation's part of pose and point together.
+inline void add_row(const Seen& seen, int row, double weight, double* own, double* own_gradient, double* cross,
+                    PointSums& sums) {
+    const double* b = seen.by_point[row];
+    double a[kSix] = {};
+    by_pose(b, seen.ray, a);
+    const double error = weight * seen.error[row];
+    for (int i = 0; i < 3; ++i) {
+        const double wb = weight * b[i];
+        for (int j = 0; j < 3; ++j) sums.hessian[3 * i + j] += wb * b[j];
+        sums.gradient[i] += b[i] * error;
+        for (int j = 0; j < kSix; ++j) cross[kSix * i + j] += wb * a[j];
+    }
+    for (int i = 0; i < 6; ++i) {
+        const double wa = weight * a[i];
+        for (int j = 0; j < kSix; ++j) own[kSix * i + j] += wa * a[j];
+    }
+    for (int j = 0; j < kSix; ++j) own_gradient[j] += a[j] * error;
+}
+
+// Takes a point out: its root, its pull, and its rows of `eliminated`.
+inline void eliminate(const Job& job, int64_t p, PointSums& sums, const std::vector<int64_t>& used, double* cross) {
+    for (int i = 0; i < 3; ++i) sums.hessian[4 * i] = sums.hessian[4 * i] * (1 + job.damping) + kLeast;
+    double* root = job.roots + 9 * p;
+    inverse_root(sums.hessian, root);
+    for (int a = 0; a < 3; ++a) {
+        const double *r = root + 3 * a, *g = sums.gradient, *f = sums.focal;
+        double* to = job.eliminated + (3 * p + a) * job.size;
+        job.pull[3 * p + a] = r[0] * g[0] + r[1] * g[1] + r[2] * g[2];
+        if (job.focal) to[job.unknown] = r[0] * f[0] + r[1] * f[1] + r[2] * f[2];
+        for (const int64_t slot : used) {
+            const double* from = cross + 3 * kSix * slot;
+            for (int i = 0; i < 6; ++i) {
+                to[6 * slot + i] = r[0] * from[i] + r[1] * from[kSix + i] + r[2] * from[2 * kSix + i];
+            }
+        }
+    }
+    for (const int64_t slot : used) std::fill_n(cross + 3 * kSix * slot, 3 * kSix, 0.0);
+}
+
+SPIKED_CLONES void add_points(const Observed& observed, const Pinhole& k, const Job& job, PoseSums& poses) {
+    std::vector<double> cross(3 * kSix * (job.unknown / 6 + 1));
+    std::vector<char> touched(job.unknown / 6 + 1);
+    std::vector<int64_t> used, first, order;
+    observed.by_point(first, order);
+    for (int64_t p = 0; p < observed.point_count; ++p) {
+        PointSums sums;
+        used.clear();
+        for (int64_t n = first[p]; n < first[p + 1]; ++n) {
+            const int64_t m = order[n], c = observed.camera[m];
+            const Seen seen = observed.look(k, m);
+            if (!seen.in_front) continue;
+            const double weight = 1 / (1 + cauchy_square(seen, job.scale));
+            double block[3 * kSix] = {};
+            for (int row = 0; row < 2; ++row) {
+                add_row(seen, row, weight, poses.hessian.data() + 6 * kSix * c, poses.gradient.data() + kSix * c, block,
+                        sums);
+                if (!job.focal) continue;
+                const double f = seen.error[row] + observed.pixels[2 * m + row] - (row ? k.cy : k.cx);
+                double a[6];
+                by_pose(seen.by_point[row], seen.ray, a);
+                job.hessian[job.size * job.size - 1] += weight * f * f;
+                job.gradient[job.unknown] += weight * f * seen.error[row];
+                for (int i = 0; i < 3; ++i) sums.focal[i] += weight * f * seen.by_point[row][i];
+                for (int i = 0; i < 6; ++i) poses.focal[kSix * c + i] += weight * f * a[i];
+            }
+            for (int64_t s = c * job.each; s < (c + 1) * job.each; ++s) {
+                const int64_t slot = job.slots[s];
+                const double share = job.shares[s];
+                if (slot < 0 || share == 0) continue;
+                if (!touched[slot]) used.push_back(slot);
+                touched[slot] = 1;
+                double* into = cross.data() + 3 * kSix * slot;
+                for (int i = 0; i < 3 * kSix; ++i) into[i] += share * block[i];
+            }
+        }
+        for (const int64_t slot : used) touched[slot] = 0;
+        eliminate(job, p, sums, used, cross.data());
+    }
+}
+
+// From poses to what they are made of.
+void share_out(const Job& job, int64_t cameras, const PoseSums& poses) {
+    for (int64_t c = 0; c < cameras; ++c) {
+        for (int64_t s = c * job.each; s < (c + 1) * job.each; ++s) {
+            const int64_t slot = job.slots[s];
+            const double share = job.shares[s];
+            if (slot < 0 || share == 0) continue;
+            for (int i = 0; i < 6; ++i) {
+                double* row = job.hessian + (6 * slot + i) * job.size;
+                job.gradient[6 * slot + i] += share * poses.gradient[kSix * c + i];
+                for (int64_t t = c * job.each; t < (c + 1) * job.each; ++t) {
+                    const int64_t other = job.slots[t];
+                    if (other < 0 || job.shares[t] == 0) continue;
+                    const double* own = poses.hessian.data() + (6 * c + i) * kSix;
+                    for (int j = 0; j < 6; ++j) row[6 * other + j] += share * job.shares[t] * own[j];
+                }
+                if (!job.focal) continue;
+                row[job.unknown] += share * poses.focal[kSix * c + i];
+                job.hessian[job.unknown * job.size + 6 * slot + i] += share * poses.focal[kSix * c + i];
+            }
+        }
+    }
+}
+
 void linearise(const In3& rotations, const In2& centres, const In2& points, const Index& camera, const Index& point,
                const In2& pixels, double fx, double fy, double cx, double cy, double scale, double damping,
                const Index2& slots, const In2& shares, bool focal, const Array<double, 2>& hessian,
                const Array<double, 1>& gradient, const Array<double, 2>& eliminated, const Array<double, 2>& pull,
                const Array<double, 3>& roots, const Array<double, 3>& pose_hessian) {
     const Observed observed(rotations, centres, points, camera, point, pixels);
-    const Pinhole k = {fx, fy, cx, cy};
     const int64_t size = static_cast<int64_t>(hessian.shape(0)), unknown = size - focal;
-    const int64_t each = static_cast<int64_t>(slots.shape(1));
     const auto count = static_cast<size_t>(observed.point_count), cameras = static_cast<size_t>(observed.cameras);
     if (static_cast<int64_t>(hessian.shape(1)) != size || static_cast<int64_t>(gradient.shape(0)) != size ||
         static_cast<int64_t>(eliminated.shape(1)) != size || eliminated.shape(0) != 3 * count ||
         pull.shape(0) != count || pull.shape(1) != 3 || roots.shape(0) != count || roots.shape(1) != 3 ||
         roots.shape(2) != 3 || pose_hessian.shape(0) != cameras || pose_hessian.shape(1) != 6 ||
-        pose_hessian.shape(2) != 6 || unknown % 6) {
+        pose_hessian.shape(2) != 6 || unknown < 0 || unknown % 6) {
         throw std::invalid_argument(
             "expected hessian [D, D], gradient [D], eliminated [3 P, D], pull [P, 3], roots [P, 3, 3], "
             "pose_hessian [C, 6, 6] with D six times the slots, and one more for a free focal length");
@@ -137,119 +265,18 @@ void linearise(const In3& rotations, const In2& centres, const In2& points, cons
             throw std::invalid_argument("a slot is -1 for a fixed pose, or below the number of slots");
         }
     }
+    const Job job = {scale,        damping,       size,           unknown,         static_cast<int64_t>(slots.shape(1)),
+                     slots.data(), shares.data(), hessian.data(), gradient.data(), eliminated.data(),
+                     pull.data(),  roots.data(),  focal};
     nb::gil_scoped_release release;
     std::fill_n(hessian.data(), size * size, 0.0);
     std::fill_n(gradient.data(), size, 0.0);
     std::fill_n(eliminated.data(), 3 * observed.point_count * size, 0.0);
-    std::fill_n(pose_hessian.data(), 36 * observed.cameras, 0.0);
-    std::vector<double> pose_gradient(6 * cameras), pose_focal(6 * cameras), cross(3 * size);
-    std::vector<char> touched(unknown / 6 + 1);
-    std::vector<int64_t> used, first, order;
-    observed.by_point(first, order);
-    double focal_hessian = 0, focal_gradient = 0;
-    for (int64_t p = 0; p < observed.point_count; ++p) {
-        double v[9] = {}, g[3] = {}, by_focal[3] = {};
-        used.clear();
-        for (int64_t n = first[p]; n < first[p + 1]; ++n) {
-            const int64_t m = order[n], c = observed.camera[m];
-            const Seen seen = observed.look(k, m);
-            if (!seen.in_front) continue;
-            const double weight = 1 / (1 + cauchy_square(seen, scale));
-            double block[6][3] = {};
-            double* own = pose_hessian.data() + 36 * c;
-            for (int row = 0; row < 2; ++row) {
-                const double* b = seen.by_point[row];
-                double a[6];
-                by_pose(b, seen.ray, a);
-                const double error = weight * seen.error[row];
-                for (int i = 0; i < 3; ++i) {
-                    const double wb = weight * b[i];
-                    for (int j = 0; j <= i; ++j) v[3 * i + j] += wb * b[j];
-                    for (int j = 0; j < 6; ++j) block[j][i] += wb * a[j];
-                    g[i] += b[i] * error;
-                }
-                for (int i = 0; i < 6; ++i) {
-                    const double wa = weight * a[i];
-                    for (int j = 0; j <= i; ++j) own[6 * i + j] += wa * a[j];
-                    pose_gradient[6 * c + i] += a[i] * error;
-                }
-                if (focal) {
-                    const double f = seen.error[row] + observed.pixels[2 * m + row] - (row ? cy : cx);
-                    focal_hessian += weight * f * f;
-                    focal_gradient += f * error;
-                    for (int i = 0; i < 3; ++i) by_focal[i] += weight * f * b[i];
-                    for (int i = 0; i < 6; ++i) pose_focal[6 * c + i] += weight * f * a[i];
-                }
-            }
-            for (int64_t s = 0; s < each; ++s) {
-                const int64_t slot = slots.data()[c * each + s];
-                const double share = shares.data()[c * each + s];
-                if (slot < 0 || share == 0) continue;
-                if (!touched[slot]) {
-                    touched[slot] = 1;
-                    used.push_back(slot);
-                }
-                double* into = cross.data() + 18 * slot;
-                for (int i = 0; i < 6; ++i)
-                    for (int j = 0; j < 3; ++j) into[3 * i + j] += share * block[i][j];
-            }
-        }
-        for (int i = 0; i < 3; ++i) v[4 * i] = v[4 * i] * (1 + damping) + kLeast;
-        double* root = roots.data() + 9 * p;
-        inverse_root(v, root);
-        for (int a = 0; a < 3; ++a) {
-            double sum = 0;
-            for (int b = 0; b <= a; ++b) sum += root[3 * a + b] * g[b];
-            pull.data()[3 * p + a] = sum;
-        }
-        for (const int64_t slot : used) {
-            touched[slot] = 0;
-            double* from = cross.data() + 18 * slot;
-            for (int a = 0; a < 3; ++a) {
-                double* to = eliminated.data() + (3 * p + a) * size + 6 * slot;
-                for (int i = 0; i < 6; ++i) {
-                    double sum = 0;
-                    for (int b = 0; b <= a; ++b) sum += root[3 * a + b] * from[3 * i + b];
-                    to[i] = sum;
-                }
-            }
-            std::fill_n(from, 18, 0.0);
-        }
-        if (focal) {
-            for (int a = 0; a < 3; ++a) {
-                double sum = 0;
-                for (int b = 0; b <= a; ++b) sum += root[3 * a + b] * by_focal[b];
-                eliminated.data()[(3 * p + a) * size + unknown] = sum;
-            }
-        }
-    }
-    for (int64_t c = 0; c < observed.cameras; ++c) {
-        double* own = pose_hessian.data() + 36 * c;
-        for (int i = 0; i < 6; ++i)
-            for (int j = i + 1; j < 6; ++j) own[6 * i + j] = own[6 * j + i];
-        for (int64_t s = 0; s < each; ++s) {
-            const int64_t slot = slots.data()[c * each + s];
-            const double share = shares.data()[c * each + s];
-            if (slot < 0 || share == 0) continue;
-            for (int i = 0; i < 6; ++i) {
-                double* row = hessian.data() + (6 * slot + i) * size;
-                gradient.data()[6 * slot + i] += share * pose_gradient[6 * c + i];
-                for (int64_t t = 0; t < each; ++t) {
-                    const int64_t other = slots.data()[c * each + t];
-                    const double both = share * shares.data()[c * each + t];
-                    if (other < 0 || both == 0) continue;
-                    for (int j = 0; j < 6; ++j) row[6 * other + j] += both * own[6 * i + j];
-                }
-                if (focal) {
-                    row[unknown] += share * pose_focal[6 * c + i];
-                    hessian.data()[unknown * size + 6 * slot + i] += share * pose_focal[6 * c + i];
-                }
-            }
-        }
-    }
-    if (focal) {
-        hessian.data()[size * size - 1] = focal_hessian;
-        gradient.data()[unknown] = focal_gradient;
+    PoseSums poses(observed.cameras);
+    add_points(observed, {fx, fy, cx, cy}, job, poses);
+    share_out(job, observed.cameras, poses);
+    for (int64_t n = 0; n < 6 * observed.cameras; ++n) {
+        std::copy_n(poses.hessian.data() + n * kSix, 6, pose_hessian.data() + 6 * n);
     }
 }
 

@@ -33,8 +33,8 @@ def picture(rate: NDArray[np.float32], white: float) -> Picture:
 
 
 def white_of(rate: NDArray[np.float32]) -> float:
-    """The rate that is shown as white, brighter than 99.5 % of the pixels in every fourth row."""
-    return max(float(_odometry.quantile(np.ascontiguousarray(rate[::4], np.float32), 0.995)), 1e-6)
+    """The rate that is shown as white, brighter than 99.5 % of the pixels."""
+    return max(float(_odometry.quantile(np.ascontiguousarray(rate, np.float32), 0.995)), 1e-6)
 
 
 @dataclass

@@ -13,7 +13,7 @@ from spiked.render import benchmark as renderer
 from spiked.render.benchmark import Row
 from spiked.ring import benchmark as ring
 from spiked.sensor import Sensor
-from spiked_service.benchmarks import files, growth, sustained
+from spiked_service.benchmarks import files, growth, sustained, tracking
 from spiked_service.benchmarks.report import Machine, document, text
 from spiked_service.console import output
 
@@ -25,14 +25,19 @@ def bench(
         bool, typer.Option("--scaling", help="Also time against splats, pixels, threads, frames.")
     ] = False,
     folder: Annotated[Path | None, typer.Option(help="Where recordings are written; default: temporary files.")] = None,
+    stream: Annotated[
+        Path | None,
+        typer.Option(help="Track this, a folder as `spiked simulate` writes it; default: a simulated room."),
+    ] = None,
 ) -> None:
-    """Measure the reduction of frames, the ring, recordings, the wire parsers and the renderer on this machine.
+    """Measure reduction of frames, ring, recordings, wire parsers, tracking and the renderer on this machine.
 
     The last column compares with this machine's own peaks, with plain or usual ways to do the same, and, in brackets,
     with what was aimed at. Times are the best or the median of a few runs; their spread stands beside them.
     """
     machine = Machine.here()
-    rows = [*_kernels(), *files.rows(folder), *sustained.rows(seconds, folder), *renderer.measure()]
+    rows = [*_kernels(), *files.rows(folder), *sustained.rows(seconds, folder)]
+    rows += [*tracking.rows(stream), *renderer.measure()]
     if scaling:
         rows += growth.rows()
     for line in text(machine, rows):

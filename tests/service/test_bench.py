@@ -1,18 +1,22 @@
 """`spiked bench` measures what it says; how fast things are is not judged here."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
-from spiked_service.benchmarks import files, sustained
+from spiked_service.benchmarks import files, sustained, tracking
 from spiked_service.benchmarks.report import Machine, document, text
 from spiked_service.cli import app
 from typer.testing import CliRunner
 
+from spiked.errors import ConfigurationError
 from spiked.render import benchmark as renderer
 from spiked.render.benchmark import Row
 from spiked.ring import RingError
 from spiked.sensor import Sensor
+from spiked.simulate import MotionKind, SimulatedCamera
+from spiked.simulate.record import simulate
 
 
 def test_files_are_written_and_decoded(tmp_path: Path) -> None:
@@ -33,6 +37,20 @@ def test_a_stream_is_accounted_for_frame_by_frame(tmp_path: Path) -> None:
 def test_a_consumer_that_dies_is_an_error(tmp_path: Path) -> None:
     with pytest.raises((RingError, OSError)):
         sustained.run(Sensor(64, 40, 2000.0), 0.2, record=tmp_path / "missing")
+
+
+def test_tracking_has_its_speed_beside_its_error(tmp_path: Path) -> None:
+    sensor = Sensor(240, 160, 20_000.0)
+    simulate(SimulatedCamera(sensor, 0, MotionKind.ARC), tmp_path / "room", "room", 768, views=0)
+    (row,) = tracking.rows(tmp_path / "room", (tracking.Setting(16, 4_000, 0.12, 768),))
+    assert row.value > 100 and row.ratio == pytest.approx(row.value / 4_000)
+    assert re.search(r"ATE \d+\.\d+ %; \d+ frames/s with the first map", row.against)
+    assert row.target == ">= 4000"
+
+
+def test_tracking_wants_one_recording_in_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="0 recordings"):
+        tracking.rows(tmp_path)
 
 
 def test_rows_as_text_and_as_a_document() -> None:

@@ -1,0 +1,116 @@
+"""Compiled tracks and pictures against what they are meant to be, written plainly."""
+
+import cv2
+import numpy as np
+import pytest
+
+from spiked.blocks import Window
+from spiked.recon.stamps import delays
+from spiked.recon.tracks import Tracks, flow, picture, pyramid, white_of
+from spiked.recon.views import make_view
+
+H, W = 96, 128
+
+
+def scene(shift: tuple[float, float], seed: int = 0) -> np.ndarray:
+    """Smooth random rates [H, W] whose content is moved by (x, y) px."""
+    rough = np.random.default_rng(seed).random((H + 80, W + 80))
+    down, across = np.fft.fftfreq(H + 80)[:, None], np.fft.fftfreq(W + 80)
+    blur = np.exp(-0.5 * (2 * np.pi * 2.0) ** 2 * (down**2 + across**2))
+    moved = np.exp(-2j * np.pi * (shift[0] * across + shift[1] * down))
+    smooth = np.fft.ifft2(np.fft.fft2(rough - 0.5) * blur * moved).real
+    return np.clip(0.5 + 4 * smooth[40:-40, 40:-40], 0, 1).astype(np.float32)
+
+
+@pytest.mark.parametrize("shift", [(0.3, -0.2), (1.7, 2.4), (-9.0, 6.0)])
+def test_places_are_found_to_a_fiftieth_of_a_pixel(shift: tuple[float, float]) -> None:
+    a, b = (picture(scene(s), 1.0) for s in ((0.0, 0.0), shift))
+    y, x = np.mgrid[22 : H - 22 : 8, 24 : W - 24 : 8] + 0.5
+    start = np.stack([x.ravel(), y.ravel()], 1)
+    found, good = flow(a, b, start, start, 0.6, levels=3)
+    assert good.mean() > 0.9
+    error = np.linalg.norm(found - start - shift, axis=1)[good]
+    assert np.median(error) < 0.02 and np.percentile(error, 95) < 0.05
+
+
+def test_it_agrees_with_opencv() -> None:
+    a, b = picture(scene((0.0, 0.0)), 1.0), picture(scene((0.8, -0.5)), 1.0)
+    start = cv2.goodFeaturesToTrack(a, 100, 0.01, 7)[:, 0].astype(float) + 0.5
+    found, good = flow(a, b, start, start, 0.6, levels=2)
+    p = (start - 0.5).astype(np.float32)[:, None]
+    there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, p, None, winSize=(13, 13), maxLevel=2)
+    both = good & (ok[:, 0] == 1)
+    assert both.sum() > 0.8 * len(start)
+    assert np.median(np.linalg.norm(found - there[:, 0] - 0.5, axis=1)[both]) < 0.01
+
+
+def test_what_has_no_texture_or_lies_outside_is_not_found() -> None:
+    flat = np.full((H, W), 90, np.uint8)
+    places = np.array([[60.0, 40.0], [-40.0, 30.0], [W + 30.0, H + 30.0]])
+    assert not flow(flat, flat, places, places, 0.6, levels=2)[1].any()
+    textured = picture(scene((0.0, 0.0)), 1.0)
+    far = np.array([[1e9, 40.0], [np.nan, 40.0], [-np.inf, 3.0]])
+    assert not flow(textured, textured, places[:1].repeat(3, 0), far, 0.6, levels=2)[1].any()
+
+
+def test_a_pyramid_may_take_the_room_of_another() -> None:
+    one, other = picture(scene((0.0, 0.0)), 1.0), picture(scene((3.0, 0.0), 1), 1.0)
+    room = pyramid(one, 2)
+    again = pyramid(other, 2, room)
+    assert all(a is b for a, b in zip(room, again, strict=True))
+    for a, b in zip(again, pyramid(other, 2), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_tracks_keep_their_names_through_views() -> None:
+    tracks = Tracks(target=60)
+    for n in range(6):
+        tracks.add(n, picture(scene((0.4 * n, 0.2 * n)), 1.0))
+    kept = tracks.born == 0
+    assert kept.sum() > 30
+    moved = tracks.at[kept] - tracks.birthplace[kept]
+    np.testing.assert_allclose(np.median(moved, axis=0), [2.0, 1.0], atol=0.03)
+    assert tracks.motion_px == pytest.approx(np.hypot(0.4, 0.2), abs=0.05)
+
+
+def test_a_picture_is_the_blurred_root() -> None:
+    rate = scene((0.0, 0.0)) * 1.3
+    expected = cv2.GaussianBlur(np.sqrt(np.clip(rate / 1.1, 0, 1)) * 255, (7, 7), 0.8)
+    assert np.abs(picture(rate, 1.1).astype(float) - expected).max() <= 0.51
+
+
+@pytest.mark.parametrize("share_of_zeros", [0.0, 0.5, 1.0])
+def test_white_is_a_quantile(share_of_zeros: float) -> None:
+    rate = np.random.default_rng(1).gamma(2.0, 0.1, (H, W)).astype(np.float32)
+    rate[np.random.default_rng(2).random((H, W)) < share_of_zeros] = 0
+    wanted = max(float(np.quantile(rate, 0.995, method="lower")), 1e-6)
+    assert white_of(rate) == pytest.approx(wanted)
+
+
+def test_a_view_is_measured_as_its_window_says() -> None:
+    rng = np.random.default_rng(4)
+    start = rng.integers(0, 24, (H, W)).astype(np.uint16)
+    stop = (start + rng.integers(1, 40, (H, W))).astype(np.uint16)
+    spikes = rng.integers(1, 9, (H, W)).astype(np.uint16)
+    spikes[:20] = 0
+    start[:10], stop[:10] = 0xFFFF, 0xFFFF
+    stop[10:20] = start[10:20]
+    window = Window(100, 64, 124, 140, spikes, start, stop, spikes)
+    view = make_view(window, after_gap=False)
+    valid = window.valid
+    np.testing.assert_allclose(view.rate, window.rate(fill=True), rtol=1e-6)
+    np.testing.assert_allclose(view.deviation[valid], np.sqrt(window.variance(jitter=1.2e-3))[valid], rtol=1e-5)
+    np.testing.assert_allclose(view.deviation[~valid], window.rate_bound()[~valid], rtol=1e-6)
+    np.testing.assert_array_equal(view.delay, np.where(valid, np.nan_to_num(window.centre() - 132.0), 0))
+    np.testing.assert_array_equal(view.duration, np.where(valid, window.duration(), 16))
+
+
+def test_delays_are_means_where_it_is_steep() -> None:
+    image = np.zeros((H, W), np.uint8)
+    image[:, 60:] = 200
+    delay = np.full((H, W), 3.0, np.float16)
+    delay[:, 59:61] = -2.5
+    at = np.array([[60.0, 48.0], [20.0, 48.0], [-5.0, H + 9.0], [W - 0.5, 0.5]])
+    found = delays(image, delay, at)
+    assert found[0] == pytest.approx(-2.5, abs=0.02)
+    assert found[1:] == pytest.approx([3.0, 3.0, 3.0], abs=1e-3)

@@ -568,12 +568,13 @@ class Odometry:
         if start is None or made is None:
             return
         bundle, ids = made
+        times = np.array([self.views[n].time for n in numbers])
+        bundle.rotations, bundle.centres = start.poses(times)
         if self.focal is not None:
             bundle.focal_free = True
             every = ids
             bundle, ids = _steady(bundle, ids)
             self.points[np.setdiff1d(every, ids)] = np.nan  # found again below, where the path then says
-        times = np.array([self.views[n].time for n in numbers])
         spline, _ = bundle.optimise_spline(start, times, effort.rounds, SCALE_PX / 2, tolerance=1e-3)
         if (wrong := self._contradicted(bundle, numbers)) and len(posed) - len(wrong) >= BOOT_VIEWS:
             for n in wrong:  # smeared views, posed by what they seemed to show, would bend the path

@@ -28,8 +28,10 @@ SSIM_SCALE = 0.01
 
 LARGE_PIXELS = 130_000
 """Images of more pixels are aligned at half their size."""
-SEED_SHARE = 0.6
+SEED_SHARE = 0.3
 """Part of all splats that one view may begin with."""
+DETAIL, DETAIL_PX = 3.0, 1.5
+"""How much more is made of a slope's detail finer than so many (large) pixels, for fast motion."""
 NUISANCES_FROM = 50
 """Steps before they are estimated at all: first the map has to look like something."""
 GAINS_FROM = 1500
@@ -75,7 +77,7 @@ class Mapper:
         self.scene = Scene.empty(self.colours)
         self.white = 1.0
         self.rasteriser = self.levels[0].rasteriser
-        self.adam = Adam(self.scene.arrays())
+        self.adam = Adam(self.scene.arrays(), threads=threads)
         self.nuisances = Nuisances(sensor.height, sensor.width)
         self.steps = 0
         self._calibration = calibration
@@ -90,14 +92,16 @@ class Mapper:
         share = self.options.splats_a_pixel * self.camera.width * self.camera.height
         return min(int(share), self.options.most_splats)
 
-    def seed_from(self, view: View, rotation: Array, centre: Array, swept: Sweep) -> int:
-        """Splats from the pixels of a swept view that the map does not cover yet; returns how many."""
+    def seed_from(self, view: View, rotation: Array, centre: Array, swept: Sweep, surer: float = 0.0) -> int:
+        """Splats from the pixels of a swept view that the map does not cover yet and whose depth has at least so much
+        confidence; returns how many."""
         height, width = view.rate.shape
         if len(self.scene):
             empty = self.rasteriser.forward(self.scene, rotation[None], centre[None]).alpha < 0.5
         else:
             self.white = float(np.percentile(view.rate, 99.5))
             empty = np.ones((height, width), bool)
+        empty &= swept.confidence >= surer
         # The first view leaves room for what others see; all of it gets splats, however few there may be.
         step = max(self.options.stride_px, float(np.sqrt(height * width / (SEED_SHARE * self.cap))))
         v, u = (
@@ -184,12 +188,17 @@ class Mapper:
         if calibration is not None:
             gain, dark = np.where(calibration.dead, 0, gain * calibration.gain), calibration.dark
         floor = self.options.floor * self.white
-        charge = self._charge(image.values, passage.frames, moved, gain, dark, pixel=level.factor, floor=floor)
+        # An image of large pixels has enough of a part of the sensor's rows.
+        every, phase = level.factor, int(self._rng.integers(level.factor))
+        charge = self._charge(
+            image.values, passage.frames, moved, gain, dark, pixel=level.factor, every=every, phase=phase, floor=floor
+        )
         if self._knows_nuisances():
             self.nuisances.note(key, self.nuisances.level(key) * charge.brightness)
         self._residuals[key] = charge.loss / self.white**2
-        self._wrong = charge.slope
-        return charge.slope / np.float32(self.white**2)
+        self._wrong = cv2.blur(charge.slope, (1, every))
+        slope = charge.slope if level.factor > 1 else _finer(charge.slope)
+        return slope / np.float32(self.white**2)
 
     def _knows_nuisances(self) -> bool:
         return self.options.nuisances and self.steps >= NUISANCES_FROM
@@ -238,7 +247,7 @@ class Mapper:
         """The map as a view saw it, at full size or at that of a level (which the sight's windows must have)."""
         return _look(level or self.levels[0], self.scene, sight, 0.0)
 
-    def densify(self, key: int, view: View, sight: Sight, share: float = 0.06) -> None:
+    def densify(self, key: int, view: View, sight: Sight, share: float = 0.02) -> None:
         """Give splats to what is rendered worst: in place of dead ones first, then new ones up to the cap."""
         middle = len(sight.centres) // 2
         rotation, centre = sight.rotations[middle], sight.centres[middle]
@@ -274,6 +283,12 @@ class Mapper:
     def render(self, rotation: Array, centre: Array) -> Image:
         """What the map looks like from a pose, radiance [H, W] or [H, W, 3]."""
         return self.rasteriser.forward(self.scene, rotation[None], centre[None]).values
+
+
+def _finer(slope: Image) -> Image:
+    """A slope [h, w] or [h, w, C] with fine detail raised: intervals are sums along the motion, and say it weakly."""
+    blurred = cv2.GaussianBlur(slope, (0, 0), DETAIL_PX).reshape(slope.shape)
+    return np.asarray(slope + np.float32(DETAIL) * (slope - blurred), np.float32)
 
 
 def _look(level: Level, scene: Scene, sight: Sight, background: float) -> Rendered:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from spiked.native._raster import carry_nodes
 from spiked.pose import Array
 from spiked.recon.views import Image
 from spiked.render import Camera
@@ -33,29 +34,21 @@ class Passage:
         A place in a frame has, to first order, the depth of where it leads to; two rounds find it.
         """
         columns, rows = -(-camera.width // CELL_PX) + 1, -(-camera.height // CELL_PX) + 1
-        x, y = np.meshgrid(CELL_PX * np.arange(columns, dtype=np.float32), CELL_PX * np.arange(rows, dtype=np.float32))
-        places = np.stack([x.ravel(), y.ravel(), np.ones(rows * columns, np.float32)])
         inverse, shrink = _smooth_inverse(depth, camera.width)
         k = camera.intrinsics.matrix()
         turn = (k @ rotation.T @ self.rotations @ np.linalg.inv(k)).astype(np.float32)
         shift = ((self.centres - centre) @ rotation @ k.T).astype(np.float32)
-        far = turn @ places
-        there: Image = np.broadcast_to(places[:2], (len(turn), *places[:2].shape))
-        height, width = inverse.shape
-        for _ in range(2):
-            column = np.clip((there[:, 0] * shrink).astype(np.int32), 0, width - 1)
-            row = np.clip((there[:, 1] * shrink).astype(np.int32), 0, height - 1)
-            seen = far + inverse[row, column][:, None] * shift[:, :, None]
-            there = np.asarray(seen[:, :2] / np.maximum(seen[:, 2:], np.float32(NEAREST)), np.float32)
-        moved = (there - places[:2]).transpose(0, 2, 1)
-        return np.ascontiguousarray(moved.reshape(len(turn), rows, columns, 2), np.float32)
+        moved = np.empty((len(turn), rows, columns, 2), np.float32)
+        carry_nodes(inverse, shrink, turn, np.ascontiguousarray(shift), CELL_PX, NEAREST, moved)
+        return moved
 
 
-def _smooth_inverse(depth: Image, width: int) -> tuple[Image, np.float32]:
+def _smooth_inverse(depth: Image, width: int) -> tuple[Image, float]:
     """Inverse depths as means over about a cell, and how many of their pixels go to one of the sensor's."""
-    shrink = np.float32(depth.shape[1] / width)
+    shrink = depth.shape[1] / width
     known = depth > 0
     inverse = 1 / np.maximum(depth, np.float32(NEAREST))
-    inverse = np.where(known, inverse, np.float32(np.median(inverse[known]) if known.any() else 1.0))
-    side = max(1, round(CELL_PX * float(shrink)))
+    if not known.all():
+        inverse = np.where(known, inverse, np.float32(np.median(inverse[known]) if known.any() else 1.0))
+    side = max(1, round(CELL_PX * shrink))
     return np.asarray(cv2.boxFilter(inverse, -1, (side, side), borderType=cv2.BORDER_REPLICATE), np.float32), shrink

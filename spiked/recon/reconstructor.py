@@ -41,11 +41,15 @@ LARGE_POWER = 0.35
 """The steps of larger ones fall with this power of their pixels: each costs more, and they have more to settle."""
 FAST_STEPS = 1.9
 """Times as many steps for views of fast motion, which cost less each and say less of what is fine."""
+DENSIFY_EVERY = 20
+"""Steps after which the view just seen gets splats where it is rendered worst: each part of the path has its turn."""
 YOUNG_STEPS = 800
 """Steps that a map which grows with the frames is looked at coarsely."""
-SEED_VIEWS = 5
+SEED_VIEWS = 11
 """Views swept for depth when the map begins."""
 SWEEP_NEIGHBOURS = 5
+SURE_DEPTH = 0.6
+"""Pixels of less confidence wait for a view that sees their place better: at the edges few others look there."""
 ALIGNMENTS = 7
 """Times that the whole path is aligned with the map in a refinement."""
 ALIGNED_SHARE = 0.6
@@ -326,6 +330,7 @@ class Reconstructor:
         assert path is not None and self.sensor.intrinsics is not None
         rotations, centres = path.poses([self._views[i].time for i in usable])
         points = self._odometry.points[np.isfinite(self._odometry.points[:, 0])]
+        doubtful = []
         for number in numbers:
             reference = usable.index(number)
             depth = (points - centres[reference]) @ rotations[reference][:, 2]
@@ -344,8 +349,11 @@ class Reconstructor:
             pixels = SWEPT_PIXELS // 4 if self._odometry.sparse else SWEPT_PIXELS
             planes = (1.3 * high, 0.5 * low)
             swept = sweep(shot(reference), others, self.sensor.intrinsics, planes, 1.5 * view.deviation, pixels)
-            self._mapper.seed_from(view, rotations[reference], centres[reference], swept)
+            self._mapper.seed_from(view, rotations[reference], centres[reference], swept, SURE_DEPTH)
+            doubtful.append((view, rotations[reference], centres[reference], swept))
             self._seeded.append(view.time)
+        for seen in doubtful:
+            self._mapper.seed_from(*seen)
         self._version += 1
 
     def _step(self, decay: float, densify: bool = True, coarse: float = 0.0) -> None:
@@ -358,7 +366,7 @@ class Reconstructor:
         level = self._mapper.level(coarse)
         sight = self._passing(view, path) or self._sight(view, path, level.factor)
         self._mapper.step(number, view, sight, decay, level)
-        if densify and self._mapper.steps % 100 == 0:
+        if densify and self._mapper.steps % DENSIFY_EVERY == 0:
             self._mapper.densify(number, view, sight)
         self._version += self._mapper.steps % 20 == 0
 

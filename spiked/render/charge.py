@@ -58,6 +58,8 @@ class ChargeLoss:
         dark: Floats | None = None,
         *,
         pixel: int = 1,
+        every: int = 1,
+        phase: int = 0,
         floor: float,
         jitter: float = 0.02,
     ) -> Charge:
@@ -67,7 +69,8 @@ class ChargeLoss:
         large as the sensor's. frames [n, frame_bytes] as stored, at most `MOST_FRAMES`; displacements float32
         [n, rows, columns, 2] lead, in px, from nodes `CELL_PX` apart (the first at the sensor's corner) in each frame
         to where the same things are in the image. gain [H, W] multiplies the light (0: a pixel that does not count),
-        dark [H, W] is added to it, in spikes a frame.
+        dark [H, W] is added to it, in spikes a frame. Of `every` pairs of the sensor's rows, the one of number `phase`
+        is looked at.
 
         The variance of an interval's charge is rate^2 / 6 (spikes are only known to the frame) plus jitter^2; that
         before the first and after the last spike is 1 / 6. A pixel's residuals are weighted so that an error e of its
@@ -90,6 +93,8 @@ class ChargeLoss:
                 cell=CELL_PX,
                 image=planes,
                 pixel=pixel,
+                every=every,
+                phase=phase,
                 gain=np.ascontiguousarray(gain, np.float32),
                 dark=None if dark is None else np.ascontiguousarray(dark, np.float32),
                 floor=floor,

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.errors import ConfigurationError
-from spiked.native._raster import adam_corrections, adam_step
+from spiked.native._raster import AdamSteps, adam_corrections
+from spiked.render.cpu import usable_cores
 from spiked.render.splats import Floats
 
 
@@ -21,9 +22,16 @@ class Adam:
     """
 
     def __init__(
-        self, arrays: Sequence[Floats], beta1: float = 0.9, beta2: float = 0.999, epsilon: float = 1e-15
+        self,
+        arrays: Sequence[Floats],
+        beta1: float = 0.9,
+        beta2: float = 0.999,
+        epsilon: float = 1e-15,
+        threads: int | None = None,
     ) -> None:
-        """arrays: float32 [N] or [N, K], K at most 4, as they will be given to step()."""
+        """arrays: float32 [N] or [N, K], K at most 4, as they will be given to step(). Threads default to the cores
+        this process may use; their number changes no bit."""
+        self._steps = AdamSteps(usable_cores() if threads is None else threads)
         self._betas = (beta1, beta2)
         self._epsilon = epsilon
         self._moments = [(np.zeros_like(array), np.zeros_like(array)) for array in arrays]
@@ -78,7 +86,7 @@ class Adam:
         correction = np.empty(count, np.float32)
         adam_corrections(np.ascontiguousarray(seen).view(np.uint8), self._taken, correction, *self._betas)
         for array, gradient, rate, (first, second) in zip(arrays, gradients, rates, self._moments, strict=True):
-            adam_step(
+            self._steps.step(
                 _rows(array),
                 _rows(np.ascontiguousarray(gradient, np.float32)),
                 _rows(first),

@@ -115,6 +115,18 @@ def test_the_true_image_is_at_the_minimum_and_explains_what_was_counted(name: st
     assert loss(1.1 * true, frames, back(STEP), gain, dark, floor=0.01).brightness == pytest.approx(1 / 1.1, abs=0.02)
 
 
+@pytest.mark.parametrize("name", SENSORS)
+def test_spikes_are_where_they_fell_to_a_twentieth_of_a_frame(name: str) -> None:
+    sensor, gain = SENSORS[name], np.ones((HEIGHT, WIDTH), np.float32)
+    true, loss = image(1 if sensor.mosaic is None else 3), ChargeLoss(sensor, 1)
+    early, now, late = (
+        np.mean([loss(true, recorded(sensor, gain, seed=seed), moved, gain, floor=0.01).loss for seed in range(4)])
+        for moved in (back(STEP) + np.float32(frames) * STEP.astype(np.float32) for frames in (-0.5, 0, 0.5))
+    )
+    assert now < 0.95 * min(early, late)
+    assert 0.25 * (early - late) / (early - 2 * now + late) == pytest.approx(0, abs=0.05)
+
+
 def test_descending_on_it_finds_a_scene_that_windows_smear() -> None:
     sensor, gain = SENSORS["grey"], np.ones((HEIGHT, WIDTH), np.float32)
     frames, true = recorded(sensor, gain), image(1)
@@ -145,6 +157,17 @@ def test_the_number_of_threads_changes_no_bit() -> None:
     one, three = (ChargeLoss(sensor, t)(image(3), frames, back(STEP), gain, floor=0.01) for t in (1, 3))
     assert one.loss == three.loss and one.chi2 == three.chi2
     np.testing.assert_array_equal(one.slope, three.slope)
+
+
+def test_parts_of_the_rows_make_the_whole() -> None:
+    sensor, gain = SENSORS["mosaic"], np.ones((HEIGHT, WIDTH), np.float32)
+    frames, loss = recorded(sensor, gain), ChargeLoss(sensor, 1)
+    gain[-8:] = 0  # the image ends before the last row: so every part has as many pixels that count
+    whole = loss(image(3), frames, back(0 * STEP), gain, floor=0.01)
+    parts = [loss(image(3), frames, back(0 * STEP), gain, every=4, phase=p, floor=0.01) for p in range(4)]
+    assert np.mean([part.loss for part in parts]) == pytest.approx(whole.loss, rel=1e-6)
+    np.testing.assert_allclose(np.mean([part.slope for part in parts], 0), whole.slope, rtol=1e-4, atol=1e-9)
+    assert not parts[1].slope[:2].any() and parts[1].slope[2:4].any()
 
 
 PROGRAM = """
@@ -180,6 +203,7 @@ def test_instruction_sets_agree(level: str, tmp_path: Path) -> None:
         ({"displacements": np.zeros((FRAMES, 2, 2, 2), np.float32)}, "cover the sensor"),
         ({"gain": np.ones((3, 3), np.float32)}, "sensor's size"),
         ({"floor": 0.0}, "positive"),
+        ({"every": 2, "phase": 2}, "one of every"),
         ({"image": np.zeros((1, 1), np.float32)}, "at least 2x2"),
     ],
 )

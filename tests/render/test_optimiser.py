@@ -80,3 +80,17 @@ def test_a_scene_that_grew_alone_is_refused() -> None:
     wide = [a.astype(np.float64) for a in parameters]
     with pytest.raises(ConfigurationError, match="float32"):
         adam.step(wide, parameters, [0.1] * 4)
+
+
+def test_the_number_of_threads_changes_no_bit() -> None:
+    rng = np.random.default_rng(0)
+    start = [rng.normal(size=(20_000, 3)).astype(np.float32), rng.normal(size=20_000).astype(np.float32)]
+    gradients, seen = [rng.normal(size=a.shape).astype(np.float32) for a in start], rng.random(20_000) < 0.7
+    moved = [[a.copy() for a in start] for _ in range(2)]
+    for arrays, threads in zip(moved, (1, 3), strict=True):
+        adam = Adam(arrays, threads=threads)
+        for _ in range(2):
+            adam.step(arrays, gradients, [1e-2, 1e-3], seen)
+    for one, three, before in zip(*moved, start, strict=True):
+        np.testing.assert_array_equal(one, three)
+        assert (one != before).any(axis=tuple(range(1, one.ndim))).tolist() == seen.tolist()

@@ -26,8 +26,8 @@ class ChargeLoss {
 
     nb::tuple run(Read<uint8_t, 2> frames, int64_t width, int64_t height, int64_t row_stride, bool flipped, bool msb,
                   Read<uint8_t, 1> tile, Read<float, 4> grids, int64_t cell, Read<float, 3> image, float pixel,
-                  Read<float, 2> gain, std::optional<Read<float, 2>> dark, float floor, float jitter,
-                  Write<float, 3> slope) {
+                  int64_t every, int64_t phase, Read<float, 2> gain, std::optional<Read<float, 2>> dark, float floor,
+                  float jitter, Write<float, 3> slope) {
         const int64_t count = static_cast<int64_t>(frames.shape(0));
         const int64_t image_height = static_cast<int64_t>(image.shape(0));
         const int64_t image_width = static_cast<int64_t>(image.shape(1)),
@@ -52,11 +52,12 @@ class ChargeLoss {
             return static_cast<int64_t>(map.shape(0)) == height && static_cast<int64_t>(map.shape(1)) == width;
         };
         expect(fits(gain) && (!dark || fits(*dark)), "gain and dark have the sensor's size");
+        expect(every > 0 && phase >= 0 && phase < every, "phase is one of every");
         expect(floor > 0 && jitter > 0, "floor and jitter are positive");
         ChargeJob job{};
         job.frames = count, job.width = width, job.height = height;
         job.row_stride = row_stride, job.frame_stride = row_stride * height;
-        job.flipped = flipped, job.msb = msb;
+        job.every = every, job.phase = phase, job.flipped = flipped, job.msb = msb;
         std::copy(tile.data(), tile.data() + 4, job.tile);
         job.bytes = frames.data(), job.grids = grids.data();
         job.rows = static_cast<int64_t>(grids.shape(1)), job.columns = static_cast<int64_t>(grids.shape(2));
@@ -125,15 +126,49 @@ class ChargeLoss {
     std::vector<std::vector<char>> scratch_;
 };
 
+// Where nodes `cell` px apart in frames lie in an image of inverse depths: p' ~ turn p + inverse(p') shift, by two
+// rounds.
+void carry_nodes(Read<float, 2> inverse, float shrink, Read<float, 3> turn, Read<float, 2> shift, float cell,
+                 float nearest, Write<float, 4> moved) {
+    const size_t frames = moved.shape(0), rows = moved.shape(1), columns = moved.shape(2);
+    expect(turn.shape(0) == frames && turn.shape(1) == 3 && turn.shape(2) == 3 && shift.shape(0) == frames &&
+               shift.shape(1) == 3 && moved.shape(3) == 2,
+           "turn [n, 3, 3], shift [n, 3] and moved [n, rows, columns, 2] disagree");
+    expect(inverse.shape(0) > 0 && inverse.shape(1) > 0, "the image is empty");
+    const size_t width = inverse.shape(1);
+    const float right = static_cast<float>(width - 1), lowest = static_cast<float>(inverse.shape(0) - 1);
+    nb::gil_scoped_release release;
+    float* out = moved.data();
+    for (size_t f = 0; f < frames; ++f) {
+        const float *a = turn.data() + 9 * f, *b = shift.data() + 3 * f;
+        for (size_t row = 0; row < rows; ++row)
+            for (size_t column = 0; column < columns; ++column, out += 2) {
+                const float x = cell * static_cast<float>(column), y = cell * static_cast<float>(row);
+                const float far[3] = {a[0] * x + a[1] * y + a[2], a[3] * x + a[4] * y + a[5],
+                                      a[6] * x + a[7] * y + a[8]};
+                float u = x, v = y;
+                for (int round = 0; round < 2; ++round) {
+                    const size_t i = static_cast<size_t>(std::clamp(u * shrink, 0.0f, right));
+                    const size_t j = static_cast<size_t>(std::clamp(v * shrink, 0.0f, lowest));
+                    const float q = inverse.data()[j * width + i], z = std::max(far[2] + q * b[2], nearest);
+                    u = (far[0] + q * b[0]) / z, v = (far[1] + q * b[1]) / z;
+                }
+                out[0] = u - x, out[1] = v - y;
+            }
+    }
+}
+
 }  // namespace
 
 void bind_charge(nb::module_& m) {
+    m.def("carry_nodes", &carry_nodes, nb::arg("inverse"), nb::arg("shrink"), nb::arg("turn"), nb::arg("shift"),
+          nb::arg("cell"), nb::arg("nearest"), nb::arg("moved"));
     nb::class_<ChargeLoss>(m, "ChargeLoss")
         .def(nb::init<int>(), nb::arg("threads"))
         .def("run", &ChargeLoss::run, nb::kw_only(), nb::arg("frames"), nb::arg("width"), nb::arg("height"),
              nb::arg("row_stride"), nb::arg("flipped"), nb::arg("msb"), nb::arg("tile"), nb::arg("grids"),
-             nb::arg("cell"), nb::arg("image"), nb::arg("pixel"), nb::arg("gain"), nb::arg("dark").none(),
-             nb::arg("floor"), nb::arg("jitter"), nb::arg("slope"));
+             nb::arg("cell"), nb::arg("image"), nb::arg("pixel"), nb::arg("every"), nb::arg("phase"), nb::arg("gain"),
+             nb::arg("dark").none(), nb::arg("floor"), nb::arg("jitter"), nb::arg("slope"));
 }
 
 }  // namespace raster

@@ -90,16 +90,18 @@ static void judge(const ChargeJob& job, const ChargeRow& row, int64_t x0, Charge
         const float t = (float)f;
         for (int i = 0; i < kPixels; ++i) {
             const float in = work.inside[f][i], hit = work.spike[f][i];
-            charge[i] += in * work.light[f][i];
+            // It fires somewhere in the frame: by its middle, on average.
+            const float half = 0.5f * in * work.light[f][i], full = charge[i] + half;
+            charge[i] = full + half;
             seen[i] += in;
-            const float now = charge[i] - spikes[i];
+            const float now = full - spikes[i];
             const bool begins = (hit > 0) & (spikes[i] == 0);
             const float length = begins ? 0 : t - last[i];
             const float wrong = begins ? 0 : now - residual[i];
             first[i] = begins ? t : first[i];
-            charge_first[i] = begins ? charge[i] : charge_first[i];
+            charge_first[i] = begins ? full : charge_first[i];
             last[i] = hit > 0 ? t : last[i];
-            charge_last[i] = hit > 0 ? charge[i] : charge_last[i];
+            charge_last[i] = hit > 0 ? full : charge_last[i];
             residual[i] = hit > 0 ? now : residual[i];
             lengths[i] += hit * length * length;
             squares[i] += hit * wrong * wrong;
@@ -132,13 +134,15 @@ static void judge(const ChargeJob& job, const ChargeRow& row, int64_t x0, Charge
         sums.expected += agrees ? charge[i] : 0;
         sums.counted += agrees ? spikes[i] : 0;
     }
-    float current[kPixels] = {};
+    float after[kPixels];
+    for (int i = 0; i < kPixels; ++i) after[i] = outer[i];
     for (int64_t f = job.frames - 1; f >= 0; --f) {
         const float t = (float)f;
         for (int i = 0; i < kPixels; ++i) {
-            current[i] = work.spike[f][i] > 0 ? work.slope[f][i] : current[i];
-            const bool between = (spikes[i] > 1) & (t > first[i]) & (t <= last[i]);
-            work.slope[f][i] = work.inside[f][i] * (between ? inner[i] * current[i] : outer[i]);
+            const float before = t > first[i] ? inner[i] * work.slope[f][i] : outer[i];
+            const float now = work.spike[f][i] > 0 ? before : after[i];
+            work.slope[f][i] = work.inside[f][i] * 0.5f * (now + after[i]);
+            after[i] = now;
         }
     }
     for (int i = 0; i < kPixels && x0 + i < job.width; ++i) charge[i] = row.gain[x0 + i];
@@ -167,6 +171,7 @@ static void charge(const ChargeJob& job, int64_t first_row, int64_t last_row, fl
                    ChargeSums& sums) {
     ChargeWork& work = *(ChargeWork*)scratch;
     for (int64_t y = first_row; y < last_row; ++y) {
+        if (y / 2 % job.every != job.phase) continue;
         const float place = ((float)y + 0.5f) / (float)job.cell;
         const int64_t upper = (int64_t)place < job.rows - 2 ? (int64_t)place : job.rows - 2;
         const float share = place - (float)upper;

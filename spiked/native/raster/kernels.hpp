@@ -165,6 +165,7 @@ constexpr int kLeastChargeFrames = 4;  // a pixel that saw the image for less do
 // Frames of spikes, and an image seen by their pixels at displaced places (charge.inl).
 struct ChargeJob {
     int64_t frames, width, height, row_stride, frame_stride;
+    int64_t every, phase;  // of so many pairs of rows, the one that is looked at
     bool flipped, msb;
     uint8_t tile[4];  // the colours of a mosaic's 2x2 sites
     const uint8_t* bytes;

@@ -1,9 +1,11 @@
+#include <algorithm>
 #include <cmath>
 #include <vector>
 
 #include "bindings.hpp"
 #include "buffer.hpp"
 #include "kernels.hpp"
+#include "pool.hpp"
 
 namespace nb = nanobind;
 
@@ -31,17 +33,31 @@ void adam_corrections(Read<uint8_t, 1> seen, Write<uint32_t, 1> taken, Write<flo
     }
 }
 
-void adam_step(Write<float, 2> parameter, Read<float, 2> gradient, Write<float, 2> first, Write<float, 2> second,
-               Read<float, 1> correction, float rate, double beta1, double beta2, float epsilon) {
-    const size_t rows = parameter.shape(0), columns = parameter.shape(1);
-    auto fits = [&](const auto& array) { return array.shape(0) == rows && array.shape(1) == columns; };
-    expect(fits(gradient) && fits(first) && fits(second) && correction.shape(0) == rows, "arrays disagree");
-    expect(columns <= 4, "a row has at most four columns");
-    const AdamRates rates{rate, static_cast<float>(1 - beta1), static_cast<float>(1 - beta2), epsilon};
-    nb::gil_scoped_release release;
-    choose_kernels().adam(rates, static_cast<int>(rows), static_cast<int>(columns), correction.data(), gradient.data(),
-                          parameter.data(), first.data(), second.data());
-}
+class AdamSteps {
+  public:
+    explicit AdamSteps(int threads) : pool_(threads) {}
+
+    void step(Write<float, 2> parameter, Read<float, 2> gradient, Write<float, 2> first, Write<float, 2> second,
+              Read<float, 1> correction, float rate, double beta1, double beta2, float epsilon) {
+        constexpr size_t kRows = 8192;  // of a task
+        const size_t rows = parameter.shape(0), columns = parameter.shape(1);
+        auto fits = [&](const auto& array) { return array.shape(0) == rows && array.shape(1) == columns; };
+        expect(fits(gradient) && fits(first) && fits(second) && correction.shape(0) == rows, "arrays disagree");
+        expect(columns <= 4, "a row has at most four columns");
+        const AdamRates rates{rate, static_cast<float>(1 - beta1), static_cast<float>(1 - beta2), epsilon};
+        nb::gil_scoped_release release;
+        const Kernels& kernels = choose_kernels();
+        pool_.run(static_cast<int>((rows + kRows - 1) / kRows), [&](int task, int) {
+            const size_t row = kRows * static_cast<size_t>(task), at = row * columns;
+            kernels.adam(rates, static_cast<int>(std::min(kRows, rows - row)), static_cast<int>(columns),
+                         correction.data() + row, gradient.data() + at, parameter.data() + at, first.data() + at,
+                         second.data() + at);
+        });
+    }
+
+  private:
+    Pool pool_;
+};
 
 double robust_loss(ReadAny<float> rendered, ReadAny<float> target, ReadAny<float> weight, bool huber, float scale,
                    WriteAny<float> d_rendered) {
@@ -79,8 +95,10 @@ double multiply_adds(int64_t rounds) {
 void bind_losses(nb::module_& m) {
     m.def("adam_corrections", &adam_corrections, nb::arg("seen"), nb::arg("taken"), nb::arg("correction"),
           nb::arg("beta1"), nb::arg("beta2"));
-    m.def("adam_step", &adam_step, nb::arg("parameter"), nb::arg("gradient"), nb::arg("first"), nb::arg("second"),
-          nb::arg("correction"), nb::arg("rate"), nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"));
+    nb::class_<AdamSteps>(m, "AdamSteps")
+        .def(nb::init<int>(), nb::arg("threads"))
+        .def("step", &AdamSteps::step, nb::arg("parameter"), nb::arg("gradient"), nb::arg("first"), nb::arg("second"),
+             nb::arg("correction"), nb::arg("rate"), nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"));
     m.def("robust_loss", &robust_loss, nb::arg("rendered"), nb::arg("target"), nb::arg("weight"), nb::arg("huber"),
           nb::arg("scale"), nb::arg("d_rendered"));
     m.def("mean_ssim", &mean_ssim, nb::arg("rendered"), nb::arg("target"), nb::arg("white"), nb::arg("d_rendered"));

@@ -15,7 +15,7 @@ class MapOptions:
     """Spacing of the pixels that become the first splats."""
     splats_a_pixel: float = 0.8
     """Cap of the number of splats, in splats for each sensor pixel."""
-    most_splats: int = 150_000
+    most_splats: int = 250_000
     """Cap of the number of splats, however many pixels there are."""
     rate_means: float = 2e-3
     """Learning rates at the start, per step; those of the means and of colour are in units of depth and of white."""

@@ -149,6 +149,7 @@ def rows() -> list[Row]:
     table += [
         Row("without nuisances", mapping={"nuisances": False}),
         Row("black background while fitting", mapping={"background": 0.0}),
+        Row("first splats of doubtful depth as well", patches=lambda: patched((reconstructor, "SURE_DEPTH", 0.0))),
         Row("without structural similarity", mapping={"ssim": 0.0}),
         Row(
             "the paper's pooled binomial and accumulation losses, 32-frame counts",
@@ -158,6 +159,9 @@ def rows() -> list[Row]:
         Row("charge between the spikes of 24 frames (as it is)", COLOUR, steps_share=0.4),
         Row("full size from the start", COLOUR, patches=lambda: patched((reconstructor, "COARSE_SHARE", 1e-9)),
             steps_share=0.4),
+        Row("fine detail not raised", COLOUR, patches=lambda: patched((mapping, "DETAIL", 0.0)), steps_share=0.4),
+        Row("first splats of doubtful depth as well", COLOUR,
+            patches=lambda: patched((reconstructor, "SURE_DEPTH", 0.0)), steps_share=0.4),
         Row("windows and sub-frames, mosaic loss", COLOUR, patches=lambda: patched(WINDOWED), steps_share=0.4),
         Row("windows and sub-frames, demosaic first", COLOUR,
             patches=lambda: patched(WINDOWED, (mapping, "levels", demosaic_first)), steps_share=0.4),

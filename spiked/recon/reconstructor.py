@@ -39,7 +39,7 @@ SMALL_PIXELS = 130_000
 """Images up to here get all the steps that the options say."""
 LARGE_POWER = 0.35
 """The steps of larger ones fall with this power of their pixels: each costs more, and they have more to settle."""
-FAST_STEPS = 1.8
+FAST_STEPS = 1.7
 """Times as many steps for views of fast motion, which cost less each and say less of what is fine."""
 DENSIFY_EVERY = 20
 """Steps after which the view just seen gets splats where it is rendered worst: each part of the path has its turn."""
@@ -466,14 +466,15 @@ class Reconstructor:
         self._queue = []
         order = np.linspace(0, len(usable) - 1, SEED_VIEWS).round().astype(int)
         self._seed([usable[i] for i in order[np.argsort(np.abs(order - order.mean()))]])
-        steps = self._steps()
+        steps, aligned = self._steps(), 0
         for done in range(steps):
             if cancelled():
                 break
             coarse = max(0.0, 1 - done / (COARSE_SHARE * steps))
             self._step(10 ** (-done / steps), densify=done < 0.7 * steps, coarse=coarse)
             if self._aligns(done, steps):
-                self._align()
+                aligned += 1
+                self._align(2 / (1 + aligned))  # ever less of a step: what the map gets wrong would be a random walk
             if done % 50 == 49:
                 self._progress = (done + 1) / steps
                 self._note(time.perf_counter() - begin)
@@ -504,7 +505,7 @@ class Reconstructor:
         interval = max(1, int(ALIGNED_SHARE * steps) // ALIGNMENTS)
         return wanted and (done + 1) % interval == 0 and done < ALIGNED_SHARE * steps
 
-    def _align(self) -> None:
+    def _align(self, share: float) -> None:
         spline = self.path
         assert isinstance(spline, Spline)
         numbered = [(i, self._views[i]) for i in self._mappable()]
@@ -515,6 +516,7 @@ class Reconstructor:
             numbered[::every],
             self._mapper,
             lambda view: self._passing(view, spline) or self._sight(view, spline, pixel),
+            share,
         )
 
     def _note(self, running_s: float = 0.0) -> None:

@@ -26,11 +26,12 @@ def align_spline(
     views: list[tuple[int, View]],
     mapper: Mapper,
     sight_of: Callable[[View], Sight],
+    share: float = 1.0,
     prior: float = 0.02,
 ) -> Spline:
     """The spline moved so that the map agrees better with the numbered views, each seen as `sight_of` says.
 
-    `prior` damps, relative to the diagonal.
+    `share` of the step is taken; `prior` damps, relative to the diagonal.
     """
     times = np.array([v.time for _, v in views])
     blend = spline.basis_matrix(times)
@@ -45,7 +46,7 @@ def align_spline(
     square = hessian.reshape(knots * 6, knots * 6)
     diagonal = np.diag(square).copy()
     square[np.diag_indices(knots * 6)] += prior * diagonal + 1e-6 * diagonal.max()
-    step = np.asarray(-np.linalg.solve(square, gradient.ravel()).reshape(knots, 6), np.float64)
+    step = np.asarray(-share * np.linalg.solve(square, gradient.ravel()).reshape(knots, 6), np.float64)
     return spline.move(step[:, :3], step[:, 3:])
 
 

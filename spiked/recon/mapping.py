@@ -76,6 +76,8 @@ class Mapper:
         self.channels = self.levels[0].channels
         self.scene = Scene.empty(self.colours)
         self.white = 1.0
+        self.depth = 1.0
+        """Typical depth of the scene, which the rate of the means is in units of."""
         self.rasteriser = self.levels[0].rasteriser
         self.adam = Adam(self.scene.arrays(), threads=threads)
         self.nuisances = Nuisances(sensor.height, sensor.width)
@@ -154,7 +156,7 @@ class Mapper:
         o = self.options
         rest = float(np.sqrt(decay))
         others = (o.rate_quats, o.rate_scales, o.rate_opacities, o.rate_colours * self.white)
-        rates = (o.rate_means * decay, *(rest * rate for rate in others))
+        rates = (o.rate_means * self.depth * decay, *(rest * rate for rate in others))
         slopes = (gradients.means, gradients.quats, gradients.log_scales, gradients.opacity_logits, gradients.colours)
         self.adam.step(self.scene.arrays(), slopes, rates, gradients.radius_px > 0)
         # Light taken away would fit as well, but viewers of the scene know none: they show such splats as black.

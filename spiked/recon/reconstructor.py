@@ -330,7 +330,7 @@ class Reconstructor:
         assert path is not None and self.sensor.intrinsics is not None
         rotations, centres = path.poses([self._views[i].time for i in usable])
         points = self._odometry.points[np.isfinite(self._odometry.points[:, 0])]
-        doubtful = []
+        doubtful, depths, begins = [], [], len(self._mapper.scene) == 0
         for number in numbers:
             reference = usable.index(number)
             depth = (points - centres[reference]) @ rotations[reference][:, 2]
@@ -338,6 +338,7 @@ class Reconstructor:
                 continue
             low, high = np.percentile(1 / depth[depth > 0], [1, 99.5])
             self._depth = float(np.median(depth[depth > 0]))
+            depths.append(self._depth)
             view = self._views[number]
 
             def shot(row: int) -> Shot:
@@ -354,6 +355,8 @@ class Reconstructor:
             self._seeded.append(view.time)
         for seen in doubtful:
             self._mapper.seed_from(*seen)
+        if begins and depths:
+            self._mapper.depth = float(np.median(depths))
         self._version += 1
 
     def _step(self, decay: float, densify: bool = True, coarse: float = 0.0) -> None:

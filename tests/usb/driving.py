@@ -158,11 +158,10 @@ class Driver:
 def check_sent(told: Told, report: Report, *, offsets: int = 1) -> None:
     """Every frame that was received is one that the camera sent, and index and camera's number go together.
 
-    They differ by one and the same number, or by up to `offsets` of them if the camera was away in between: the frames
-    that it dropped meanwhile may be as many as the clock says, or not. What was not received is in gaps: on a loaded
-    machine the camera may drop frames at any time.
+    They differ by one and the same number, or by `offsets` of them if the camera counted anew in between. What was not
+    received is in gaps: on a loaded machine the camera may drop frames at any time.
     """
-    assert 1 <= len(told.offsets) <= offsets, f"index and number differ by {told.offsets}"
+    assert len(told.offsets) == offsets, f"index and number differ by {told.offsets}; runs {told.runs}"
     for (_, number), count in told.runs.items():
         assert not count or _within(report, number, count), f"frames {number} to {number + count - 1} were not all sent"
 

@@ -198,7 +198,7 @@ class Mapper:
         if self._knows_nuisances():
             self.nuisances.note(key, self.nuisances.level(key) * charge.brightness)
         self._residuals[key] = charge.loss / self.white**2
-        self._wrong = cv2.blur(charge.slope, (1, every))
+        self._wrong = charge.slope if every == 1 else cv2.blur(charge.slope, (1, every))
         slope = charge.slope if level.factor > 1 else _finer(charge.slope)
         return slope / np.float32(self.white**2)
 

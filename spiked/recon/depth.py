@@ -4,18 +4,24 @@
 across views, so plain differences in units of their noise are the cost.
 """
 
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+import spiked.native._odometry as _odometry
 from spiked.pose import Array
 from spiked.recon.views import Image
+from spiked.render.cpu import usable_cores
 from spiked.sensor import Intrinsics
 
 SWEPT_PIXELS = 130_000
 """Images of more pixels than about this are made smaller for the sweep: the first splats are coarser still."""
+MOST_APART, UNSEEN = 4.0, 2.0
+"""Deviations that two pictures differ by at most at a pixel, and where one of them saw nothing."""
 
 
 @dataclass(frozen=True)
@@ -57,10 +63,11 @@ def sweep(
     near_far: tuple[float, float],
     noise: Image,
     pixels: int = SWEPT_PIXELS,
+    threads: int | None = None,
 ) -> Sweep:
     """Inverse depth of `reference` between `near_far` (inverse depths: largest, smallest). `noise` [H, W] is the
     standard deviation of a difference between two images. Images of more than about so many `pixels` are swept at a
-    fraction of their size."""
+    fraction of their size. Threads default to the cores this process may use; their number changes no bit."""
     height, width = reference.image.shape
     fraction = max(1, round(float(np.sqrt(height * width / pixels))))
     if fraction > 1:
@@ -71,6 +78,7 @@ def sweep(
             near_far,
             np.asarray(_shrunk(noise, fraction) / fraction, np.float32),
             height * width,
+            threads,
         )
         size = (width, height)
         return Sweep(*(cv2.resize(image, size).astype(np.float32) for image in (small.inverse_depth, small.confidence)))
@@ -79,18 +87,22 @@ def sweep(
     largest, smallest = near_far
     planes = int(np.clip((largest - smallest) * intrinsics.fx * baseline / 0.6, 16, 96))
     inverse = np.linspace(smallest, largest, planes, dtype=np.float32)
-    weight = 1 / np.maximum(noise, 1e-6)
+    weight = np.ascontiguousarray(1 / np.maximum(noise, 1e-6), np.float32)
     cost = np.empty((planes, height, width), np.float32)
-    for p, q in enumerate(inverse):
+    image = np.ascontiguousarray(reference.image, np.float32)
+
+    def fill(plane: int) -> None:
         total = np.zeros((height, width), np.float32)
         for other in others:
-            warped = _through_plane(other, reference, k, float(q))
-            difference = np.abs(warped - reference.image) * weight
-            total += np.where(np.isfinite(warped), np.minimum(difference, 4.0), 2.0)
+            warped = _through_plane(other, reference, k, float(inverse[plane]))
+            _odometry.compare(warped, image, weight, MOST_APART, UNSEEN, total)
         total /= len(others)
-        cost[p] = (
+        cost[plane] = (
             cv2.boxFilter(total, -1, (3, 3)) + cv2.boxFilter(total, -1, (9, 9)) + cv2.boxFilter(total, -1, (21, 21))
         )
+
+    with ThreadPoolExecutor(threads or usable_cores()) as pool:
+        deque(pool.map(fill, range(planes)), maxlen=0)
     return _winner(cost, inverse)
 
 
@@ -122,18 +134,12 @@ def _through_plane(other: Shot, reference: Shot, k: Array, inverse_depth: float)
 
 def _winner(cost: Image, inverse: Image) -> Sweep:
     """Best plane, refined by a parabola through its neighbours; the runner-up gives confidence."""
-    planes = len(inverse)
-    best = np.argmin(cost, 0)
-    inner = np.clip(best, 1, planes - 2)
-    a, b, c = (np.take_along_axis(cost, (inner + d)[None], 0)[0] for d in (-1, 0, 1))
-    bend = a - 2 * b + c
-    offset = np.where((best == inner) & (bend > 1e-6), 0.5 * (a - c) / np.maximum(bend, 1e-6), 0.0)
-    step = inverse[1] - inverse[0]
-    value = inverse[best] + np.clip(offset, -0.5, 0.5) * step
-    rivals = np.where(np.abs(np.arange(planes)[:, None, None] - best) > max(2, planes // 12), cost, np.inf)
-    margin = rivals.min(0) / np.maximum(cost.min(0), 1e-6) - 1
+    planes, height, width = cost.shape
+    place, margin = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    _odometry.winner(cost, max(2, planes // 12), place, margin)
     confidence = np.clip(margin / 0.3, 0, 1).astype(np.float32)
-    return Sweep(_settled(value.astype(np.float32), confidence), confidence)
+    value = inverse[0] + place * (inverse[1] - inverse[0])
+    return Sweep(_settled(value, confidence), confidence)
 
 
 def _settled(value: Image, confidence: Image) -> Image:

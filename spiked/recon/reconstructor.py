@@ -349,7 +349,8 @@ class Reconstructor:
             # A quarter of the pixels takes a tenth of a second, in which a fast camera is not lost.
             pixels = SWEPT_PIXELS // 4 if self._odometry.sparse else SWEPT_PIXELS
             planes = (1.3 * high, 0.5 * low)
-            swept = sweep(shot(reference), others, self.sensor.intrinsics, planes, 1.5 * view.deviation, pixels)
+            noise = 1.5 * view.deviation
+            swept = sweep(shot(reference), others, self.sensor.intrinsics, planes, noise, pixels, self.options.threads)
             self._mapper.seed_from(view, rotations[reference], centres[reference], swept, SURE_DEPTH)
             doubtful.append((view, rotations[reference], centres[reference], swept))
             self._seeded.append(view.time)

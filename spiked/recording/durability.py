@@ -38,10 +38,12 @@ class Durability:
     """Space taken from the disk ahead of the frames, and given back at the end."""
     reserve_bytes: int = 0
     """Free space that is left to others: when there is less, the disk counts as full."""
+    direct: bool = False
+    """Write past the page cache, at a fraction of the processor's time; frames are on their way when `append` ends."""
 
 
 PLAIN = Durability()
-LIVE = Durability(index=True, sync=Sync.SECOND, preallocate_bytes=64 << 20, reserve_bytes=64 << 20)
+LIVE = Durability(index=True, sync=Sync.SECOND, preallocate_bytes=64 << 20, reserve_bytes=64 << 20, direct=True)
 """For cameras that do not wait."""
 
 

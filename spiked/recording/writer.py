@@ -4,7 +4,6 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from io import FileIO
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -14,6 +13,7 @@ from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
 from spiked.errors import RecordingError
+from spiked.recording.appender import Appender
 from spiked.recording.durability import PLAIN, Allocator, Durability, Sync, Syncer
 from spiked.recording.index import IndexWriter, index_path
 from spiked.recording.reader import REVERSED_BITS
@@ -24,7 +24,7 @@ from spiked.sensor import BitOrder, Layout, Sensor
 
 @dataclass
 class _Files:
-    frames: FileIO
+    frames: Appender
     index: IndexWriter | None
     allocator: Allocator
     syncer: Syncer | None = None
@@ -100,9 +100,7 @@ class RecordingWriter:
         self._closed = False
 
     def _open(self, *, resume: bool) -> _Files:
-        # Unbuffered: what was appended is the kernel's, whatever becomes of this process.
-        frames = self.path.open("r+b" if resume else "xb", buffering=0)
-        frames.seek(0, os.SEEK_END)
+        frames = Appender(self.path, resume=resume, direct=self._durability.direct)
         index = None
         beside = index_path(self.path)
         if self._durability.index and (not resume or beside.exists()):
@@ -127,11 +125,11 @@ class RecordingWriter:
         """The losses so far."""
         return tuple(self._gaps)
 
-    def append(self, frames: NDArray[np.uint8]) -> None:
+    def append(self, frames: NDArray[np.uint8], *, cached: bool = False) -> None:
         """Append compact frames, uint8 [n, height * row_bytes], LSB first, in the sensor's row order.
 
-        They are stored in the sensor's layout and bit order. Raises RecordingError when the disk does not take them;
-        the frames before remain valid.
+        They are stored in the sensor's layout and bit order. With `cached`, the kernel may keep them in memory for a
+        disk that is behind. Raises RecordingError when the disk does not take them; the frames before remain valid.
         """
         compact = self.sensor.compact().frame_bytes
         if frames.ndim != 2 or frames.shape[1] != compact or frames.dtype != np.uint8:
@@ -143,17 +141,14 @@ class RecordingWriter:
             if files.syncer is not None:
                 files.syncer.check()
             files.allocator.before(offset + stored.nbytes)
-            rest = stored.data
-            while rest:
-                rest = rest[files.frames.write(rest) :]
+            files.frames.append(stored, cached)
             if files.index is not None:
                 files.index.frames(self._next, len(frames), offset, crc32(stored))
             if self._durability.sync is Sync.BLOCK:
                 self._sync(files)
         except OSError as error:
             with suppress(OSError):  # on a disk gone read-only the unfinished block stays, and is not counted
-                files.frames.truncate(offset)
-                files.frames.seek(offset)
+                files.frames.cut(offset)
                 if files.index is not None:
                     files.index.retract(entries)
             raise RecordingError(
@@ -200,7 +195,7 @@ class RecordingWriter:
         if files.syncer is not None:
             files.syncer.close()
         try:
-            files.frames.truncate(self.bytes)  # gives back what was taken in advance
+            files.frames.cut(self.bytes)  # gives back what was taken in advance
             self._sync(files)
         except OSError as error:
             raise RecordingError(f"{self.path}: cannot be finished: {error.strerror}") from error

@@ -77,6 +77,7 @@ class RingReader:
         self._held: Frames | None = None
         self._end: End | None = None
         self._orphaned_s: float | None = None
+        self._look_s = 0.0
         writer = self._control.writer()
         self._counters.next_entry = (
             self._position_to_take(writer) if start_frame is None else self._position_of(start_frame, writer)
@@ -132,18 +133,21 @@ class RingReader:
             remaining_s = deadline - time.monotonic()
             if self._control.committed.wait(seen, min(max(remaining_s, 0.0), _LOOK_AGAIN_S)):
                 continue
-            if self._orphaned():
+            if self._has_died():
                 return self._take() or self._finish(self._control.writer(), EndReason.WRITER_DIED)
             if remaining_s <= 0:
                 return None
 
-    def _orphaned(self) -> bool:
-        """Whether nobody writes, nor will."""
+    def _has_died(self) -> bool:
+        """Whether nobody writes, nor will; looked at now and then only, as it costs what a block does."""
+        now_s = time.monotonic()
+        if now_s < self._look_s:
+            return False
+        self._look_s = now_s + _LOOK_AGAIN_S
         owner = self._segment.owner
         if is_alive(owner):
             self._orphaned_s = None
             return False
-        now_s = time.monotonic()
         self._orphaned_s = self._orphaned_s or now_s
         return not owner or now_s - self._orphaned_s > _MOURNING_S
 

@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import tempfile
+import threading
 import time
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -11,10 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from spiked.blocks import reduce_blocks
+from spiked.errors import RecordingError
 from spiked.recording import LIVE, RecordingWriter
 from spiked.render.benchmark import Row
 from spiked.ring import End, EndReason, Frames, Gap, Policy, RingError, RingReader, RingWriter
 from spiked.sensor import Sensor
+from spiked_service.roles.recorder import record
 
 _START_S = 30.0
 _PREVIEW_S = 1 / 30
@@ -90,29 +93,34 @@ def _produce(writer: RingWriter, sensor: Sensor, seconds: float) -> tuple[int, f
 
 def _consume(kind: str, name: str, folder: str, answer: Connection) -> None:
     policy = {"preview": Policy.LATEST, "recorder": Policy.PRIORITY}.get(kind, Policy.LOSSLESS)
-    lost = 0
     with RingReader.attach(name, policy, kind) as reader:
-        sensor = reader.geometry.sensor
-        writer = RecordingWriter(Path(folder) / "bench.dat", sensor, durability=LIVE) if kind == "recorder" else None
-        out = reduce_blocks(np.zeros((reader.geometry.block_frames, sensor.frame_bytes), np.uint8), sensor, 0)
         cpu_s, start_s = time.process_time(), time.perf_counter()
-        while not isinstance(item := reader.next(1.0), End):
-            if isinstance(item, Gap):
+        if kind == "recorder":
+            writer = RecordingWriter(Path(folder) / "bench.dat", reader.geometry.sensor, durability=LIVE)
+            ended = record(reader, writer, 0, None, threading.Event())
+            if ended.trouble:
+                raise RecordingError(ended.trouble)
+            lost = sum(ended.lost.values())
+        else:
+            lost = _reduce(reader, pause_s=_PREVIEW_S if kind == "preview" else 0.0)
+        answer.send((lost, (time.process_time() - cpu_s) / (time.perf_counter() - start_s)))
+
+
+def _reduce(reader: RingReader, pause_s: float) -> int:
+    """Blocks until the end, as a preview or a tracker does; frames that were lost."""
+    lost = 0
+    sensor = reader.geometry.sensor
+    out = reduce_blocks(np.zeros((reader.geometry.block_frames, sensor.frame_bytes), np.uint8), sensor, 0)
+    while not isinstance(item := reader.next(1.0), End):
+        if isinstance(item, Gap):
+            lost += item.count
+        if isinstance(item, Frames):
+            reduce_blocks(item.data, sensor, item.first, out=out)
+            if pause_s:
+                time.sleep(pause_s)
+            if not item.release():
                 lost += item.count
-            if not isinstance(item, Frames):
-                continue
-            if writer is not None:
-                writer.append(item.data)
-            else:
-                reduce_blocks(item.data, sensor, item.first, out=out)
-                if kind == "preview":
-                    time.sleep(_PREVIEW_S)
-            if not item.release() and kind != "preview":
-                lost += item.count
-        share = (time.process_time() - cpu_s) / (time.perf_counter() - start_s)
-        if writer is not None:
-            writer.close()
-        answer.send((lost, share))
+    return lost
 
 
 def rows(seconds: float, folder: Path | None = None) -> list[Row]:

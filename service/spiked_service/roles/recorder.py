@@ -2,6 +2,7 @@
 
 import logging
 import os
+import threading
 import time
 from collections import Counter
 from contextlib import suppress
@@ -19,7 +20,11 @@ from spiked_service.worker import Link
 _log = logging.getLogger("spiked.recorder")
 _WAIT_S = 0.1
 _BATCH_BLOCKS = 16
-"""Written at once when the disk is behind; otherwise every block by itself, as soon as it is there."""
+"""Most that are written at once."""
+_GATHER_S = 0.005
+"""Blocks that come within this time are written at once, which costs the processor a third."""
+_LATE_SHARE = 0.25
+"""Of the ring: with more to be written, the disk is too slow, and the kernel's memory may help it out."""
 _CLOCK_S = 1.0
 _LOOK_S = 0.1
 _NICE = -5
@@ -41,19 +46,29 @@ def run_recorder(order: RecorderOrder, link: Link) -> None:
             sensor = replace(sensor, intrinsics=order.intrinsics or sensor.intrinsics)
             more = {"device": {"source": order.source}}
             writer = RecordingWriter(order.path, sensor, note=order.note, durability=LIVE, **more)
-        scribe = _Scribe(writer, order.first_frame, reader)
-        end = None
-        try:
-            end = _record(reader, scribe, order.stop_frame, link)
-        except RecordingError as error:
-            scribe.trouble = str(error)
-        try:
-            writer.close()
-        except RecordingError as error:
-            scribe.trouble = scribe.trouble or str(error)
-    account = scribe.account(end)
+        account = record(reader, writer, order.first_frame, order.stop_frame, link.stop)
     _log.info("recording closed with %d frames; lost %s", account.frames, account.lost or "none")
     link.tell(account)
+
+
+def record(
+    reader: RingReader, writer: RecordingWriter, first_frame: int, stop_frame: int | None, stopped: threading.Event
+) -> RecordingEnded:
+    """From frame `first_frame` of the ring, where the recording begins, until its end, `stop_frame` or `stopped`.
+
+    The writer is closed. Trouble with the disk is told, not raised.
+    """
+    scribe = _Scribe(writer, first_frame, reader)
+    end = None
+    try:
+        end = _record(reader, scribe, stop_frame, stopped)
+    except RecordingError as error:
+        scribe.trouble = str(error)
+    try:
+        writer.close()
+    except RecordingError as error:
+        scribe.trouble = scribe.trouble or str(error)
+    return scribe.account(end)
 
 
 class _Scribe:
@@ -67,6 +82,9 @@ class _Scribe:
         shape = (_BATCH_BLOCKS * geometry.block_frames, geometry.sensor.frame_bytes)
         self._buffer: NDArray[np.uint8] = np.empty(shape, np.uint8)
         self._waiting = 0
+        self._due_s = 0.0
+        self._reader = reader
+        self._late_frames = _LATE_SHARE * geometry.slots * geometry.block_frames
         self._clock_s = self._looked_s = -np.inf
         self._fired = self._unfired = False
 
@@ -76,9 +94,9 @@ class _Scribe:
         return self._first + self.writer.next_frame + self._waiting
 
     @property
-    def waits(self) -> bool:
-        """Whether frames wait to be written."""
-        return self._waiting > 0
+    def patience_s(self) -> float:
+        """How long what waits to be written may wait for more."""
+        return max(0.0, self._due_s - time.monotonic()) if self._waiting else _WAIT_S
 
     @property
     def has_room(self) -> bool:
@@ -93,6 +111,7 @@ class _Scribe:
         place = self._buffer[self._waiting : self._waiting + end - begin]
         place[:] = item.data[begin:end]
         if item.release():
+            self._due_s = self._due_s if self._waiting else time.monotonic() + _GATHER_S
             self._waiting += end - begin
 
     def write(self) -> None:
@@ -108,8 +127,9 @@ class _Scribe:
             self._looked_s = now_s
             self._fired = self._fired or bool(frames[-1].any())
             self._unfired = self._unfired or bool((frames[-1] != 0xFF).any())
+        late = self._reader.newest_frame - self.next_frame > self._late_frames
         self._waiting = 0
-        self.writer.append(frames)
+        self.writer.append(frames, cached=late)
 
     def lose(self, gap: Gap, cause: Cause, stop: int | None) -> None:
         """Note a loss, as far as it lies within the capture. Raises RecordingError."""
@@ -135,11 +155,11 @@ class _Scribe:
         )
 
 
-def _record(reader: RingReader, scribe: _Scribe, stop: int | None, link: Link) -> End | None:
+def _record(reader: RingReader, scribe: _Scribe, stop: int | None, stopped: threading.Event) -> End | None:
     """Until the end of the ring, the capture's last frame, or the service's wish. Raises RecordingError."""
     overruns = reader.overruns
-    while not link.stop.is_set() and (stop is None or scribe.next_frame < stop):
-        item = reader.next(0.0 if scribe.waits else _WAIT_S)
+    while not stopped.is_set() and (stop is None or scribe.next_frame < stop):
+        item = reader.next(scribe.patience_s)
         match item:
             case Frames():
                 scribe.take(item, stop)

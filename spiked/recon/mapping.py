@@ -32,6 +32,8 @@ SEED_SHARE = 0.3
 """Part of all splats that one view may begin with."""
 DETAIL, DETAIL_PX = 3.0, 1.5
 """How much more is made of a slope's detail finer than so many (large) pixels, for fast motion."""
+BETAS = 0.8, 0.99
+"""Adam's memory, in the steps that see a splat: a few dozen are all that many get."""
 NUISANCES_FROM = 50
 """Steps before they are estimated at all: first the map has to look like something."""
 GAINS_FROM = 1500
@@ -79,7 +81,7 @@ class Mapper:
         self.depth = 1.0
         """Typical depth of the scene, which the rate of the means is in units of."""
         self.rasteriser = self.levels[0].rasteriser
-        self.adam = Adam(self.scene.arrays(), threads=threads)
+        self.adam = Adam(self.scene.arrays(), *BETAS, threads=threads)
         self.nuisances = Nuisances(sensor.height, sensor.width)
         self.steps = 0
         self._calibration = calibration

@@ -19,8 +19,8 @@ class MapOptions:
     """Cap of the number of splats, however many pixels there are."""
     rate_means: float = 2e-3
     """Learning rates at the start, per step; those of the means and of colour are in units of depth and of white."""
-    rate_quats: float = 8e-3
-    rate_scales: float = 3e-2
+    rate_quats: float = 2.5e-2
+    rate_scales: float = 1e-1
     rate_opacities: float = 8e-2
     rate_colours: float = 1.5e-2
     ssim: float = 0.2

@@ -1,6 +1,8 @@
 // Bands of rows share out the work; each has image rows of its own to add to, so that no bit depends on the threads.
 #include <algorithm>
 #include <cmath>
+#include <tuple>
+#include <utility>
 #include <vector>
 
 #include "bindings.hpp"
@@ -15,7 +17,7 @@ namespace {
 constexpr int kBands = 8;
 
 struct Band {
-    int64_t first = 0, last = 0;  // sensor rows
+    int64_t first = 0, last = 0;  // image rows that it adds to
     std::vector<float> slope;
     ChargeSums sums;
 };
@@ -72,36 +74,59 @@ class ChargeLoss {
     }
 
   private:
-    ChargeSums all(const ChargeJob& job, float* slope) {
+    ChargeSums all(ChargeJob job, float* slope) {
         const Kernels& kernels = choose_kernels();
-        const int64_t stride = job.image_width * job.colours;
+        const int64_t plane = job.image_height * job.image_width, colours = job.colours;
         scratch_.resize(static_cast<size_t>(pool_.threads()));
+        planes_.resize(static_cast<size_t>(plane * colours));
+        pool_.run(kBands, [&](int number, int) {
+            for (int64_t i = plane * number / kBands; i < plane * (number + 1) / kBands; ++i)
+                for (int64_t c = 0; c < colours; ++c)
+                    planes_[static_cast<size_t>(c * plane + i)] = job.image[i * colours + c];
+        });
+        job.image = planes_.data();
         pool_.run(kBands, [&](int number, int thread) {
             Band& band = bands_[number];
-            band.first = job.height * number / kBands;
-            band.last = job.height * (number + 1) / kBands;
+            const int64_t first = job.height * number / kBands, last = job.height * (number + 1) / kBands;
             band.sums = {};
-            const auto [low, high] = reach(job, band.first, band.last);
-            band.slope.assign(static_cast<size_t>((high - low) * stride), 0.0f);
+            std::tie(band.first, band.last) = reach(job, first, last);
             ChargeJob mine = job;
-            mine.slope = band.slope.data(), mine.slope_row = low;
+            mine.slope_row = band.first, mine.slope_plane = (band.last - band.first) * job.image_width;
+            band.slope.assign(static_cast<size_t>(mine.slope_plane * colours), 0.0f);
+            mine.slope = band.slope.data();
             std::vector<char>& scratch = scratch_[static_cast<size_t>(thread)];
             scratch.resize(static_cast<size_t>(kernels.charge_scratch()) + 64);
             const size_t skip = 64 - reinterpret_cast<uintptr_t>(scratch.data()) % 64;
             std::vector<float> lines(static_cast<size_t>(job.frames * job.columns * 2));
-            kernels.charge(mine, band.first, band.last, lines.data(), scratch.data() + skip, band.sums);
-            band.first = low, band.last = high;  // now: the image rows that it added to
+            kernels.charge(mine, first, last, lines.data(), scratch.data() + skip, band.sums);
         });
-        std::fill(slope, slope + job.image_height * stride, 0.0f);
+        pool_.run(kBands, [&](int number, int) {
+            std::vector<float> line(static_cast<size_t>(job.image_width));
+            for (int64_t y = job.image_height * number / kBands; y < job.image_height * (number + 1) / kBands; ++y)
+                for (int64_t c = 0; c < colours; ++c)
+                    gather(y, c, colours, line, slope + y * job.image_width * colours);
+        });
         ChargeSums sums{};
         for (const Band& band : bands_) {
-            float* out = slope + band.first * stride;
-            for (size_t i = 0; i < band.slope.size(); ++i) out[i] += band.slope[i];
             sums.loss += band.sums.loss, sums.pixels += band.sums.pixels;
             sums.chi2 += band.sums.chi2, sums.intervals += band.sums.intervals;
             sums.expected += band.sums.expected, sums.counted += band.sums.counted;
         }
         return sums;
+    }
+
+    // What all bands have added to a line of one colour, to every colours-th place of `out`.
+    void gather(int64_t y, int64_t colour, int64_t colours, std::vector<float>& line, float* out) const {
+        std::fill(line.begin(), line.end(), 0.0f);
+        for (const Band& band : bands_) {
+            if (y < band.first || y >= band.last) continue;
+            const int64_t rows = band.last - band.first;
+            const float* from =
+                band.slope.data() + (colour * rows + y - band.first) * static_cast<int64_t>(line.size());
+            for (size_t x = 0; x < line.size(); ++x) line[x] += from[x];
+        }
+        for (size_t x = 0; x < line.size(); ++x)
+            out[x * static_cast<size_t>(colours) + static_cast<size_t>(colour)] = line[x];
     }
 
     // The image rows that sensor rows [first, last) can come to lie in.
@@ -124,6 +149,7 @@ class ChargeLoss {
     Pool pool_;
     Band bands_[kBands];
     std::vector<std::vector<char>> scratch_;
+    std::vector<float> planes_;
 };
 
 // Where nodes `cell` px apart in frames lie in an image of inverse depths: p' ~ turn p + inverse(p') shift, by two

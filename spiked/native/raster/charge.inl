@@ -1,13 +1,24 @@
 // What frames of spikes say of an image that is carried along its motion. A pixel gathers light until the charge of one
 // spike is full: between two of its spikes, what it saw of the image as that moved past adds up to exactly one. Plain
 // loops over kPixels pixels of a row, which the compiler vectorises for each instruction set.
+//
+// Neighbours in a frame mostly are neighbours in the image. So kLanes of them are read and written at once where they
+// are; the image has a plane for each colour, of which a mosaic's row takes every second pixel in turn.
 
-constexpr int kPixels = 64;
+constexpr int kPixels = 64, kRuns = kPixels / kLanes;
+
+static inline Int lanes() {
+    Int number;
+    for (int i = 0; i < kLanes; ++i) number[i] = i;
+    return number;
+}
+static inline Vec alternate(Vec even, Vec odd) { return (lanes() & 1) != 0 ? odd : even; }
 
 struct ChargeWork {
     float light[kMaxChargeFrames][kPixels];                                     // expected charge of a frame
     float right[kMaxChargeFrames][kPixels], down[kMaxChargeFrames][kPixels];    // between the four image pixels
-    int32_t at[kMaxChargeFrames][kPixels];                                      // the upper left one of them
+    int32_t at[kMaxChargeFrames][kPixels];                                      // the upper left one, in a plane
+    bool run[kMaxChargeFrames][kRuns];                                          // kLanes of them side by side
     float inside[kMaxChargeFrames][kPixels], spike[kMaxChargeFrames][kPixels];  // 0 or 1
     float slope[kMaxChargeFrames][kPixels];
 };
@@ -18,26 +29,48 @@ struct ChargeRow {
     const uint8_t* bytes;  // of the first frame
     const float* lines;    // the displacements of the grids' columns on this row, [frames][columns][2]
     int64_t y;
+    int32_t even, odd;  // colours of this row's pixels
 };
+
+// The bits of 64 pixels, those beyond `count` 0; pixel 0 is the lowest.
+static inline uint64_t spikes_of(const uint8_t* bytes, int count, bool msb) {
+    uint64_t word = 0;
+    for (int k = 0; 8 * k < count; ++k) word |= (uint64_t)bytes[k] << (8 * k);
+    if (!msb) return word;
+    word = (word >> 1 & 0x5555555555555555u) | (word & 0x5555555555555555u) << 1;
+    word = (word >> 2 & 0x3333333333333333u) | (word & 0x3333333333333333u) << 2;
+    return (word >> 4 & 0x0f0f0f0f0f0f0f0fu) | (word & 0x0f0f0f0f0f0f0f0fu) << 4;
+}
+
+// Whether kLanes places lie side by side.
+static inline bool side_by_side(const int32_t* at) {
+    Int place;
+    __builtin_memcpy(&place, at, sizeof place);
+    const Int apart = place - at[0] - lanes();
+    return !any_reaches(__builtin_convertvector(apart & 0x7fffffff, Vec), splat(0.5f));
+}
 
 // Light and spikes of `count` pixels from column x0 on, in all frames.
 static void see(const ChargeJob& job, const ChargeRow& row, int64_t x0, int count, ChargeWork& work) {
     const float step = 1.0f / (float)job.cell, shrink = 1.0f / job.pixel;
     const float right_edge = (float)job.image_width - 1.001f, lower_edge = (float)job.image_height - 1.001f;
-    const int32_t colours = job.colours, stride = colours * (int32_t)job.image_width;
+    const int32_t stride = (int32_t)job.image_width;
+    const int64_t plane = job.image_height * job.image_width;
+    const float *even = job.image + row.even * plane, *odd = job.image + row.odd * plane;
     float gain[kPixels], dark[kPixels];
-    int32_t channel[kPixels];
     for (int i = 0; i < kPixels; ++i) {
         const bool there = i < count;
         gain[i] = there ? row.gain[x0 + i] : 0;
         dark[i] = there && row.dark ? row.dark[x0 + i] : 0;
-        channel[i] = colours > 1 ? job.tile[(row.y & 1) * 2 + ((x0 + i) & 1)] : 0;
     }
     for (int64_t f = 0; f < job.frames; ++f) {
         const uint8_t* bytes = row.bytes + f * job.frame_stride + x0 / 8;
         float* spike = work.spike[f];
-        for (int i = 0; i < kPixels; ++i) spike[i] = 0;
-        for (int i = 0; i < count; ++i) spike[i] = (float)((bytes[i >> 3] >> (job.msb ? 7 - (i & 7) : (i & 7))) & 1);
+        const uint64_t word = spikes_of(bytes, count, job.msb);
+        for (int from = 0; from < kPixels; from += kLanes) {
+            const Int some = (Int{} + (int32_t)(word >> from & ((1u << kLanes) - 1))) >> lanes();
+            store(spike + from, __builtin_convertvector(some & 1, Vec));
+        }
         const float* line = row.lines + f * job.columns * 2;
         float dx[kPixels], dy[kPixels];
         for (int from = 0; from < kPixels; from += 8) {
@@ -63,13 +96,27 @@ static void see(const ChargeJob& job, const ChargeRow& row, int64_t x0, int coun
             const int32_t column = (int32_t)x, line_number = (int32_t)y;
             right[i] = x - (float)column;
             down[i] = y - (float)line_number;
-            at[i] = line_number * stride + column * colours + channel[i];
+            at[i] = line_number * stride + column;
         }
-        for (int i = 0; i < kPixels; ++i) {
-            const float* p = job.image + at[i];
-            const float above = p[0] + right[i] * (p[colours] - p[0]);
-            const float below = p[stride] + right[i] * (p[stride + colours] - p[stride]);
-            light[i] = gain[i] * (above + down[i] * (below - above)) + dark[i];
+        for (int r = 0; r < kRuns; ++r) {
+            const int from = r * kLanes;
+            const bool run = work.run[f][r] = side_by_side(at + from);
+            if (run) {
+                const float *e = even + at[from], *o = odd + at[from];
+                const Vec u = load(right + from), v = load(down + from);
+                const Vec a = alternate(load(e), load(o)), b = alternate(load(e + 1), load(o + 1));
+                const Vec c = alternate(load(e + stride), load(o + stride));
+                const Vec d = alternate(load(e + stride + 1), load(o + stride + 1));
+                const Vec above = a + u * (b - a), below = c + u * (d - c);
+                store(light + from, load(gain + from) * (above + v * (below - above)) + load(dark + from));
+            } else {
+                for (int i = from; i < from + kLanes; ++i) {
+                    const float* p = (i & 1 ? odd : even) + at[i];
+                    const float above = p[0] + right[i] * (p[1] - p[0]);
+                    const float below = p[stride] + right[i] * (p[stride + 1] - p[stride]);
+                    light[i] = gain[i] * (above + down[i] * (below - above)) + dark[i];
+                }
+            }
         }
     }
     for (int64_t f = 0; f < job.frames; ++f)
@@ -151,18 +198,43 @@ static void judge(const ChargeJob& job, const ChargeRow& row, int64_t x0, Charge
 }
 
 // The transpose of see(): each slope goes to the four image pixels that its light came from.
-static void spread(const ChargeJob& job, int count, const ChargeWork& work) {
-    const int32_t colours = job.colours, stride = colours * (int32_t)job.image_width;
-    float* out = job.slope - job.slope_row * (int64_t)stride;
+static void spread(const ChargeJob& job, const ChargeRow& row, int count, const ChargeWork& work) {
+    const int32_t stride = (int32_t)job.image_width;
+    float* even = job.slope + row.even * job.slope_plane - job.slope_row * (int64_t)stride;
+    float* odd = job.slope + row.odd * job.slope_plane - job.slope_row * (int64_t)stride;
     for (int64_t f = 0; f < job.frames; ++f) {
-        for (int i = 0; i < count; ++i) {
-            float* p = out + work.at[f][i];
+        float left[2][kPixels + 1], right_of[2][kPixels + 1];  // of the upper and the lower line
+        float* right[2] = {right_of[0] + 1, right_of[1] + 1};
+        for (int i = 0; i < kPixels; ++i) {
             const float lower = work.slope[f][i] * work.down[f][i], upper = work.slope[f][i] - lower;
-            const float upper_right = upper * work.right[f][i], lower_right = lower * work.right[f][i];
-            p[0] += upper - upper_right;
-            p[colours] += upper_right;
-            p[stride] += lower - lower_right;
-            p[stride + colours] += lower_right;
+            right[0][i] = upper * work.right[f][i], right[1][i] = lower * work.right[f][i];
+            left[0][i] = upper - right[0][i], left[1][i] = lower - right[1][i];
+        }
+        for (int line = 0; line < 2; ++line) left[line][kPixels] = right_of[line][0] = 0;
+        // What every second pixel adds to a line, both sides of each, lies side by side.
+        for (int r = 0; r < kRuns; ++r) {
+            if (!work.run[f][r]) continue;
+            const int from = r * kLanes;
+            float* p = even + work.at[f][from];
+            for (int line = 0; line < 2; ++line, p += stride)
+                store(p, load(p) + alternate(load(left[line] + from), load(right[line] + from - 1)));
+        }
+        for (int r = 0; r < kRuns; ++r) {
+            if (!work.run[f][r]) continue;
+            const int from = r * kLanes;
+            float* p = odd + work.at[f][from] + 1;
+            for (int line = 0; line < 2; ++line, p += stride)
+                store(p, load(p) + alternate(load(left[line] + from + 1), load(right[line] + from)));
+        }
+        for (int r = 0; r < kRuns; ++r) {
+            if (work.run[f][r]) continue;
+            for (int i = r * kLanes; i < (r + 1) * kLanes && i < count; ++i) {
+                float* p = (i & 1 ? odd : even) + work.at[f][i];
+                p[0] += left[0][i];
+                p[1] += right[0][i];
+                p[stride] += left[1][i];
+                p[stride + 1] += right[1][i];
+            }
         }
     }
 }
@@ -181,14 +253,20 @@ static void charge(const ChargeJob& job, int64_t first_row, int64_t last_row, fl
             float* line = lines + f * job.columns * 2;
             for (int64_t k = 0; k < 2 * job.columns; ++k) line[k] = a[k] + share * (b[k] - a[k]);
         }
+        const bool mixed = job.colours > 1;
         const int64_t stored = job.flipped ? job.height - 1 - y : y;
-        const ChargeRow row = {job.gain + y * job.width, job.dark ? job.dark + y * job.width : nullptr,
-                               job.bytes + stored * job.row_stride, lines, y};
+        const ChargeRow row = {job.gain + y * job.width,
+                               job.dark ? job.dark + y * job.width : nullptr,
+                               job.bytes + stored * job.row_stride,
+                               lines,
+                               y,
+                               mixed ? job.tile[(y & 1) * 2] : 0,
+                               mixed ? job.tile[(y & 1) * 2 + 1] : 0};
         for (int64_t x = 0; x < job.width; x += kPixels) {
             const int count = (int)(job.width - x < kPixels ? job.width - x : kPixels);
             see(job, row, x, count, work);
             judge(job, row, x, work, sums);
-            spread(job, count, work);
+            spread(job, row, count, work);
         }
     }
 }

@@ -171,7 +171,7 @@ struct ChargeJob {
     const uint8_t* bytes;
     const float* grids;  // [frames][rows][columns][2], px of the sensor, at nodes `cell` apart
     int64_t rows, columns, cell;
-    const float* image;  // [image_height][image_width][colours], expected spikes a frame
+    const float* image;  // [colours][image_height][image_width], expected spikes a frame
     int64_t image_width, image_height;
     int32_t colours;
     float pixel;        // side of an image pixel in sensor pixels
@@ -179,8 +179,8 @@ struct ChargeJob {
     const float* dark;  // [height][width] or null, spikes a frame
     float floor;        // error of the map, spikes a frame
     float jitter;       // of an interval's charge
-    float* slope;       // image rows from slope_row on
-    int64_t slope_row;
+    float* slope;       // [colours][slope_plane], image rows from slope_row on
+    int64_t slope_row, slope_plane;
 };
 
 struct ChargeSums {

@@ -12,6 +12,7 @@ from spiked_service.commands.convert import convert
 from spiked_service.commands.devices import devices
 from spiked_service.commands.evaluate import evaluate
 from spiked_service.commands.info import info
+from spiked_service.commands.noise_report import noise_report
 from spiked_service.commands.openapi import openapi
 from spiked_service.commands.reconstruct import reconstruct
 from spiked_service.commands.render import render
@@ -31,7 +32,7 @@ app = typer.Typer(
 )
 for _group, _commands in {
     "Live": (serve, devices),
-    "Files": (info, verify, convert, simulate, calibrate),
+    "Files": (info, verify, convert, simulate, calibrate, noise_report),
     "Scenes": (reconstruct, render, evaluate),
     "This program": (bench, openapi, version),
 }.items():

@@ -32,8 +32,8 @@ SEED_SHARE = 0.3
 """Part of all splats that one view may begin with."""
 DETAIL, DETAIL_PX = 3.0, 1.5
 """How much more is made of a slope's detail finer than so many (large) pixels, for fast motion."""
-BETAS = 0.8, 0.99
-"""Adam's memory, in the steps that see a splat: a few dozen are all that many get."""
+BETAS = 0.9, 0.99
+"""Adam's memory, in steps that see a splat: many see few."""
 NUISANCES_FROM = 50
 """Steps before they are estimated at all: first the map has to look like something."""
 GAINS_FROM = 1500

@@ -9,6 +9,7 @@ import staging
 from staging import SENSOR
 
 from spiked.evaluate import psnr, similarity_of_trajectories
+from spiked.noise import measure_noise
 from spiked.pose import Array
 from spiked.recon import Options, Reconstructor, State
 from spiked.recording import open_recording
@@ -24,11 +25,11 @@ Figure = Callable[[str, object, str], None]
 
 def test_counts_of_a_real_camera_vary_less_than_any_binomial(shared: Path, figure: Figure) -> None:
     recording = open_recording(shared / "real" / "static_fence.dat", width=400, height=250, frame_rate_hz=20000.0)
-    windows = recording.frames // 32
-    bits = np.unpackbits(recording.read(0, 32 * windows), axis=1).reshape(windows, 32, -1)
-    variance = float(bits.sum(1, dtype=np.float64).var(0, ddof=1).mean())
+    (row,) = (row for row in measure_noise(recording).windows if row.frames == 32)
+    variance = row.variance
     figure("noise on static_fence: var(count, n = 32)", f"{variance:.3f}", "0.15 to 0.25")
     assert 0.15 < variance < 0.25
+    assert row.charge < row.counted / 2
 
 
 def test_tracks_have_no_bias(figure: Figure) -> None:

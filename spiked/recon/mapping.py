@@ -145,8 +145,7 @@ class Mapper:
         return self.levels[int(np.ceil(coarse * (len(self.levels) - 1)))]
 
     def step(self, key: int, view: View, sight: Sight, decay: float, level: Level) -> Gradients:
-        """One gradient step on a view; `decay` scales the rate of the means, and its root the others.
-        Returns the gradients (for the poses)."""
+        """One gradient step on a view; `decay` scales all rates. Returns the gradients (for the poses)."""
         # A background of any brightness: dark things have to be there, not to be holes.
         background = float(self._rng.uniform(0, self.options.background)) * self.white
         if sight.passage is None:
@@ -156,9 +155,8 @@ class Mapper:
         gradients = level.rasteriser.backward(slope)
         self.steps += 1
         o = self.options
-        rest = float(np.sqrt(decay))
         others = (o.rate_quats, o.rate_scales, o.rate_opacities, o.rate_colours * self.white)
-        rates = (o.rate_means * self.depth * decay, *(rest * rate for rate in others))
+        rates = tuple(decay * rate for rate in (o.rate_means * self.depth, *others))
         slopes = (gradients.means, gradients.quats, gradients.log_scales, gradients.opacity_logits, gradients.colours)
         self.adam.step(self.scene.arrays(), slopes, rates, gradients.radius_px > 0)
         # Light taken away would fit as well, but viewers of the scene know none: they show such splats as black.

@@ -43,7 +43,7 @@ class Options:
     """Frames of a view; None follows the motion (8 to 64)."""
     steps: int = 2000
     """Gradient steps of the final refinement; images of more than 130,000 pixels get fewer, as each costs more,
-    and fast motion gets up to 1.85 times as many."""
+    and fast motion gets up to 1.8 times as many."""
     seed: int = 0
     """Seed of everything random: the same input, options and seed give the same result."""
     threads: int | None = None

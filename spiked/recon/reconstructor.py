@@ -37,9 +37,9 @@ COARSE_SHARE = 0.6
 """Part of the refinement in which large images are looked at with fewer, larger pixels: a quarter of the work each."""
 SMALL_PIXELS = 130_000
 """Images up to here get all the steps that the options say."""
-LARGE_POWER = 0.35
+LARGE_POWER = 0.3
 """The steps of larger ones fall with this power of their pixels: each costs more, and they have more to settle."""
-FAST_STEPS = 1.85
+FAST_STEPS = 1.8
 """Times as many steps for views of fast motion, which cost less each and say less of what is fine."""
 DENSIFY_EVERY = 20
 """Steps after which the view just seen gets splats where it is rendered worst: each part of the path has its turn."""

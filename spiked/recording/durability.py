@@ -39,7 +39,7 @@ class Durability:
     reserve_bytes: int = 0
     """Free space that is left to others: when there is less, the disk counts as full."""
     direct: bool = False
-    """Write past the page cache, at a fraction of the processor's time; frames are on their way when `append` ends."""
+    """Write past the page cache, at a fraction of the processor's time; an append then waits for the disk."""
 
 
 PLAIN = Durability()

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.blocks import aligned_window
+from spiked.blocks import aligned_window, unpack
 from spiked.errors import RecordingError
 from spiked.recording import Recording
+from spiked.sensor import Sensor
 
 LENGTHS = (4, 8, 16, 32, 64)
 """Frames of the windows that are compared."""
@@ -67,7 +68,7 @@ def measure_noise(recording: Recording, most_frames: int = 2048) -> NoiseReport:
             f"{recording.path}: no pixel has {LEAST_SPIKES} spikes in {count} frames; use a lit scene or more frames"
         )
     rate = total[used] / count
-    interval, jitter = _intervals(recording, frames, used)
+    interval, jitter = _intervals(recording.sensor, frames, used)
     rows = tuple(_windows(recording, frames, used, rate, length) for length in lengths)
     return NoiseReport(count, float(total.mean() / count), interval, jitter, rows)
 
@@ -97,12 +98,12 @@ def _windows(
     )
 
 
-def _intervals(recording: Recording, frames: NDArray[np.uint8], used: NDArray[np.bool_]) -> tuple[float, float]:
+def _intervals(sensor: Sensor, frames: NDArray[np.uint8], used: NDArray[np.bool_]) -> tuple[float, float]:
     """Medians over the pixels of the mean and of the standard deviation of the frames from spike to spike."""
     last = np.full(used.shape, -1, np.int32)
     number, total, squares = np.zeros(used.shape), np.zeros(used.shape), np.zeros(used.shape)
     for frame in range(len(frames)):
-        v, u = np.nonzero(recording.images(frame, 1)[0] & used)
+        v, u = np.nonzero(unpack(frames[frame : frame + 1], sensor)[0] & used)
         before = last[v, u]
         length = np.where(before >= 0, frame - before, 0)
         number[v, u] += before >= 0

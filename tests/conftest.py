@@ -1,5 +1,6 @@
 """What several folders of tests share: the data beside the repository, and the daemon as a process."""
 
+import os
 import re
 import subprocess
 import sys
@@ -139,3 +140,13 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
         terminalreporter.section("validation")
     for what, value, bound in figures:
         terminalreporter.write_line(f"{what:58s} {value:>16s}   ({bound})")
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Path:
+    """A folder whose file system takes direct writes."""
+    try:
+        os.close(os.open(tmp_path / "try", os.O_WRONLY | os.O_CREAT | os.O_DIRECT))
+    except OSError as error:
+        pytest.skip(f"the file system of {tmp_path} takes no direct writes: {error.strerror}")
+    return tmp_path

@@ -16,16 +16,6 @@ def content(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, count, np.uint8)
 
 
-@pytest.fixture
-def disk(tmp_path: Path) -> Path:
-    """A folder whose file system takes direct writes."""
-    try:
-        os.close(os.open(tmp_path / "try", os.O_WRONLY | os.O_CREAT | os.O_DIRECT))
-    except OSError as error:
-        pytest.skip(f"the file system of {tmp_path} takes no direct writes: {error.strerror}")
-    return tmp_path
-
-
 def test_appends_of_any_length_follow_each_other_and_whole_pages_go_directly(disk: Path) -> None:
     rng = np.random.default_rng(1)
     lengths = [1, 4095, 1, 70_000, 100_000, 4096, 65_536, 9 << 20, *rng.integers(1, 300_000, 40)]

@@ -7,4 +7,5 @@ NB_MODULE(_odometry, m) {
     spiked::bind_pose(m);
     spiked::bind_flow(m);
     spiked::bind_light(m);
+    spiked::bind_rotation(m);
 }

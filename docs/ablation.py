@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -27,6 +28,7 @@ import spiked.recon.bootstrap as bootstrap
 from spiked.blocks import Window
 from spiked.evaluate import score_trajectory
 from spiked.recon import MapOptions, Options, Reconstructor, mapping, reconstructor, smooth, views
+from spiked.recon.edges import Edges
 from spiked.recon.levels import Level, Target
 from spiked.recon.mapping import Mapper, Sight, fill_mosaic
 from spiked.recon.views import Image, View
@@ -53,14 +55,28 @@ class Row:
     steps_share: float = 1.0
 
 
-def counted(window: Window, after_gap: bool, *more: Any, **named: Any) -> View:
+class Counted(View):
     """Rates by counting in the nominal window, with the variance that counts have."""
-    length = window.end - window.begin
-    rate = (window.count / np.float32(length)).astype(np.float32)
-    deviation = np.full(rate.shape, np.sqrt(0.2) / length, np.float32)
-    zero = np.zeros(rate.shape, np.float16)
+
+    counts: Image
+
+    @cached_property
+    def light(self) -> tuple[Image, Image]:
+        length = np.float32(self.end - self.begin)
+        return self.counts / length, np.full(self.counts.shape, np.sqrt(0.2) / length, np.float32)
+
+    def glimpse(self, room: Image) -> Image:
+        return self.rate
+
+
+def counted(window: Window, after_gap: bool, *more: Any, **named: Any) -> View:
+    """A view by counting; all pixels look at the nominal window."""
+    none = np.zeros_like(window.spikes)
+    edges = Edges.of(replace(window, spikes=none))
     sharp = more[1] if len(more) > 1 else named.get("sharp")
-    return View(window.begin, window.end, rate, deviation, zero, zero + length, float(rate.mean()), after_gap, sharp)
+    view = Counted(window.begin, window.end, edges, float(window.count.mean()), None, after_gap, sharp)
+    view.__dict__["counts"] = window.count.astype(np.float32)
+    return view
 
 
 def still_poses(parts: int) -> Callable[[Reconstructor, View, Spline, int], Sight]:

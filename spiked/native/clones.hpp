@@ -6,3 +6,6 @@
 #else
 #define SPIKED_CLONES
 #endif
+
+// A loop over lanes: one vector each, rather than unrolled before anybody sees that.
+#define SPIKED_LANES _Pragma("GCC unroll 1") _Pragma("GCC ivdep")

@@ -15,10 +15,11 @@ from spiked.pose import Array, exp_so3, log_so3, mean_rotation
 from spiked.recon.bootstrap import INLIER_PX, LEAST_INLIERS, MORE_MOTION, SCALE_PX, Views
 from spiked.recon.bundle import Bundle
 from spiked.recon.certainty import path_error
+from spiked.recon.edges import Edges
 from spiked.recon.focal import CORRELATED, Focal, try_fields
 from spiked.recon.movers import first_map
 from spiked.recon.smooth import Bursts, bursts, clock_of, coarsest
-from spiked.recon.stamps import Stamps, delays
+from spiked.recon.stamps import Stamps
 from spiked.recon.tracks import Picture, Tracks, flow, search
 from spiked.sensor import Intrinsics
 from spiked.spline import Spline, Waypoints
@@ -174,15 +175,15 @@ class Odometry:
         length: int,
         picture: Picture,
         known: tuple[Array, Array] | None = None,
-        delay: NDArray[np.floating] | None = None,
+        edges: Edges | None = None,
     ) -> Posed:
         """Track one view of `length` frames around `time` and pose it if possible.
 
-        `known` gives its pose, `delay` [H, W] by how many frames each pixel's own time is later.
+        `known` gives its pose, `edges` say when each pixel looked.
         """
         motion = self._tracks.add(len(self.views), picture)
         ids, at = self._tracks.ids.copy(), self._tracks.at.copy()
-        late = np.zeros(len(ids)) if delay is None else delays(picture, delay, at)
+        late = np.zeros(len(ids)) if edges is None else edges.delays(picture, at)
         pixels, unsure = self._stamps.level(time, ids, at, late)
         posed = Posed(time, length, ids, pixels, motion, self.state, unsure_px=unsure)
         self.views.append(posed)

@@ -144,6 +144,7 @@ class Reconstructor:
         self._mapper = self._new_mapper()
         self._rng = np.random.default_rng(self.options.seed)
         self._views: list[View] = []
+        self._room = np.empty((sensor.height, sensor.width), np.float32)
         self._queue: list[int] = []
         self._seeded: list[float] = []
         self._gaps: list[tuple[int, int]] = []
@@ -236,10 +237,10 @@ class Reconstructor:
         self._broken = True
 
     def _add(self, view: View) -> None:
-        grey = luminance(view.rate, self.sensor.mosaic) if view.sharp is None else view.sharp
-        delay = view.delay if view.sharp is None else None
-        image = picture(grey, white_of(grey))
-        posed = self._odometry.add(view.time, view.end - view.begin, image, self._given(view), delay)
+        sharp = view.sharp
+        grey = luminance(view.glimpse(self._room), self.sensor.mosaic) if sharp is None else sharp
+        image, edges = picture(grey, white_of(grey)), view.edges if sharp is None else None
+        posed = self._odometry.add(view.time, view.end - view.begin, image, self._given(view), edges)
         self._views.append(view)
         self._broken = False
         if len(self._views) == 1:
@@ -541,7 +542,9 @@ class Reconstructor:
     def tracked(self, since: int = 0) -> list[Tracked]:
         """The views tracked so far, in order, without the first `since`."""
         new = self._odometry.views[since:]
-        rates = {view.time: float(view.rate.mean()) for view in self._views[-min(64, len(new) or 1) :]}
+        rates = {
+            view.time: view.spikes_a_pixel / (view.end - view.begin) for view in self._views[-min(64, len(new) or 1) :]
+        }
         return [
             Tracked(
                 view.time,

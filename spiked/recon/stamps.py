@@ -9,24 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-import spiked.native._odometry as _odometry
 from spiked.pose import Array
-from spiked.recon.tracks import Picture
 
 UNSURE = 0.25
 """Part of a shift to the view's time that may be wrong: the pixels around a track looked at different times."""
 NEAR = 8
 """Tracks whose motion is taken for that of one without a past."""
-
-
-def delays(image: Picture, delay: NDArray[np.floating], at: Array) -> Array:
-    """Frames [n] between a view's time and that at which tracks at `at` [n, 2] were seen.
-
-    delay [H, W] is each pixel's own; those with the steepest slopes say most about where a track is.
-    """
-    out = np.empty(len(at))
-    _odometry.delays(image, np.ascontiguousarray(delay, np.float16).view(np.uint16), np.ascontiguousarray(at), out)
-    return out
 
 
 @dataclass(frozen=True)

@@ -2,21 +2,20 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-import spiked.native._odometry as _odometry
 from spiked.blocks import Window, aligned_window
 from spiked.calibration import Calibration
+from spiked.recon.edges import Edges
 from spiked.recon.motion import Sharpener, drift, speed
 from spiked.sensor import Mosaic, Sensor
 
 Image = NDArray[np.float32]
 
-JITTER = 1.2e-3
-"""Squared relative jitter of one interval between spikes."""
 LATE_PERCENT = 10.0
 """Pixels, of a hundred, that may begin before the span over which a view is rendered, or end after it: the darkest ones
 gather charge for so long that sub-frames over all of it would be too long to be straight."""
@@ -49,16 +48,12 @@ class View:
 
     begin: int
     end: int
-    rate: Image
-    """Spikes a frame; where no whole interval was seen, half of the rate's upper bound."""
-    deviation: Image
-    """Standard deviation of `rate`."""
-    delay: NDArray[np.float16]
-    """Frames from the middle of the window to the middle of the charge that `rate` was measured from."""
-    duration: NDArray[np.float16]
-    """Frames over which that charge came together."""
+    edges: Edges
+    """Of each pixel's charge."""
     spikes_a_pixel: float
     """Mean plain count."""
+    calibration: Calibration | None = None
+    """Where there is one, rates are light."""
     after_gap: bool = False
     """Frames are missing between the view before and this one."""
     sharp: Image | None = None
@@ -74,6 +69,26 @@ class View:
         """The middle of the window in frames."""
         return 0.5 * (self.begin + self.end)
 
+    @cached_property
+    def light(self) -> tuple[Image, Image]:
+        """Rate and deviation, kept from the first time that somebody asks for them."""
+        measured = self.edges.rate(), self.edges.deviation()
+        return measured if self.calibration is None else self.calibration.apply(*measured)
+
+    @property
+    def rate(self) -> Image:
+        """Spikes a frame; where no whole interval was seen, half of the rate's upper bound."""
+        return self.light[0]
+
+    @property
+    def deviation(self) -> Image:
+        """Standard deviation of `rate`."""
+        return self.light[1]
+
+    def glimpse(self, room: Image) -> Image:
+        """`rate` for one look: it may be in `room`, and is not kept."""
+        return self.rate if self.calibration is not None else self.edges.rate(room)
+
     def exposure(self, parts: int) -> tuple[NDArray[np.float64], Image, NDArray[np.bool_]]:
         """When each pixel gathered its charge, for `Rasteriser.forward_moving` with `parts` sub-frames.
 
@@ -81,10 +96,9 @@ class View:
         pixels looked at, the pixels' windows [2, H, W] in units of these, and which pixels [H, W] they describe: the
         others looked much longer.
         """
-        half = 0.5 * self.duration.astype(np.float32)
-        start, stop = self.delay - half, self.delay + half
-        first = np.percentile(start[::4, ::4], LATE_PERCENT)
-        last = np.percentile(stop[::4, ::4], 100 - LATE_PERCENT)
+        start, stop = self.edges.times()
+        first = float(np.percentile(start[::4, ::4], LATE_PERCENT))
+        last = float(np.percentile(stop[::4, ::4], 100 - LATE_PERCENT))
         scale = np.float32(parts / max(last - first, 1e-3))
         windows = np.stack([(start - np.float32(first)) * scale, (stop - np.float32(first)) * scale])
         whole = windows[1] - windows[0]
@@ -103,26 +117,8 @@ def make_view(
     frames: NDArray[np.uint8] | None = None,
 ) -> View:
     """The view of a spike-aligned window, in light instead of spikes where the camera is calibrated."""
-    shape = window.spikes.shape
-    rate, deviation = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    delay, duration = np.empty(shape, np.float16), np.empty(shape, np.float16)
-    _odometry.measure(
-        window.spikes,
-        window.start_offset,
-        window.stop_offset,
-        window.frames,
-        window.end - window.begin,
-        0.5 * (window.begin + window.end) - window.first_frame,
-        JITTER,
-        rate,
-        deviation,
-        delay.view(np.uint16),
-        duration.view(np.uint16),
-    )
-    if calibration is not None:
-        rate, deviation = calibration.apply(rate, deviation)
-    count = float(window.count.mean())
-    return View(window.begin, window.end, rate, deviation, delay, duration, count, after_gap, sharp, first, frames)
+    edges, count = Edges.of(window), float(cv2.mean(window.count)[0])
+    return View(window.begin, window.end, edges, count, calibration, after_gap, sharp, first, frames)
 
 
 class Windows:

@@ -1,12 +1,11 @@
 """Where no view says where the camera was, it went on evenly; and each track belongs to its own moment."""
 
-import cv2
 import numpy as np
 
 from spiked.pose import exp_so3
 from spiked.recon.inertia import Inertia
 from spiked.recon.smooth import clock_of
-from spiked.recon.stamps import Stamps, delays
+from spiked.recon.stamps import Stamps
 from spiked.spline import Clock, Spline
 
 
@@ -40,15 +39,6 @@ def test_tracks_are_brought_to_the_time_of_their_view() -> None:
         at, unsure = stamps.level(time, ids, seen, np.full(40, late))
     np.testing.assert_allclose(at, start + speed * 24.0, atol=1e-9)
     assert 0 < unsure < np.linalg.norm(3 * speed)
-
-
-def test_the_delay_of_a_track_is_that_of_the_edges_around_it() -> None:
-    image = np.zeros((40, 40), np.uint8)
-    image[10:20, 10:20] = 200
-    image = cv2.GaussianBlur(image, (0, 0), 1.0)
-    delay = np.full((40, 40), 9.0, np.float32)
-    delay[6:24, 6:24] = 2.0
-    assert abs(delays(image, delay, np.array([[15.0, 15.0]]))[0] - 2.0) < 0.1
 
 
 def test_knots_are_not_spent_on_a_camera_that_stands_still() -> None:

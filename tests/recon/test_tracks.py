@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from spiked.blocks import Window
-from spiked.recon.stamps import delays
+from spiked.recon.edges import Edges
 from spiked.recon.tracks import Tracks, flow, picture, pyramid, white_of
 from spiked.recon.views import make_view
 
@@ -87,30 +87,55 @@ def test_white_is_a_quantile(share_of_zeros: float) -> None:
     assert white_of(rate) == pytest.approx(wanted)
 
 
-def test_a_view_is_measured_as_its_window_says() -> None:
+@pytest.mark.parametrize("far", [0, 300])
+def test_a_view_is_measured_as_its_window_says(far: int) -> None:
     rng = np.random.default_rng(4)
     start = rng.integers(0, 24, (H, W)).astype(np.uint16)
-    stop = (start + rng.integers(1, 40, (H, W))).astype(np.uint16)
+    stop = (start + far + rng.integers(1, 40, (H, W))).astype(np.uint16)
     spikes = rng.integers(1, 9, (H, W)).astype(np.uint16)
     spikes[:20] = 0
     start[:10], stop[:10] = 0xFFFF, 0xFFFF
     stop[10:20] = start[10:20]
-    window = Window(100, 64, 124, 140, spikes, start, stop, spikes)
+    window = Window(100, 64 + far, 124, 140 + far, spikes, start, stop, spikes)
     view = make_view(window, after_gap=False)
     valid = window.valid
+    assert view.edges.start.dtype == (np.uint16 if far else np.uint8)
     np.testing.assert_allclose(view.rate, window.rate(fill=True), rtol=1e-6)
+    np.testing.assert_array_equal(view.glimpse(np.empty((H, W), np.float32)), view.rate)
     np.testing.assert_allclose(view.deviation[valid], np.sqrt(window.variance(jitter=1.2e-3))[valid], rtol=1e-5)
     np.testing.assert_allclose(view.deviation[~valid], window.rate_bound()[~valid], rtol=1e-6)
-    np.testing.assert_array_equal(view.delay, np.where(valid, np.nan_to_num(window.centre() - 132.0), 0))
-    np.testing.assert_array_equal(view.duration, np.where(valid, window.duration(), 16))
+    assert view.spikes_a_pixel == pytest.approx(spikes.mean())
+    first, last = view.edges.times()
+    middle = np.where(valid, np.nan_to_num(window.centre() - view.time), 0)
+    np.testing.assert_allclose(0.5 * (first + last), middle, atol=1e-5)
+    np.testing.assert_allclose(last - first, np.where(valid, window.duration(), 16 + far), atol=1e-5)
 
 
-def test_delays_are_means_where_it_is_steep() -> None:
+def edges_with(late: np.ndarray, kind: type) -> Edges:
+    """Of pixels that each looked for 8 frames, so many frames later than the middle of the window."""
+    start = (30 + late - 4.5).astype(kind)
+    return Edges(np.ones(late.shape, kind), start, start + kind(8), 60, 16, 30.0)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_delays_are_means_where_it_is_steep(kind: type) -> None:
     image = np.zeros((H, W), np.uint8)
     image[:, 60:] = 200
-    delay = np.full((H, W), 3.0, np.float16)
-    delay[:, 59:61] = -2.5
+    late = np.full((H, W), 3.5)
+    late[:, 59:61] = -2.5
     at = np.array([[60.0, 48.0], [20.0, 48.0], [-5.0, H + 9.0], [W - 0.5, 0.5]])
-    found = delays(image, delay, at)
+    edges = edges_with(late, kind)
+    found = edges.delays(image, at)
     assert found[0] == pytest.approx(-2.5, abs=0.02)
-    assert found[1:] == pytest.approx([3.0, 3.0, 3.0], abs=1e-3)
+    assert found[1:] == pytest.approx([3.5, 3.5, 3.5], abs=1e-3)
+    edges.spikes[:] = 0
+    np.testing.assert_array_equal(edges.delays(image, at), 0)
+
+
+def test_the_delay_of_a_track_is_that_of_the_edges_around_it() -> None:
+    image = np.zeros((40, 40), np.uint8)
+    image[10:20, 10:20] = 200
+    image = cv2.GaussianBlur(image, (0, 0), 1.0)
+    late = np.full((40, 40), 9.5)
+    late[6:24, 6:24] = 2.5
+    assert abs(edges_with(late, np.uint8).delays(image, np.array([[15.0, 15.0]]))[0] - 2.5) < 0.1

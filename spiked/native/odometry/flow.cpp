@@ -22,8 +22,6 @@ constexpr int kIterations = 30;
 constexpr float kStill2 = 0.003f * 0.003f;  // px^2, a step that ends the search
 constexpr float kLeastEdge = 0.1f;  // mean squared gradient a px across the weakest direction, in grey levels squared
 
-// A loop over lanes: one vector each, rather than unrolled before anybody sees that.
-#define SPIKED_LANES _Pragma("GCC unroll 1") _Pragma("GCC ivdep")
 constexpr int kMargin = 24;  // px around a picture that repeat its edge
 
 // A picture without its margin; a place may lie half a window beyond the edge.

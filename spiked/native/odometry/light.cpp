@@ -11,56 +11,19 @@
 namespace spiked {
 namespace {
 
-constexpr uint16_t kNever = 0xFFFF;
 constexpr int kReach = 6;  // px from the middle of a track's window to its edge
 constexpr int kColumns = 16;
 
-// Half-precision bits of a number that they hold exactly, or nearly.
-inline uint16_t half(float value) {
-    uint32_t bits;
-    std::memcpy(&bits, &value, 4);
-    const uint32_t size = bits & 0x7fffffffU;
-    const uint32_t small = size < 0x38800000U ? 0U : (size - 0x38000000U) >> 13;
-    return static_cast<uint16_t>(small | ((bits >> 16) & 0x8000U));
-}
-
-// And back; 0 becomes 3e-5.
-inline float full(uint16_t bits) {
-    const uint32_t size = (static_cast<uint32_t>(bits & 0x7fff) << 13) + 0x38000000U;
-    const uint32_t all = size | (static_cast<uint32_t>(bits & 0x8000) << 16);
-    float value;
-    std::memcpy(&value, &all, 4);
-    return value;
-}
-
-struct Span {
-    float frames, whole, middle, jitter;  // frames looked at, of the window, and its middle from the first looked at
+// What is known of each pixel: as spiked.recon.edges.Edges.
+template <class T>
+struct Edges {
+    const T *spikes, *start, *stop;
+    int64_t count;
 };
 
-SPIKED_CLONES void measure_pixels(const uint16_t* __restrict spikes, const uint16_t* __restrict start,
-                                  const uint16_t* __restrict stop, int64_t count, Span span, float* __restrict rate,
-                                  float* __restrict deviation, uint16_t* __restrict delay,
-                                  uint16_t* __restrict duration) {
-    const float per_frame = 1 / span.frames;
-    for (int64_t i = 0; i < count; ++i) {
-        const bool valid = spikes[i] > 0;
-        const float first = start[i], last = stop[i], m = spikes[i];
-        const float bound = (start[i] != kNever ? 2.0f : 1.0f) * per_frame;
-        const float time = valid ? last - first : 1.0f;
-        const float per_time = 1 / time, p = m * per_time;
-        const float charge = p * p / 6 + span.jitter * m + (0.01f * m) * (0.01f * m);
-        const float noise = std::sqrt(charge) * per_time;
-        const uint16_t late = half(0.5f * (first + last) + 0.5f - span.middle);
-        rate[i] = valid ? p : 0.5f * bound;
-        deviation[i] = valid ? noise : bound;
-        delay[i] = valid ? late : 0;
-        duration[i] = half(valid ? time : span.whole);
-    }
-}
-
-using Counts = Array<const uint16_t, 2>;
+template <class T>
+using Offsets = Array<const T, 2>;
 using Image = Array<float, 2>;
-using Halves = Array<uint16_t, 2>;
 
 template <class A, class B>
 void same_shape(const A& a, const B& b) {
@@ -69,20 +32,89 @@ void same_shape(const A& a, const B& b) {
     }
 }
 
-void measure(const Counts& spikes, const Counts& start, const Counts& stop, int frames, int whole, double middle,
-             double jitter, const Image& rate, const Image& deviation, const Halves& delay, const Halves& duration) {
+template <class T>
+Edges<T> edges_of(const Offsets<T>& spikes, const Offsets<T>& start, const Offsets<T>& stop) {
     same_shape(spikes, start);
     same_shape(spikes, stop);
-    same_shape(spikes, rate);
-    same_shape(spikes, deviation);
-    same_shape(spikes, delay);
-    same_shape(spikes, duration);
-    if (frames < 1 || whole < 1) throw std::invalid_argument("a window has at least one frame");
-    const Span span = {static_cast<float>(frames), static_cast<float>(whole), static_cast<float>(middle),
-                       static_cast<float>(jitter)};
+    return {spikes.data(), start.data(), stop.data(), static_cast<int64_t>(spikes.size())};
+}
+
+constexpr uint8_t kByte = 0xFF;  // the largest number of a byte; all of them are "never"
+constexpr uint16_t kWord = 0xFFFF;
+inline float bound(bool seen, float per_frame) { return (seen ? 2.0f : 1.0f) * per_frame; }
+
+template <class T>
+inline void rate_pixels(Edges<T> e, T never, float per_frame, float* __restrict out) {
+    for (int64_t i = 0; i < e.count; ++i) {
+        const float m = e.spikes[i], time = static_cast<float>(e.stop[i] - e.start[i]);
+        out[i] = m > 0 ? m / time : 0.5f * bound(e.start[i] != never, per_frame);
+    }
+}
+
+template <class T>
+inline void deviation_pixels(Edges<T> e, T never, float per_frame, float jitter, float* __restrict out) {
+    for (int64_t i = 0; i < e.count; ++i) {
+        const float m = e.spikes[i], per_time = 1 / std::max(static_cast<float>(e.stop[i] - e.start[i]), 1.0f);
+        const float p = m * per_time, charge = p * p / 6 + jitter * m + (0.01f * m) * (0.01f * m);
+        out[i] = m > 0 ? std::sqrt(charge) * per_time : bound(e.start[i] != never, per_frame);
+    }
+}
+
+template <class T>
+inline void time_pixels(Edges<T> e, float middle, float half, float* __restrict first, float* __restrict last) {
+    for (int64_t i = 0; i < e.count; ++i) {
+        first[i] = e.spikes[i] > 0 ? static_cast<float>(e.start[i]) + 0.5f - middle : -half;
+        last[i] = e.spikes[i] > 0 ? static_cast<float>(e.stop[i]) + 0.5f - middle : half;
+    }
+}
+
+SPIKED_CLONES void rate_all(Edges<uint8_t> e, float per_frame, float* out) { rate_pixels(e, kByte, per_frame, out); }
+SPIKED_CLONES void rate_all(Edges<uint16_t> e, float per_frame, float* out) { rate_pixels(e, kWord, per_frame, out); }
+SPIKED_CLONES void deviation_all(Edges<uint8_t> e, float per_frame, float jitter, float* out) {
+    deviation_pixels(e, kByte, per_frame, jitter, out);
+}
+SPIKED_CLONES void deviation_all(Edges<uint16_t> e, float per_frame, float jitter, float* out) {
+    deviation_pixels(e, kWord, per_frame, jitter, out);
+}
+SPIKED_CLONES void time_all(Edges<uint8_t> e, float middle, float half, float* first, float* last) {
+    time_pixels(e, middle, half, first, last);
+}
+SPIKED_CLONES void time_all(Edges<uint16_t> e, float middle, float half, float* first, float* last) {
+    time_pixels(e, middle, half, first, last);
+}
+
+float per_frame(int frames) {
+    if (frames < 1) throw std::invalid_argument("a window has at least one frame");
+    return 1 / static_cast<float>(frames);
+}
+
+template <class T>
+void rates(const Offsets<T>& spikes, const Offsets<T>& start, const Offsets<T>& stop, int frames, const Image& out) {
+    same_shape(spikes, out);
+    const float share = per_frame(frames);
+    const auto edges = edges_of<T>(spikes, start, stop);
     nb::gil_scoped_release release;
-    measure_pixels(spikes.data(), start.data(), stop.data(), static_cast<int64_t>(spikes.size()), span, rate.data(),
-                   deviation.data(), delay.data(), duration.data());
+    rate_all(edges, share, out.data());
+}
+
+template <class T>
+void deviations(const Offsets<T>& spikes, const Offsets<T>& start, const Offsets<T>& stop, int frames, double jitter,
+                const Image& out) {
+    same_shape(spikes, out);
+    const float share = per_frame(frames);
+    const auto edges = edges_of<T>(spikes, start, stop);
+    nb::gil_scoped_release release;
+    deviation_all(edges, share, static_cast<float>(jitter), out.data());
+}
+
+template <class T>
+void times(const Offsets<T>& spikes, const Offsets<T>& start, const Offsets<T>& stop, double middle, double length,
+           const Image& first, const Image& last) {
+    same_shape(spikes, first);
+    same_shape(spikes, last);
+    const auto edges = edges_of<T>(spikes, start, stop);
+    nb::gil_scoped_release release;
+    time_all(edges, static_cast<float>(middle), static_cast<float>(length / 2), first.data(), last.data());
 }
 
 // The value below which so large a share of an image's values (none negative) are: those in the same of 8,192 steps,
@@ -174,23 +206,30 @@ void picture(const Array<const float, 2>& rate, double white, const Array<uint8_
     }
 }
 
-// The mean delay in a window, of rows [top, bottom) and `columns` columns from `left` on, weighed by squared slopes.
-template <int kLanes>
-inline float steep(const uint8_t* picture, const uint16_t* delay, int64_t stride, int64_t top, int64_t bottom,
-                   int columns) {
+// Twice the mean time in a window of `edges` from its first frame, counted from twice the middle of it all, of rows
+// [top, bottom) and `columns` columns from `left` on, weighed by squared slopes.
+template <int kLanes, class T>
+inline float steep(const uint8_t* picture, Edges<T> edges, int64_t stride, int64_t top, int64_t bottom, int columns,
+                   float twice) {
     float sum[kColumns] = {}, weights[kColumns] = {};
     const int lanes = kLanes ? kLanes : columns;
     for (int64_t y = top; y < bottom; ++y) {
         const uint8_t* q = picture + y * stride;
         const uint8_t *p = q - stride, *r = q + stride;
-        const uint16_t* d = delay + y * stride;
-#pragma GCC unroll 1
-        for (int x = 0; x < lanes; ++x) {
+        const T *m = edges.spikes + y * stride, *first = edges.start + y * stride, *last = edges.stop + y * stride;
+        float weight[kColumns], late[kColumns];
+        SPIKED_LANES for (int x = 0; x < lanes; ++x) {
             const int dx = 3 * (p[x + 1] - p[x - 1] + r[x + 1] - r[x - 1]) + 10 * (q[x + 1] - q[x - 1]);
             const int dy = 3 * (r[x - 1] - p[x - 1] + r[x + 1] - p[x + 1]) + 10 * (r[x] - p[x]);
-            const float weight = x < columns ? static_cast<float>(dx * dx + dy * dy) + 1 : 0.0f;
-            sum[x] += weight * full(d[x]);
-            weights[x] += weight;
+            weight[x] = x < columns ? static_cast<float>(dx * dx + dy * dy + 1) : 0.0f;
+        }
+        SPIKED_LANES for (int x = 0; x < lanes; ++x) {
+            const int sure = m[x] > 0 ? 1 : 0;
+            late[x] = static_cast<float>(sure * (first[x] + last[x])) - static_cast<float>(sure) * twice;
+        }
+        SPIKED_LANES for (int x = 0; x < lanes; ++x) {
+            sum[x] += weight[x] * late[x];
+            weights[x] += weight[x];
         }
     }
     float all = 0, weight = 0;
@@ -201,15 +240,30 @@ inline float steep(const uint8_t* picture, const uint16_t* delay, int64_t stride
     return weight > 0 ? all / weight : 0;
 }
 
-SPIKED_CLONES float steep_delay(const uint8_t* picture, const uint16_t* delay, int64_t width, int64_t left, int64_t top,
-                                int64_t bottom, int columns) {
-    return left + kColumns < width ? steep<kColumns>(picture + left, delay + left, width, top, bottom, columns)
-                                   : steep<0>(picture + left, delay + left, width, top, bottom, columns);
+template <class T>
+inline float steep_any(const uint8_t* picture, Edges<T> edges, int64_t width, int64_t left, int64_t top, int64_t bottom,
+                       int columns, float twice) {
+    edges.spikes += left;
+    edges.start += left;
+    edges.stop += left;
+    return left + kColumns < width ? steep<kColumns>(picture + left, edges, width, top, bottom, columns, twice)
+                                   : steep<0>(picture + left, edges, width, top, bottom, columns, twice);
 }
 
-void delays(const Array<const uint8_t, 2>& picture, const Array<const uint16_t, 2>& delay,
-            const Array<const double, 2>& at, const Array<double, 1>& out) {
-    same_shape(picture, delay);
+SPIKED_CLONES float steep_time(const uint8_t* picture, Edges<uint8_t> edges, int64_t width, int64_t left, int64_t top,
+                               int64_t bottom, int columns, float twice) {
+    return steep_any(picture, edges, width, left, top, bottom, columns, twice);
+}
+SPIKED_CLONES float steep_time(const uint8_t* picture, Edges<uint16_t> edges, int64_t width, int64_t left, int64_t top,
+                               int64_t bottom, int columns, float twice) {
+    return steep_any(picture, edges, width, left, top, bottom, columns, twice);
+}
+
+template <class T>
+void delays(const Array<const uint8_t, 2>& picture, const Offsets<T>& spikes, const Offsets<T>& start,
+            const Offsets<T>& stop, double middle, const Array<const double, 2>& at, const Array<double, 1>& out) {
+    same_shape(picture, spikes);
+    const auto edges = edges_of<T>(spikes, start, stop);
     if (at.shape(1) != 2 || out.shape(0) != at.shape(0)) throw std::invalid_argument("expected at [n, 2], out [n]");
     const auto height = static_cast<int64_t>(picture.shape(0)), width = static_cast<int64_t>(picture.shape(1));
     if (height < 3 || width < 3) throw std::invalid_argument("a picture needs 3x3 pixels");
@@ -220,21 +274,35 @@ void delays(const Array<const uint8_t, 2>& picture, const Array<const uint16_t, 
         const int64_t right = std::clamp<int64_t>(x + kReach + 1, left + 1, width - 1);
         const int64_t top = std::clamp<int64_t>(y - kReach, 1, height - 2);
         const int64_t bottom = std::clamp<int64_t>(y + kReach + 1, top + 1, height - 1);
-        out.data()[n] =
-            steep_delay(picture.data(), delay.data(), width, left, top, bottom, static_cast<int>(right - left));
+        out.data()[n] = 0.5 * steep_time(picture.data(), edges, width, left, top, bottom,
+                                         static_cast<int>(right - left), static_cast<float>(2 * middle - 1));
     }
+}
+
+// What is the same for bytes and words; arrays are not converted, or all would be taken for bytes.
+template <class T>
+void bind_edges(nb::module_& m) {
+    const auto spikes = nb::arg("spikes").noconvert(), start = nb::arg("start").noconvert();
+    const auto stop = nb::arg("stop").noconvert();
+    m.def("rates", &rates<T>, spikes, start, stop, nb::arg("frames"), nb::arg("out"),
+          "Spikes a frame, or half of their upper bound where no interval was seen.");
+    m.def("deviations", &deviations<T>, spikes, start, stop, nb::arg("frames"), nb::arg("jitter"), nb::arg("out"),
+          "Standard deviations of rates, or their upper bounds.");
+    m.def("times", &times<T>, spikes, start, stop, nb::arg("middle"), nb::arg("length"), nb::arg("first"),
+          nb::arg("last"), "Frames from `middle` to the begin and the end of each pixel's charge.");
+    m.def("delays", &delays<T>, nb::arg("picture"), spikes, start, stop, nb::arg("middle"), nb::arg("at"),
+          nb::arg("out"),
+          "Mean frames from `middle` to the middles of the charge of the 13x13 pixels around each place, weighed by\n"
+          "squared slopes.");
 }
 
 }  // namespace
 
 void bind_light(nb::module_& m) {
-    m.def("measure", &measure,
-          "Rates and their deviations [H, W], and bits of half floats: frames from `middle` (counted from the first\n"
-          "frame looked at) to the middle of each pixel's charge, and over which it came together; `whole` for none.");
+    bind_edges<uint8_t>(m);
+    bind_edges<uint16_t>(m);
     m.def("quantile", &quantile, "The value below which such a share of an image's values are; none may be negative.");
     m.def("picture", &picture, "255 times the root of rate / white, at most 255, blurred by 0.8 px.");
-    m.def("delays", &delays,
-          "Mean of `delay` (bits of half floats) in the 13x13 pixels around each place, weighed by squared slopes.");
 }
 
 }  // namespace spiked

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 import spiked.native._odometry as _odometry
 from spiked.pose import Array, exp_so3
 from spiked.recon.inertia import Inertia
+from spiked.recon.robust import median
 from spiked.sensor import Intrinsics
 from spiked.spline import Spline
 
@@ -115,7 +116,7 @@ class Bundle:
 
     def noise_px(self) -> float:
         """Standard deviation of a track's place in one view and one direction, from the median residual."""
-        return float(np.median(np.linalg.norm(self.residuals(), axis=1))) / 1.1774
+        return median(np.linalg.norm(self.residuals(), axis=1)) / 1.1774
 
     def pose_hessians(self, scale_px: float) -> Array:
         """How firmly each pose is held by the points where they are: [C, 6, 6] of (rotation, centre), in 1/px^2."""

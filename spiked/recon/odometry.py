@@ -18,6 +18,7 @@ from spiked.recon.certainty import path_error
 from spiked.recon.edges import Edges
 from spiked.recon.focal import CORRELATED, Focal, try_fields
 from spiked.recon.movers import first_map
+from spiked.recon.robust import median
 from spiked.recon.smooth import Bursts, bursts, clock_of, coarsest
 from spiked.recon.stamps import Stamps
 from spiked.recon.tracks import Picture, Tracks, flow, search
@@ -395,8 +396,8 @@ class Odometry:
         _odometry.fit_pose(points, pixels, k.fx, k.fy, k.cx, k.cy, scales, rotation, centre, size, hessian, move)
         inliers = float(np.mean(size < 1.5 * INLIER_PX))
         noise = float(np.hypot(max(1.3 * self._noise_px, LEAST_NOISE_PX), view.unsure_px))
-        chi2 = float((np.median(size) / (1.1774 * noise)) ** 2)
-        depth = float(np.median((points - centre) @ rotation[:, 2]))
+        chi2 = float((median(size) / (1.1774 * noise)) ** 2)
+        depth = median((points - centre) @ rotation[:, 2])
         seen_px = _odometry.displacement(hessian, rotation, k.fx, k.fy, k.cx, k.cy, max(depth, 1e-6))
         return Fit(rotation, centre, inliers, len(points), chi2, float(np.sqrt(max(chi2, 1.0)) * noise * seen_px))
 
@@ -605,7 +606,7 @@ class Odometry:
         for row, n in enumerate(numbers):
             seen = size[bundle.camera == row]
             if len(seen):
-                chi2[row] = (np.median(seen) / (1.1774 * np.hypot(noise, self.views[n].unsure_px))) ** 2
+                chi2[row] = (median(seen) / (1.1774 * np.hypot(noise, self.views[n].unsure_px))) ** 2
         # Their neighbours on a spline are drawn along: only the worst of each few are wrong for sure.
         around = np.lib.stride_tricks.sliding_window_view(np.pad(chi2, 2), 5).max(1)
         return [n for n, own, most in zip(numbers, chi2, around, strict=True) if own > HOPELESS_CHI2 and own == most]

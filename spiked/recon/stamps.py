@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.pose import Array
+from spiked.recon.robust import median
 
 UNSURE = 0.25
 """Part of a shift to the view's time that may be wrong: the pixels around a track looked at different times."""
@@ -40,7 +41,7 @@ class Stamps:
         velocity = np.zeros_like(at) if self.last is None else _velocity(self.last, time, ids, at, time + late)
         self.last = _Seen(time, ids.copy(), at.copy(), time + late, velocity)
         shift = velocity * late[:, None]
-        unsure = UNSURE * float(np.median(np.linalg.norm(shift, axis=1))) if len(ids) else 0.0
+        unsure = UNSURE * median(np.linalg.norm(shift, axis=1)) if len(ids) else 0.0
         return np.asarray(at - shift), unsure
 
 

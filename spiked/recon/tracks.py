@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 import spiked.native._odometry as _odometry
 from spiked.pose import Array
+from spiked.recon.robust import median
 
 Picture = NDArray[np.uint8]
 Pyramid = list[NDArray[np.float32]]
@@ -21,6 +22,10 @@ LEVELS = 4
 """Times that a picture is halved to follow tracks from one view to the next."""
 NEAR_PX = 3.0
 """After so much motion from one view to the next half the size is small enough to look at."""
+NEAR_GUESS_PX = 1.5
+"""A track is where it was expected to this many pixels."""
+LOOKED = 2
+"""Pixels from one to the next, across and down, that the white of a picture is found from."""
 SURE = 0.6
 """With so many of the points found, no other place is tried."""
 
@@ -33,8 +38,8 @@ def picture(rate: NDArray[np.float32], white: float) -> Picture:
 
 
 def white_of(rate: NDArray[np.float32]) -> float:
-    """The rate that is shown as white, brighter than 99.5 % of the pixels."""
-    return max(float(_odometry.quantile(np.ascontiguousarray(rate, np.float32), 0.995)), 1e-6)
+    """The rate that is shown as white, brighter than 99.5 % of every fourth pixel."""
+    return max(float(_odometry.quantile(rate[::LOOKED, ::LOOKED], 0.995)), 1e-6)
 
 
 @dataclass
@@ -53,6 +58,8 @@ class Tracks:
     """Positions [live, 2] px (pixel centres at +0.5) in the newest window."""
     born: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     birthplace: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    pace: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    """Motion [live, 2] px to the newest window; NaN for tracks that are new in it."""
     pictures: dict[int, Pyramid] = field(default_factory=dict)
     """Of the newest window and those in which tracks were born."""
     newest_picture: Picture | None = None
@@ -77,38 +84,67 @@ class Tracks:
 
     def forget(self) -> None:
         """Let go of all tracks, where what they follow cannot be what they followed."""
-        self.ids, self.at, self.born, self.birthplace = self.ids[:0], self.at[:0], self.born[:0], self.birthplace[:0]
+        self._keep(np.zeros(len(self.ids), bool))
 
     def resume(self, window: int, ids: NDArray[np.int64], at: Array) -> None:
         """Continue tracks that were found again in the newest window."""
-        fresh = ~np.isin(self.ids, ids)
-        count = len(ids)
-        self.ids = np.concatenate([ids, self.ids[fresh]])
-        self.at = np.concatenate([at, self.at[fresh]])
-        self.born = np.concatenate([np.full(count, window), self.born[fresh]])
-        self.birthplace = np.concatenate([at, self.birthplace[fresh]])
+        self._keep(~np.isin(self.ids, ids))
+        self._begin(window, ids, at)
+
+    def _keep(self, good: NDArray[np.bool_]) -> None:
+        self.ids, self.at, self.pace = self.ids[good], self.at[good], self.pace[good]
+        self.born, self.birthplace = self.born[good], self.birthplace[good]
+
+    def _begin(self, window: int, ids: NDArray[np.int64], at: Array) -> None:
+        self.ids = np.concatenate([self.ids, ids])
+        self.at = np.concatenate([self.at, at])
+        self.pace = np.concatenate([self.pace, np.full_like(at, np.nan)])
+        self.born = np.concatenate([self.born, np.full(len(ids), window)])
+        self.birthplace = np.concatenate([self.birthplace, at])
 
     def _follow(self, image: Picture, levels: Pyramid) -> float:
-        if self.far and self.newest_picture is not None:
-            moved, good = search(self.newest_picture, image, self.at)
-        else:
-            before = self.pictures[self.newest]
-            few = 1 if self.motion_px < NEAR_PX else LEVELS
-            moved, good = follow(before, levels, self.at, self.at, self.reach_px, few, back=False)
-            if few < LEVELS and good.sum() < SURE * len(good):
-                moved, good = follow(before, levels, self.at, self.at, self.reach_px, back=False)
-        motion = float(np.median(np.linalg.norm(moved - self.at, axis=1)[good])) if good.any() else 0.0
-        for window in np.unique(self.born[good]):
-            rows = np.flatnonzero(good & (self.born == window))
-            refined, ok = follow(self.pictures[window], levels, self.birthplace[rows], moved[rows], self.reach_px, 0)
-            near = np.linalg.norm(refined - moved[rows], axis=1) < 1.5
-            moved[rows] = np.where((ok & near)[:, None], refined, moved[rows])
-            good[rows] &= ok & near
+        """Where tracks are expected is where they began as it looks now, or else they are looked for."""
+        moved, good = self._refined(levels, self._expected())
+        if good.sum() <= SURE * len(good):
+            moved, found = self._sought(image, levels)
+            moved, good = self._refined(levels, moved)
+            good &= found
         height, width = image.shape
+        motion = median(np.linalg.norm(moved - self.at, axis=1)[good]) if good.any() else 0.0
         good &= (moved > 4).all(1) & (moved[:, 0] < width - 4) & (moved[:, 1] < height - 4)
-        self.ids, self.at = self.ids[good], moved[good]
-        self.born, self.birthplace = self.born[good], self.birthplace[good]
+        self.at, self.pace = moved, moved - self.at
+        self._keep(good)
         return motion
+
+    def _expected(self) -> Array | None:
+        """Places [live, 2] if all go on as they went, None where that says little; new ones go as most do."""
+        known = ~np.isnan(self.pace[:, 0])
+        if self.far or self.motion_px >= NEAR_PX or known.sum() <= SURE * len(known):
+            return None
+        return self.at + np.where(known[:, None], self.pace, [median(one) for one in self.pace[known].T])
+
+    def _sought(self, image: Picture, levels: Pyramid) -> tuple[Array, NDArray[np.bool_]]:
+        """Places [live, 2] by the newest picture, and which were found."""
+        assert self.newest_picture is not None
+        if self.far:
+            return search(self.newest_picture, image, self.at)
+        before = self.pictures[self.newest]
+        few = 1 if self.motion_px < NEAR_PX else LEVELS
+        moved, good = follow(before, levels, self.at, self.at, self.reach_px, few, back=False)
+        if few < LEVELS and good.sum() < SURE * len(good):
+            moved, good = follow(before, levels, self.at, self.at, self.reach_px, back=False)
+        return moved, good
+
+    def _refined(self, levels: Pyramid, guess: Array | None) -> tuple[Array, NDArray[np.bool_]]:
+        """Places [live, 2] near a guess by how tracks looked when they were born, and which were found."""
+        good = np.zeros(len(self.ids), bool)
+        if guess is None:
+            return self.at, good
+        windows = sorted(self.pictures)
+        births, at = [self.pictures[window][0] for window in windows], np.array(guess)
+        row = np.searchsorted(windows, self.born)
+        _odometry.refine(births, row, levels[0], self.birthplace, at, self.reach_px, NEAR_GUESS_PX, good)
+        return at, good
 
     def _start(self, window: int, image: Picture) -> None:
         mask = np.full(image.shape, 255, np.uint8)
@@ -120,11 +156,8 @@ class Tracks:
         if corners is None:
             return
         fresh = corners[:, 0].astype(float) + 0.5
-        self.ids = np.concatenate([self.ids, self.next_id + np.arange(len(fresh))])
+        self._begin(window, self.next_id + np.arange(len(fresh)), fresh)
         self.next_id += len(fresh)
-        self.at = np.concatenate([self.at, fresh])
-        self.born = np.concatenate([self.born, np.full(len(fresh), window)])
-        self.birthplace = np.concatenate([self.birthplace, fresh])
 
 
 def flow(

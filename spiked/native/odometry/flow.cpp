@@ -217,6 +217,41 @@ void follow(const Pictures& a, const Pictures& b, const Array<const double, 2>& 
     }
 }
 
+// Each track in its own picture of `births` and in the newest one, at full size.
+void refine(const Pictures& births, const Array<const int64_t, 1>& birth, const Array<const float, 2>& newest,
+            const Array<const double, 2>& start, const Array<double, 2>& at, float reach, float near,
+            const Array<bool, 1>& good) {
+    const size_t count = start.shape(0);
+    if (birth.shape(0) != count || start.shape(1) != 2 || at.shape(0) != count || at.shape(1) != 2 ||
+        good.shape(0) != count) {
+        throw std::invalid_argument("expected birth [n], start and at [n, 2], good [n]");
+    }
+    const std::vector<Gray> from = grays(births), to = grays({newest});
+    for (const Gray& one : from) {
+        if (one.width != to[0].width || one.height != to[0].height) {
+            throw std::invalid_argument("all pictures must have the same size");
+        }
+    }
+    for (size_t n = 0; n < count; ++n) {
+        if (birth.data()[n] < 0 || birth.data()[n] >= static_cast<int64_t>(from.size())) {
+            throw std::invalid_argument("a track names a picture that does not exist");
+        }
+    }
+    nb::gil_scoped_release release;
+    for (size_t n = 0; n < count; ++n) {
+        const Gray& born = from[birth.data()[n]];
+        const auto x = static_cast<float>(start.data()[2 * n] - 0.5);
+        const auto y = static_cast<float>(start.data()[2 * n + 1] - 0.5);
+        const auto guess_u = static_cast<float>(at.data()[2 * n] - 0.5);
+        const auto guess_v = static_cast<float>(at.data()[2 * n + 1] - 0.5);
+        float u = guess_u, v = guess_v, back_x = x, back_y = y;
+        good.data()[n] = align(born, to[0], x, y, &u, &v) && std::hypot(u - guess_u, v - guess_v) < near &&
+                         align(to[0], born, u, v, &back_x, &back_y) && std::hypot(back_x - x, back_y - y) < reach;
+        at.data()[2 * n] = u + 0.5;
+        at.data()[2 * n + 1] = v + 0.5;
+    }
+}
+
 }  // namespace
 
 void bind_flow(nb::module_& m) {
@@ -228,6 +263,11 @@ void bind_flow(nb::module_& m) {
           "it is in `b`: `at` [n, 2] holds guesses and is changed. `good` [n]: found and, with `back`, less than "
           "`reach` px apart\n"
           "when followed back. Pixel centres are at +0.5.");
+    m.def(
+        "refine", &refine,
+        "For each place of `start` [n, 2] in picture `birth` [n] of `births`, where it is in `newest`: `at` [n, 2]\n"
+        "holds guesses and is changed. `good` [n]: found less than `near` px from the guess and, followed back, less\n"
+        "than `reach` px from where it began.");
 }
 
 }  // namespace spiked

@@ -121,27 +121,33 @@ void times(const Offsets<T>& spikes, const Offsets<T>& start, const Offsets<T>& 
 // the upper bits of a float, are told apart, no others.
 constexpr int kBinShift = 19;
 
-double quantile(const Array<const float, 2>& image, double share) {
-    const size_t count = image.size();
-    if (count == 0 || !(share >= 0 && share <= 1))
+double quantile(const nb::ndarray<const float, nb::ndim<2>, nb::device::cpu>& image, double share) {
+    const auto height = static_cast<int64_t>(image.shape(0)), width = static_cast<int64_t>(image.shape(1));
+    if (height == 0 || width == 0 || !(share >= 0 && share <= 1))
         throw std::invalid_argument("expected pixels, and a share of 0 to 1");
     const auto step = [](float value) {
         uint32_t bits;
-        const float positive = value > 0 ? value : 0.0f;
-        std::memcpy(&bits, &positive, 4);
+        std::memcpy(&bits, &value, 4);
         return bits >> kBinShift;
     };
     nb::gil_scoped_release release;
     std::vector<uint32_t> bins(1 << (32 - kBinShift));
-    for (size_t i = 0; i < count; ++i) ++bins[step(image.data()[i])];
-    const auto wanted = static_cast<size_t>(share * static_cast<double>(count - 1));
+    std::vector<float> values(height * width), same;
+    for (int64_t y = 0, i = 0; y < height; ++y) {
+        const float* row = image.data() + y * image.stride(0);
+        for (int64_t x = 0; x < width; ++x) {
+            const float value = row[x * image.stride(1)];
+            values[i++] = value > 0 ? value : 0.0f;
+        }
+    }
+    for (const float value : values) ++bins[step(value)];
+    const auto wanted = static_cast<size_t>(share * static_cast<double>(values.size() - 1));
     size_t below = 0;
     uint32_t bin = 0;
     while (below + bins[bin] <= wanted) below += bins[bin++];
-    std::vector<float> same;
     same.reserve(bins[bin]);
-    for (size_t i = 0; i < count; ++i) {
-        if (step(image.data()[i]) == bin) same.push_back(image.data()[i]);
+    for (const float value : values) {
+        if (step(value) == bin) same.push_back(value);
     }
     const auto at = same.begin() + static_cast<int64_t>(wanted - below);
     std::nth_element(same.begin(), at, same.end());

@@ -75,6 +75,11 @@ BOOT_VIEWS = 10
 MIN_PARALLAX_PX = 0.8
 """Motion that rotation cannot explain before a bootstrap is tried; tracks are good to 0.05 px."""
 MIN_POINTS = 15
+LEAST_SEEN, LEAST_SPREAD_PX, PLACED_PX = 5, 0.5, 2.0
+"""A track has a place in space when so many views saw it, along rays that spread by so much, and none sees the place so
+far off."""
+LEAST_BOUND = 3
+"""A point is adjusted when so many of the views adjusted saw it."""
 LEAST_NOISE_PX = 0.15
 """Points that were found lately are not yet better than this, however clean their tracks are."""
 WORST_CHI2 = 2.5
@@ -128,7 +133,7 @@ class Effort:
     """Of each part, at most."""
 
 
-WHOLE, MEANWHILE = Effort(100, 100, 8), Effort(48, 24, 4)
+WHOLE, MEANWHILE = Effort(100, 100, 8), Effort(32, 16, 3)
 """Kinks of fast motion take all of the views (with 32 of 100 free ones the error of garden_fast was 4 %), and so does
 the last adjustment (the camera that walks forward had turns wrong by 0.011 degrees over 32 frames instead of 0.003)."""
 
@@ -450,66 +455,30 @@ class Odometry:
 
     def _triangulate(self, span: range) -> None:
         """Positions for tracks that have none, from the posed views of `span`."""
-        rotations, rays, ids, centres, pixels = self._unplaced(span)
-        if len(ids) == 0:
+        posed = [(v, v.rotation, v.centre) for v in self.views[span.start : span.stop] if v.rotation is not None]
+        if not posed:
             return
-        unique, row = np.unique(ids, return_inverse=True)
-        outer = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-        lhs, rhs = np.zeros((len(unique), 3, 3)), np.zeros((len(unique), 3))
-        np.add.at(lhs, row, outer)
-        np.add.at(rhs, row, np.einsum("mij,mj->mi", outer, centres))
-        seen = np.bincount(row)
-        # The smallest eigenvalue is the sum of squared sines of the angles between the rays and their mean direction.
-        spread = np.sqrt(np.maximum(np.linalg.eigvalsh(lhs)[:, 0], 0) / np.maximum(seen, 1)) * self.intrinsics.fx
-        wide = (seen >= 5) & (spread > max(0.5, 3 * self._noise_px))
-        position = np.linalg.solve(lhs + 1e-12 * np.eye(3), rhs[..., None])[..., 0]
-        local = np.einsum("mji,mj->mi", rotations, position[row] - centres)
-        k = self.intrinsics
-        z = np.where(local[:, 2] > 1e-3, local[:, 2], np.nan)
-        error = np.hypot(k.fx * local[:, 0] / z + k.cx - pixels[:, 0], k.fy * local[:, 1] / z + k.cy - pixels[:, 1])
-        worst = np.zeros(len(unique))
-        np.maximum.at(worst, row, np.nan_to_num(error, nan=1e3))
-        good = wide & (worst < 2.0)
-        self.points[unique[good]] = position[good]
-
-    def _unplaced(self, span: range) -> tuple[Array, Array, NDArray[np.int64], Array, Array]:
-        """Observations in the posed views of `span` of tracks without a position:
-        rotations, unit world rays, ids, centres, pixels."""
-        k = self.intrinsics
-        unknown = np.isnan(self.points[:, 0])
-        rows: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
-        ids, pixels = [np.zeros(0, np.int64)], [np.zeros((0, 2))]
-        rotations, centres = [np.eye(3)], [np.zeros(3)]
-        for number in span:
-            view = self.views[number]
-            if view.rotation is None or view.centre is None:
-                continue
-            keep = np.flatnonzero(unknown[view.ids])
-            rows.append(np.full(len(keep), len(rotations)))
-            ids.append(view.ids[keep])
-            pixels.append(view.pixels[keep])
-            rotations.append(view.rotation)
-            centres.append(view.centre)
-        row, at = np.concatenate(rows), np.concatenate(pixels)
-        turned = np.stack(rotations)[row]
-        rays = np.column_stack([(at - [k.cx, k.cy]) / [k.fx, k.fy], np.ones(len(at))])
-        rays = np.einsum("mij,mj->mi", turned, rays / np.linalg.norm(rays, axis=1, keepdims=True))
-        return turned, rays, np.concatenate(ids), np.stack(centres)[row], at
+        seen = np.repeat(np.arange(len(posed)), [len(view.ids) for view, _, _ in posed])
+        ids, pixels = (np.concatenate(one) for one in zip(*((v.ids, v.pixels) for v, _, _ in posed), strict=True))
+        rotations, centres = np.array([r for _, r, _ in posed]), np.array([c for _, _, c in posed])
+        k, spread_px = self.intrinsics, max(LEAST_SPREAD_PX, 3 * self._noise_px)
+        lens = k.fx, k.fy, k.cx, k.cy
+        _odometry.place(rotations, centres, seen, ids, pixels, *lens, LEAST_SEEN, spread_px, PLACED_PX, self.points)
 
     def _bundle(self, numbers: list[int]) -> tuple[Bundle, NDArray[np.int64]] | None:
-        """A bundle of the posed views `numbers` and all points seen twice or more in them, with those points' ids."""
-        columns = [(v, i, p) for n in numbers for v, i, p in [self._known(n)]]
-        ids = np.concatenate([i for _, i, _ in columns])
-        unique, row, seen = np.unique(ids, return_inverse=True, return_counts=True)
-        keep = seen[row] >= 3
+        """A bundle of the posed views `numbers` and all points seen three times or more in them, with their ids."""
+        views = [self.views[n] for n in numbers]
+        ids, pixels = (np.concatenate(one) for one in zip(*((v.ids, v.pixels) for v in views), strict=True))
+        used = (np.bincount(ids, minlength=len(self.points)) >= LEAST_BOUND) & np.isfinite(self.points[:, 0])
+        keep = used[ids]
         if keep.sum() < 60:
             return None
-        unique, point = np.unique(ids[keep], return_inverse=True)
-        camera = np.repeat(np.arange(len(numbers)), [len(i) for _, i, _ in columns])[keep]
-        pixels = np.concatenate([p for _, _, p in columns])[keep]
-        rotations = np.stack([v.rotation for v, _, _ in columns if v.rotation is not None])
-        centres = np.stack([v.centre for v, _, _ in columns if v.centre is not None])
-        return Bundle(rotations, centres, self.points[unique], camera, point, pixels, self.intrinsics), unique
+        camera = np.repeat(np.arange(len(views)), [len(v.ids) for v in views])[keep]
+        point = (np.cumsum(used) - 1)[ids[keep]]
+        rotations = np.stack([v.rotation for v in views if v.rotation is not None])
+        centres = np.stack([v.centre for v in views if v.centre is not None])
+        bundle = Bundle(rotations, centres, self.points[used], camera, point, pixels[keep], self.intrinsics)
+        return bundle, np.flatnonzero(used)
 
     def _known(self, number: int) -> tuple[Posed, NDArray[np.int64], Array]:
         view = self.views[number]

@@ -17,6 +17,7 @@ void bind_normal(nb::module_& m);
 void bind_pose(nb::module_& m);
 void bind_flow(nb::module_& m);
 void bind_light(nb::module_& m);
+void bind_place(nb::module_& m);
 void bind_rotation(nb::module_& m);
 
 }  // namespace spiked

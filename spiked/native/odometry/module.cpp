@@ -7,5 +7,6 @@ NB_MODULE(_odometry, m) {
     spiked::bind_pose(m);
     spiked::bind_flow(m);
     spiked::bind_light(m);
+    spiked::bind_place(m);
     spiked::bind_rotation(m);
 }

@@ -19,6 +19,7 @@ using Index = Array<const int64_t, 1>;
 using Index2 = Array<const int64_t, 2>;
 
 constexpr double kWorst = 1e6;   // a squared error, in units of the scale, beyond which none is worse
+constexpr double kFull = 1e290;  // a product that another factor could make overflow: one logarithm for many
 constexpr double kLeast = 1e-9;  // added to the diagonal of a point's Hessian
 
 // What was seen: checked once, then indexed freely.
@@ -90,11 +91,14 @@ void residuals(const In3& rotations, const In2& centres, const In2& points, cons
 double cost(const In3& rotations, const In2& centres, const In2& points, const Index& camera, const Index& point,
             const In2& pixels, double fx, double fy, double cx, double cy, double scale) {
     const Observed observed(rotations, centres, points, camera, point, pixels);
-    double sum = 0;
+    double sum = 0, product = 1;
     for (int64_t m = 0; m < observed.count; ++m) {
-        sum += std::log1p(cauchy_square(observed.look({fx, fy, cx, cy}, m), scale));
+        product *= 1 + cauchy_square(observed.look({fx, fy, cx, cy}, m), scale);
+        if (product < kFull) continue;
+        sum += std::log(product);
+        product = 1;
     }
-    return sum / static_cast<double>(observed.count);
+    return (sum + std::log(product)) / static_cast<double>(observed.count);
 }
 
 // The inverse of the lower Cholesky factor of a symmetric 3x3 matrix, row-major; its upper part is zero.

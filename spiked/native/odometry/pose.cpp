@@ -10,6 +10,7 @@
 namespace spiked {
 namespace {
 
+constexpr double kStill = 1e-7;  // rad, and units of the typical depth: a step that ends the search
 constexpr double kBehind = 1e3;  // px, the error of a point that is not in front of the camera
 
 // Solves the symmetric positive definite 6x6 system a x = b in place (Cholesky); false where it is not definite.
@@ -94,7 +95,10 @@ void fit_pose(const Array<const double, 2>& points, const Array<const double, 2>
         std::copy_n(h, 36, hessian.data());
         if (!move || !solve6(h, g)) break;
         turn(g, rotation.data());
+        double most = 0;
         for (int i = 0; i < 3; ++i) centre.data()[i] += g[3 + i];
+        for (const double part : g) most = std::max(most, std::abs(part));
+        if (most < kStill && scale == scales.data()[scales.shape(0) - 1]) break;
     }
 }
 
@@ -130,11 +134,11 @@ double displacement(const Array<const double, 2>& hessian, const Array<const dou
 }  // namespace
 
 void bind_pose(nb::module_& m) {
-    m.def(
-        "fit_pose", &fit_pose,
-        "Gauss-Newton with Cauchy weights, one step for each of `scales` (px): changes rotation and centre in place;\n"
-        "`error` [n] (px) and `hessian` [6, 6] are those before the last step. Without `move` they are only looked "
-        "at.");
+    m.def("fit_pose", &fit_pose,
+          "Gauss-Newton with Cauchy weights, a step for each of `scales` (px) until they are small at the last: "
+          "changes rotation and centre in place;\n"
+          "`error` [n] (px) and `hessian` [6, 6] are those before the last step. Without `move` they are only looked "
+          "at.");
     m.def("displacement", &displacement,
           "Root mean square motion (px, one direction) of a plane at `depth` for a pose with this Hessian.");
 }

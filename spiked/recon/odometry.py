@@ -548,6 +548,9 @@ class Odometry:
             self.points[np.setdiff1d(every, ids)] = np.nan  # found again below, where the path then says
         spline, _ = bundle.optimise_spline(start, times, effort.rounds, SCALE_PX / 2, tolerance=1e-3)
         if (wrong := self._contradicted(bundle, numbers)) and len(posed) - len(wrong) >= BOOT_VIEWS:
+            if effort is not WHOLE:  # too few views to say so
+                self.settle()
+                return
             for n in wrong:  # smeared views, posed by what they seemed to show, would bend the path
                 self.views[n].rotation = self.views[n].centre = None
                 self.views[n].state = State.LOST

@@ -24,6 +24,8 @@ NEAR_PX = 3.0
 """After so much motion from one view to the next half the size is small enough to look at."""
 NEAR_GUESS_PX = 1.5
 """A track is where it was expected to this many pixels."""
+AS_EXPECTED = 0.85
+"""With fewer of them where they were expected something else happened, and all are looked for."""
 LOOKED = 2
 """Pixels from one to the next, across and down, that the white of a picture is found from."""
 SURE = 0.6
@@ -105,7 +107,7 @@ class Tracks:
     def _follow(self, image: Picture, levels: Pyramid) -> float:
         """Where tracks are expected is where they began as it looks now, or else they are looked for."""
         moved, good = self._refined(levels, self._expected())
-        if good.sum() <= SURE * len(good):
+        if good.sum() <= AS_EXPECTED * len(good):
             moved, found = self._sought(image, levels)
             moved, good = self._refined(levels, moved)
             good &= found

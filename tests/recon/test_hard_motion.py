@@ -80,8 +80,10 @@ def test_a_camera_that_stands_still_first(still: int) -> None:
     assert error < 3 and coverage > 0.98
 
 
-def test_a_camera_that_stops_and_goes_on() -> None:
-    reconstructor, error, coverage = followed(Halting(path(), 350, 650), 900)
+@pytest.mark.parametrize(("stop", "go"), [(350, 650), (330, 640)])
+def test_a_camera_that_stops_and_goes_on(stop: float, go: float) -> None:
+    """The second lost its poses while it stood: an adjustment in between had too few views to follow it."""
+    reconstructor, error, coverage = followed(Halting(path(), stop, go), 900)
     assert reconstructor.status().state is State.TRACK, reconstructor.status().reason
     assert error < 3 and coverage > 0.98
 

@@ -529,7 +529,7 @@ class Odometry:
         if self.sparse:
             return
         posed = [n for n, v in enumerate(self.views) if v.rotation is not None]
-        self._next_global = max(len(self.views) + 16, int(1.6 * len(self.views)))
+        self._next_global = max(len(self.views) + 12, int(1.5 * len(self.views)))
         if len(posed) < BOOT_VIEWS:
             return
         effort = WHOLE if final or self.views[-1].length < SLOW_FRAMES else MEANWHILE

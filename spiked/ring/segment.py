@@ -83,12 +83,12 @@ class Segment:
         self._owner = memory[_OWNER_OFFSET : _OWNER_OFFSET + 8].view("<u8")  # aligned: written and read in one piece
         control_bytes = Control.bytes(geometry.log_places)
         self.control = Control(memory[_CONTROL_OFFSET : _CONTROL_OFFSET + control_bytes], geometry.log_places)
-        self._data = memory[geometry.data_offset :].reshape(geometry.slots, geometry.slot_stride)
+        slots = memory[geometry.data_offset :].reshape(geometry.slots, geometry.slot_stride)
+        self._slots = slots[:, : geometry.slot_bytes].reshape(geometry.slots, geometry.block_frames, -1)
 
     def slot(self, number: int, frames: int) -> NDArray[np.uint8]:
         """The first frames of a slot, uint8 [frames, frame_bytes], writable; slot numbers are absolute."""
-        size = self.geometry.sensor.frame_bytes
-        return self._data[number % self.geometry.slots, : frames * size].reshape(frames, size)
+        return self._slots[number % len(self._slots), :frames]
 
     @property
     def owner(self) -> int:

@@ -308,7 +308,7 @@ def test_a_ring_that_is_held_is_gone_on_with(dying: "subprocess.Popen[str]") -> 
     outside, reader = Ring.attach(name), RingReader.attach(name, Policy.LOSSLESS, "test", 0)
     dying.communicate("die\n")
     assert outside.hold("it died")
-    assert clean_stale() == []
+    assert name not in clean_stale()
     counts = []
     while isinstance(item := reader.next(0.7), Frames):
         counts.append(item.count)
@@ -338,7 +338,7 @@ def test_a_ring_that_is_given_up_ends_at_once(dying: "subprocess.Popen[str]") ->
         pass
     outside.give_up()
     assert reader.next(0.3) == End(21, EndReason.WRITER_DIED)
-    assert clean_stale() == [name]
+    assert name in clean_stale()
 
 
 def test_status_is_visible_from_outside_and_outlives_the_name() -> None:

@@ -19,7 +19,6 @@ from spiked.sensor import BitOrder, Sensor
 
 CELL_PX = 8
 """Spacing of the nodes at which displacements are given."""
-MOST_FRAMES = 64
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ class ChargeLoss:
         """Loss, slope and brightness of an image in spikes a frame.
 
         image [h, w], or [h, w, 3] for a mosaic, shows the sensor's field at one moment, its pixels `pixel` times as
-        large as the sensor's. frames [n, frame_bytes] as stored, at most `MOST_FRAMES`; displacements float32
+        large as the sensor's. frames [n, frame_bytes] as stored, at most 64 of them; displacements float32
         [n, rows, columns, 2] lead, in px, from nodes `CELL_PX` apart (the first at the sensor's corner) in each frame
         to where the same things are in the image. gain [H, W] multiplies the light (0: a pixel that does not count),
         dark [H, W] is added to it, in spikes a frame. Of `every` pairs of the sensor's rows, the one of number `phase`

@@ -182,19 +182,20 @@ class Odometry:
         picture: Picture,
         known: tuple[Array, Array] | None = None,
         edges: Edges | None = None,
+        after_gap: bool = False,
     ) -> Posed:
         """Track one view of `length` frames around `time` and pose it if possible.
 
-        `known` gives its pose, `edges` say when each pixel looked.
+        `known` gives its pose, `edges` say when each pixel looked; `after_gap`: frames are missing before it.
         """
-        motion = self._tracks.add(len(self.views), picture)
+        motion = self._tracks.add(len(self.views), picture, after_gap)
         ids, at = self._tracks.ids.copy(), self._tracks.at.copy()
         late = np.zeros(len(ids)) if edges is None else edges.delays(picture, at)
         pixels, unsure = self._stamps.level(time, ids, at, late)
         posed = Posed(time, length, ids, pixels, motion, self.state, unsure_px=unsure)
         self.views.append(posed)
-        missing = self._tracks.next_id - len(self.points)
-        self.points = np.concatenate([self.points, np.full((missing, 3), np.nan)])
+        if missing := self._tracks.next_id - len(self.points):
+            self.points = np.concatenate([self.points, np.full((missing, 3), np.nan)])
         if known is not None:
             posed.rotation, posed.centre = known
             if len(self.views) % 8 == 0:
@@ -525,7 +526,7 @@ class Odometry:
 
     def settle(self, final: bool = True) -> None:
         """Adjust the whole path: freely first, then on the coarsest spline that follows it. Where it is not `final` and
-        the motion is slow, with fewer views and rounds."""
+        the motion is slow, with fewer views and rounds, unless these contradict each other."""
         if self.sparse:
             return
         posed = [n for n, v in enumerate(self.views) if v.rotation is not None]
@@ -539,13 +540,12 @@ class Odometry:
         if start is None or made is None:
             return
         bundle, ids = made
+        every = ids
         times = np.array([self.views[n].time for n in numbers])
         bundle.rotations, bundle.centres = start.poses(times)
         if self.focal is not None:
             bundle.focal_free = True
-            every = ids
             bundle, ids = _steady(bundle, ids)
-            self.points[np.setdiff1d(every, ids)] = np.nan  # found again below, where the path then says
         spline, _ = bundle.optimise_spline(start, times, effort.rounds, SCALE_PX / 2, tolerance=1e-3)
         if (wrong := self._contradicted(bundle, numbers)) and len(posed) - len(wrong) >= BOOT_VIEWS:
             if effort is not WHOLE:  # too few views to say so
@@ -557,6 +557,7 @@ class Odometry:
             self.settle(final)
             return
         self._noise_px = bundle.noise_px()
+        self.points[np.setdiff1d(every, ids)] = np.nan  # found again below, where the path then says
         if self.focal is not None:
             self.intrinsics = bundle.intrinsics
             self.focal = Focal(self.intrinsics, CORRELATED * bundle.focal_sigma(SCALE_PX))

@@ -240,7 +240,8 @@ class Reconstructor:
         sharp = view.sharp
         grey = luminance(view.glimpse(self._room), self.sensor.mosaic) if sharp is None else sharp
         image, edges = picture(grey, white_of(grey)), view.edges if sharp is None else None
-        posed = self._odometry.add(view.time, view.end - view.begin, image, self._given(view), edges)
+        known = self._given(view)
+        posed = self._odometry.add(view.time, view.end - view.begin, image, known, edges, view.after_gap)
         self._views.append(view)
         self._broken = False
         if len(self._views) == 1:

@@ -26,8 +26,9 @@ NEAR_GUESS_PX = 1.5
 """A track is where it was expected to this many pixels."""
 AS_EXPECTED = 0.85
 """With fewer of them where they were expected something else happened, and all are looked for."""
-LOOKED = 2
-"""Pixels from one to the next, across and down, that the white of a picture is found from."""
+LOOKED = 3
+"""Pixels from one to the next, across and down, that the white of a picture is found from: odd, to meet all sites of a
+mosaic."""
 SURE = 0.6
 """With so many of the points found, no other place is tried."""
 
@@ -40,7 +41,7 @@ def picture(rate: NDArray[np.float32], white: float) -> Picture:
 
 
 def white_of(rate: NDArray[np.float32]) -> float:
-    """The rate that is shown as white, brighter than 99.5 % of every fourth pixel."""
+    """The rate that is shown as white, brighter than 99.5 % of every ninth pixel."""
     return max(float(_odometry.quantile(rate[::LOOKED, ::LOOKED], 0.995)), 1e-6)
 
 
@@ -71,8 +72,13 @@ class Tracks:
     _spare: list[Pyramid] = field(default_factory=list)
     """Room that the next picture may take."""
 
-    def add(self, window: int, image: Picture) -> float:
-        """Follow all tracks into a window and start new ones; returns the median motion in px (0 without tracks)."""
+    def add(self, window: int, image: Picture, after_gap: bool = False) -> float:
+        """Follow all tracks into a window and start new ones; returns the median motion in px (0 where none was found).
+
+        Nobody knows how the camera went on in a gap.
+        """
+        if after_gap:
+            self.pace[:] = np.nan
         motion, levels = 0.0, pyramid(image, LEVELS, self._spare.pop() if self._spare else None)
         if self.newest_picture is not None and len(self.ids):
             motion = self._follow(image, levels)
@@ -142,9 +148,9 @@ class Tracks:
         good = np.zeros(len(self.ids), bool)
         if guess is None:
             return self.at, good
-        windows = sorted(self.pictures)
-        births, at = [self.pictures[window][0] for window in windows], np.array(guess)
-        row = np.searchsorted(windows, self.born)
+        births, at = [levels[0] for levels in self.pictures.values()], np.array(guess)
+        number = {window: n for n, window in enumerate(self.pictures)}
+        row = np.array([number[window] for window in self.born.tolist()], np.int64)
         _odometry.refine(births, row, levels[0], self.birthplace, at, self.reach_px, NEAR_GUESS_PX, good)
         return at, good
 

@@ -264,7 +264,8 @@ void bind_flow(nb::module_& m) {
           "`reach` px apart\n"
           "when followed back. Pixel centres are at +0.5.");
     m.def(
-        "refine", &refine,
+        "refine", &refine, nb::arg("births"), nb::arg("birth"), nb::arg("newest"), nb::arg("start"),
+        nb::arg("at").noconvert(), nb::arg("reach"), nb::arg("near"), nb::arg("good").noconvert(),
         "For each place of `start` [n, 2] in picture `birth` [n] of `births`, where it is in `newest`: `at` [n, 2]\n"
         "holds guesses and is changed. `good` [n]: found less than `near` px from the guess and, followed back, less\n"
         "than `reach` px from where it began.");

@@ -289,15 +289,14 @@ void delays(const Array<const uint8_t, 2>& picture, const Offsets<T>& spikes, co
 template <class T>
 void bind_edges(nb::module_& m) {
     const auto spikes = nb::arg("spikes").noconvert(), start = nb::arg("start").noconvert();
-    const auto stop = nb::arg("stop").noconvert();
-    m.def("rates", &rates<T>, spikes, start, stop, nb::arg("frames"), nb::arg("out"),
+    const auto stop = nb::arg("stop").noconvert(), out = nb::arg("out").noconvert();
+    m.def("rates", &rates<T>, spikes, start, stop, nb::arg("frames"), out,
           "Spikes a frame, or half of their upper bound where no interval was seen.");
-    m.def("deviations", &deviations<T>, spikes, start, stop, nb::arg("frames"), nb::arg("jitter"), nb::arg("out"),
+    m.def("deviations", &deviations<T>, spikes, start, stop, nb::arg("frames"), nb::arg("jitter"), out,
           "Standard deviations of rates, or their upper bounds.");
-    m.def("times", &times<T>, spikes, start, stop, nb::arg("middle"), nb::arg("length"), nb::arg("first"),
-          nb::arg("last"), "Frames from `middle` to the begin and the end of each pixel's charge.");
-    m.def("delays", &delays<T>, nb::arg("picture"), spikes, start, stop, nb::arg("middle"), nb::arg("at"),
-          nb::arg("out"),
+    m.def("times", &times<T>, spikes, start, stop, nb::arg("middle"), nb::arg("length"), nb::arg("first").noconvert(),
+          nb::arg("last").noconvert(), "Frames from `middle` to the begin and the end of each pixel's charge.");
+    m.def("delays", &delays<T>, nb::arg("picture"), spikes, start, stop, nb::arg("middle"), nb::arg("at"), out,
           "Mean frames from `middle` to the middles of the charge of the 13x13 pixels around each place, weighed by\n"
           "squared slopes.");
 }

@@ -111,7 +111,9 @@ void place(const Array<const double, 3>& rotations, const Array<const double, 2>
 }  // namespace
 
 void bind_place(nb::module_& m) {
-    m.def("place", &place,
+    m.def("place", &place, nb::arg("rotations"), nb::arg("centres"), nb::arg("view"), nb::arg("track"),
+          nb::arg("pixels"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"), nb::arg("least_views"),
+          nb::arg("least_px"), nb::arg("worst_px"), nb::arg("points").noconvert(),
           "Fills those of `points` [P, 3] that are NaN from what posed views saw of them: observation m is of `track`\n"
           "[m] in `view` [m]. Only tracks that `least_views` saw, along rays that spread by more than `least_px`, and\n"
           "that no view sees as far as `worst_px` off.");

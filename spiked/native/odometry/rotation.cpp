@@ -66,9 +66,13 @@ void all(const In& from, const Out& to) {
 }  // namespace
 
 void bind_rotation(nb::module_& m) {
-    m.def("exponentials", &all<exponential, 3, 9>, "Rotation matrices [n, 9] of rotation vectors [n, 3] (rad).");
-    m.def("logarithms", &all<logarithm, 9, 3>, "Rotation vectors [n, 3] (rad) of rotation matrices [n, 9].");
-    m.def("quaternions", &all<quaternion, 9, 4>, "Unit quaternions wxyz [n, 4], w >= 0, of rotation matrices [n, 9].");
+    const auto from = nb::arg("from");
+    const auto to = nb::arg("to").noconvert();
+    m.def("exponentials", &all<exponential, 3, 9>, from, to,
+          "Rotation matrices [n, 9] of rotation vectors [n, 3] (rad).");
+    m.def("logarithms", &all<logarithm, 9, 3>, from, to, "Rotation vectors [n, 3] (rad) of rotation matrices [n, 9].");
+    m.def("quaternions", &all<quaternion, 9, 4>, from, to,
+          "Unit quaternions wxyz [n, 4], w >= 0, of rotation matrices [n, 9].");
 }
 
 }  // namespace spiked

@@ -27,13 +27,15 @@ from numpy.typing import NDArray
 import spiked.recon.bootstrap as bootstrap
 from spiked.blocks import Window
 from spiked.evaluate import score_trajectory
-from spiked.recon import MapOptions, Options, Reconstructor, mapping, reconstructor, smooth, views
+from spiked.pose import Array
+from spiked.recon import MapOptions, Options, Reconstructor, mapping, odometry, reconstructor, smooth, views
 from spiked.recon.edges import Edges
 from spiked.recon.levels import Level, Target
 from spiked.recon.mapping import Mapper, Sight, fill_mosaic
 from spiked.recon.views import Image, View
 from spiked.recording import open_recording
 from spiked.render.loss import dssim
+from spiked.render.splats import Image as Rendered
 from spiked.spline import Spline
 from spiked.trajectory import Trajectory
 
@@ -112,19 +114,41 @@ def pooled_binomial(self: Mapper, expected: Image, target: Target, level: Level)
 class Demosaiced(Level):
     """Full size with colours interpolated before the fit."""
 
+    sites: NDArray[np.uint8]
+    """The sensor's colours, [H, W]; the level itself has all of them everywhere."""
+
     def target(self, view: View, windows: Image | None, seen: NDArray[np.bool_] | None) -> Target:
-        assert self._mosaic is not None
-        channels = self._mosaic.channels(*view.rate.shape)
         deviation = np.repeat(view.deviation[..., None], 3, -1)
         if seen is not None:
             deviation[~seen] = np.inf
-        return Target(fill_mosaic(view.rate, channels), deviation, windows)
+        return Target(fill_mosaic(view.rate, self.sites), deviation, windows)
 
 
 def demosaic_first(sensor: Any, camera: Any, threads: int | None) -> list[Level]:
     level = Demosaiced(sensor, camera, 1, threads)
-    level.channels = None
+    assert level.channels is not None
+    Demosaiced.sites, level.channels = level.channels, None
     return [level]
+
+
+def filled(rate: Image, channels: object) -> Image:
+    """What the mapper takes colours from."""
+    return fill_mosaic(rate, Demosaiced.sites)
+
+
+LOOK, DENSIFY = Mapper.look, Mapper.densify
+
+
+def looked(self: Mapper, sight: Sight, level: Level | None = None) -> Rendered:
+    """What the sensor's sites saw of it."""
+    image = LOOK(self, sight, level)
+    return replace(image, values=np.take_along_axis(image.values, Demosaiced.sites[..., None], 2)[..., 0])
+
+
+def densify(self: Mapper, *arguments: Any) -> None:
+    """Splats are missing where the sites say so."""
+    with patched((Demosaiced, "target", Level.target), (Mapper, "look", looked)):
+        DENSIFY(self, *arguments)
 
 
 @contextmanager
@@ -142,8 +166,14 @@ WINDOWED = (Reconstructor, "_passing", lambda self, view, path: None)
 
 def splines(spacing: int, degree: int) -> Callable[[], Iterator[None]]:
     """Only splines of this kind."""
-    cubic = ((spacing,), ()) if degree == 3 else ((), (spacing,))
-    return lambda: patched((smooth, "SPACINGS", cubic[0]), (smooth, "KINKED_SPACINGS", cubic[1]))
+
+    def fitted(
+        times: Array, rotations: Array, centres: Array, hessians: Array, _: int, span: Any, clock: Any
+    ) -> Spline:
+        spline = Spline.fit(times, rotations, centres, spacing, degree, span, clock)
+        return smooth._fit_weighted(spline, times, rotations, centres, hessians)[0]
+
+    return lambda: patched((odometry, "coarsest", fitted))
 
 
 def rows() -> list[Row]:
@@ -179,8 +209,9 @@ def rows() -> list[Row]:
         Row("first splats of doubtful depth as well", COLOUR,
             patches=lambda: patched((reconstructor, "SURE_DEPTH", 0.0)), steps_share=0.4),
         Row("windows and sub-frames, mosaic loss", COLOUR, patches=lambda: patched(WINDOWED), steps_share=0.4),
-        Row("windows and sub-frames, demosaic first", COLOUR,
-            patches=lambda: patched(WINDOWED, (mapping, "levels", demosaic_first)), steps_share=0.4),
+        Row("windows and sub-frames, demosaic first, without nuisances", COLOUR, mapping={"nuisances": False},
+            patches=lambda: patched(WINDOWED, (mapping, "levels", demosaic_first),
+                                    (mapping, "fill_mosaic", filled), (Mapper, "densify", densify)), steps_share=0.4),
         Row("path: as it is", path=True),
         Row("path: counted windows", path=True, patches=lambda: patched((views, "make_view", counted))),
     ]  # fmt: skip

@@ -557,8 +557,8 @@ class Odometry:
             self.settle(final)
             return
         self._noise_px = bundle.noise_px()
-        self.points[np.setdiff1d(every, ids)] = np.nan  # found again below, where the path then says
         if self.focal is not None:
+            self.points[np.setdiff1d(every, ids)] = np.nan  # found again below, where the path then says
             self.intrinsics = bundle.intrinsics
             self.focal = Focal(self.intrinsics, CORRELATED * bundle.focal_sigma(SCALE_PX))
         self.spline = self._in_old_frame(spline, bundle, numbers)

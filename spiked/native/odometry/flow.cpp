@@ -56,8 +56,15 @@ inline void between(const float* __restrict row, float a, float* __restrict out)
     }
 }
 
+// Of lanes.
+inline float total(const float* lane) {
+    float sum = 0;
+    SPIKED_LANES for (int x = 0; x < kLanes; ++x) sum += lane[x];
+    return sum;
+}
+
 // The window whose corner is at (left + a, top + b), with its gradients (Scharr), which are 0 beyond its last column.
-inline Matrix cut(const float* corner, int64_t stride, float a, float b, Window& window) {
+inline void cut(const float* corner, int64_t stride, float a, float b, Window& window) {
     float ring[kRing][kLanes + 4], before[kLanes], after[kLanes];
     between(corner, a, before);
     for (int y = 0; y < kRing; ++y) {
@@ -68,14 +75,48 @@ inline Matrix cut(const float* corner, int64_t stride, float a, float b, Window&
         }
         for (int x = kLanes; x < kLanes + 4; ++x) ring[y][x] = 0;
     }
-    float xx[kLanes] = {}, xy[kLanes] = {}, yy[kLanes] = {};
     for (int y = 0; y < kWindow; ++y) {
         const float *p = ring[y], *q = ring[y + 1], *r = ring[y + 2];
         SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
             const float inside = x < kWindow ? 1.0f / 32 : 0.0f;
-            const float dx = inside * (3 * (p[x + 2] - p[x] + r[x + 2] - r[x]) + 10 * (q[x + 2] - q[x]));
-            const float dy = inside * (3 * (r[x] - p[x] + r[x + 2] - p[x + 2]) + 10 * (r[x + 1] - p[x + 1]));
             window.value[y][x] = q[x + 1];
+            window.across[y][x] = inside * (3 * (p[x + 2] - p[x] + r[x + 2] - r[x]) + 10 * (q[x + 2] - q[x]));
+            window.down[y][x] = inside * (3 * (r[x] - p[x] + r[x + 2] - p[x + 2]) + 10 * (r[x + 1] - p[x + 1]));
+        }
+    }
+}
+
+// The gradients without what a change of brightness or contrast looks like: sums of them times a difference of two
+// windows then say nothing of these (G. D. Hager and P. N. Belhumeur, "Efficient region tracking with parametric models
+// of geometry and illumination", 1998).
+inline Matrix project(Window& window) {
+    float value[kLanes] = {}, across[kLanes] = {}, down[kLanes] = {};
+    for (int y = 0; y < kWindow; ++y) {
+        SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
+            value[x] += x < kWindow ? window.value[y][x] : 0.0f;
+            across[x] += window.across[y][x];
+            down[x] += window.down[y][x];
+        }
+    }
+    constexpr float kShare = 1.0f / (kWindow * kWindow);
+    const float mean = kShare * total(value), mean_across = kShare * total(across), mean_down = kShare * total(down);
+    float square[kLanes] = {}, by_across[kLanes] = {}, by_down[kLanes] = {};
+    for (int y = 0; y < kWindow; ++y) {
+        SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
+            const float contrast = x < kWindow ? window.value[y][x] - mean : 0.0f;
+            square[x] += contrast * contrast;
+            by_across[x] += contrast * window.across[y][x];
+            by_down[x] += contrast * window.down[y][x];
+        }
+    }
+    const float size = 1 / std::max(total(square), 1e-6f);
+    const float slope_across = size * total(by_across), slope_down = size * total(by_down);
+    float xx[kLanes] = {}, xy[kLanes] = {}, yy[kLanes] = {};
+    for (int y = 0; y < kWindow; ++y) {
+        SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
+            const float contrast = window.value[y][x] - mean;
+            const float dx = x < kWindow ? window.across[y][x] - mean_across - slope_across * contrast : 0.0f;
+            const float dy = x < kWindow ? window.down[y][x] - mean_down - slope_down * contrast : 0.0f;
             window.across[y][x] = dx;
             window.down[y][x] = dy;
             xx[x] += dx * dx;
@@ -83,13 +124,7 @@ inline Matrix cut(const float* corner, int64_t stride, float a, float b, Window&
             yy[x] += dy * dy;
         }
     }
-    Matrix sum = {};
-    SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
-        sum.xx += xx[x];
-        sum.xy += xy[x];
-        sum.yy += yy[x];
-    }
-    return sum;
+    return {total(xx), total(xy), total(yy)};
 }
 
 // The sums over the window of its gradients times the difference to another picture.
@@ -106,11 +141,8 @@ inline void differ(const float* corner, int64_t stride, float a, float b, const 
             before[x] = after[x];
         }
     }
-    *across = *down = 0;
-    SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
-        *across += u[x];
-        *down += v[x];
-    }
+    *across = total(u);
+    *down = total(v);
 }
 
 // Whether a place was found for the window around (x, y) of `from` in `to`, near (*u, *v), which it is put to.
@@ -118,7 +150,8 @@ SPIKED_CLONES bool align(const Gray& from, const Gray& to, float x, float y, flo
     if (!from.holds(x, y)) return false;
     const float left = std::floor(x - kHalf), top = std::floor(y - kHalf);
     Window window;
-    const Matrix g = cut(from.at(left - 1, top - 1), from.stride, x - kHalf - left, y - kHalf - top, window);
+    cut(from.at(left - 1, top - 1), from.stride, x - kHalf - left, y - kHalf - top, window);
+    const Matrix g = project(window);
     const float spread = std::sqrt((g.xx - g.yy) * (g.xx - g.yy) + 4 * g.xy * g.xy);
     if (g.xx + g.yy - spread < 2 * kLeastEdge * kWindow * kWindow) return false;
     const float scale = 1 / (g.xx * g.yy - g.xy * g.xy);

@@ -36,15 +36,38 @@ def test_places_are_found_to_a_fiftieth_of_a_pixel(shift: tuple[float, float]) -
     assert np.median(error) < 0.02 and np.percentile(error, 95) < 0.05
 
 
-def test_it_agrees_with_opencv() -> None:
-    a, b = picture(scene((0.0, 0.0)), 1.0), picture(scene((0.8, -0.5)), 1.0)
-    start = cv2.goodFeaturesToTrack(a, 100, 0.01, 7)[:, 0].astype(float) + 0.5
-    found, good = flow(a, b, start, start, 0.6, levels=2)
-    p = (start - 0.5).astype(np.float32)[:, None]
+def errors_of_both(a: np.ndarray, b: np.ndarray, motion: np.ndarray) -> tuple[float, float]:
+    """Median distance in px from where the affine `motion` [2, 3] of pixel centres leads, of ours and of OpenCV's."""
+    corners = cv2.goodFeaturesToTrack(a[16:-16, 16:-16].copy(), 100, 0.01, 7)[:, 0].astype(float) + 16
+    truth = corners @ motion[:, :2].T + motion[:, 2]
+    found, good = flow(a, b, corners + 0.5, corners + 0.5, 0.6, levels=2)
+    p = corners.astype(np.float32)[:, None]
     there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, p, None, winSize=(13, 13), maxLevel=2)
     both = good & (ok[:, 0] == 1)
-    assert both.sum() > 0.8 * len(start)
-    assert np.median(np.linalg.norm(found - there[:, 0] - 0.5, axis=1)[both]) < 0.01
+    assert both.sum() > 0.8 * len(corners)
+    ours, theirs = (np.linalg.norm(one - truth, axis=1)[both] for one in (found - 0.5, there[:, 0]))
+    return float(np.median(ours)), float(np.median(theirs))
+
+
+def test_it_is_as_good_as_opencv_where_the_image_only_moves() -> None:
+    shift = 0.8, -0.5
+    a, b = picture(scene((0.0, 0.0)), 1.0), picture(scene(shift), 1.0)
+    ours, theirs = errors_of_both(a, b, np.column_stack([np.eye(2), shift]))
+    assert ours < 1.2 * theirs
+
+
+@pytest.mark.parametrize(
+    ("degrees", "growth", "gain", "light"), [(0, 1, 0.8, 0.05), (0, 1, 1.25, 0), (4, 1, 1, 0), (0, 1.05, 1, 0)]
+)
+def test_a_change_of_light_a_turn_or_growth_moves_no_track(
+    degrees: float, growth: float, gain: float, light: float
+) -> None:
+    here = 0.7 * scene((0.0, 0.0))
+    motion = cv2.getRotationMatrix2D((W / 2 - 0.5, H / 2 - 0.5), degrees, growth)
+    motion[:, 2] += 0.8, -0.5
+    there = cv2.warpAffine(here, motion, (W, H), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    ours, theirs = errors_of_both(picture(here, 1.0), picture(gain * there + np.float32(light), 1.0), motion)
+    assert ours < 0.06 and ours < 0.5 * theirs
 
 
 def test_what_has_no_texture_or_lies_outside_is_not_found() -> None:

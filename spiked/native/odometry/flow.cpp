@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <stdexcept>
 #include <vector>
 
@@ -16,7 +17,7 @@ namespace {
 
 constexpr int kWindow = 13;  // px
 constexpr float kHalf = 0.5f * (kWindow - 1);
-constexpr int kLanes = 16;  // a row of the window and what fills up a vector
+constexpr int kLanes = 16;
 constexpr int kRing = kWindow + 2;
 constexpr int kIterations = 30;
 constexpr float kStill2 = 0.003f * 0.003f;  // px^2, a step that ends the search
@@ -40,118 +41,148 @@ struct Gray {
     int64_t stride;
 };
 
+// A row of the window and what fills up a vector.
+typedef float Row __attribute__((vector_size(4 * kLanes)));
+typedef int32_t Which __attribute__((vector_size(4 * kLanes)));
+constexpr Which kColumn = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+
 struct Window {
-    float value[kWindow][kLanes], across[kWindow][kLanes], down[kWindow][kLanes];
+    Row value[kWindow], across[kWindow], down[kWindow];
 };
 
 struct Matrix {
     float xx, xy, yy;
 };
 
-// One row between pixels, `a` of the way from each to the next.
-inline void between(const float* __restrict row, float a, float* __restrict out) {
-    SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
-        const float here = row[x], next = row[x + 1];
-        out[x] = here + a * (next - here);
-    }
+inline Row load(const float* from) {
+    Row row;
+    std::memcpy(&row, from, sizeof row);
+    return row;
 }
 
-// Of lanes.
-inline float total(const float* lane) {
-    float sum = 0;
-    SPIKED_LANES for (int x = 0; x < kLanes; ++x) sum += lane[x];
-    return sum;
+inline float total(Row row) {
+    typedef float Half __attribute__((vector_size(2 * kLanes)));
+    typedef float Quarter __attribute__((vector_size(kLanes)));
+    Half half[2];
+    std::memcpy(half, &row, sizeof half);
+    half[0] += half[1];
+    Quarter quarter[2];
+    std::memcpy(quarter, half, sizeof quarter);
+    quarter[0] += quarter[1];
+    return (quarter[0][0] + quarter[0][2]) + (quarter[0][1] + quarter[0][3]);
+}
+
+// One row between pixels, `a` of the way from each to the next.
+inline Row between(const float* row, float a) {
+    const Row here = load(row);
+    return here + a * (load(row + 1) - here);
 }
 
 // The window whose corner is at (left + a, top + b), with its gradients (Scharr), which are 0 beyond its last column.
 inline void cut(const float* corner, int64_t stride, float a, float b, Window& window) {
-    float ring[kRing][kLanes + 4], before[kLanes], after[kLanes];
-    between(corner, a, before);
+    float ring[kRing][kLanes + 4] = {};
+    Row before = between(corner, a);
     for (int y = 0; y < kRing; ++y) {
-        between(corner + (y + 1) * stride, a, after);
-        SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
-            ring[y][x] = before[x] + b * (after[x] - before[x]);
-            before[x] = after[x];
-        }
-        for (int x = kLanes; x < kLanes + 4; ++x) ring[y][x] = 0;
+        const Row after = between(corner + (y + 1) * stride, a), row = before + b * (after - before);
+        std::memcpy(ring[y], &row, sizeof row);
+        before = after;
     }
+    const Row inside = kColumn < kWindow ? Row{} + 1.0f / 32 : Row{};
     for (int y = 0; y < kWindow; ++y) {
         const float *p = ring[y], *q = ring[y + 1], *r = ring[y + 2];
-        SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
-            const float inside = x < kWindow ? 1.0f / 32 : 0.0f;
-            window.value[y][x] = q[x + 1];
-            window.across[y][x] = inside * (3 * (p[x + 2] - p[x] + r[x + 2] - r[x]) + 10 * (q[x + 2] - q[x]));
-            window.down[y][x] = inside * (3 * (r[x] - p[x] + r[x + 2] - p[x + 2]) + 10 * (r[x + 1] - p[x + 1]));
-        }
+        const Row above = load(p), below = load(r), above2 = load(p + 2), below2 = load(r + 2);
+        window.value[y] = load(q + 1);
+        window.across[y] = inside * (3 * (above2 - above + below2 - below) + 10 * (load(q + 2) - load(q)));
+        window.down[y] = inside * (3 * (below - above + below2 - above2) + 10 * (load(r + 1) - load(p + 1)));
     }
 }
 
-// The gradients without what a change of brightness or contrast looks like: sums of them times a difference of two
-// windows then say nothing of these (G. D. Hager and P. N. Belhumeur, "Efficient region tracking with parametric models
-// of geometry and illumination", 1998).
-inline Matrix project(Window& window) {
-    float value[kLanes] = {}, across[kLanes] = {}, down[kLanes] = {};
+// The products of the gradients.
+inline Matrix products(const Window& window) {
+    Row xx = {}, xy = {}, yy = {};
     for (int y = 0; y < kWindow; ++y) {
-        SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
-            value[x] += x < kWindow ? window.value[y][x] : 0.0f;
-            across[x] += window.across[y][x];
-            down[x] += window.down[y][x];
-        }
-    }
-    constexpr float kShare = 1.0f / (kWindow * kWindow);
-    const float mean = kShare * total(value), mean_across = kShare * total(across), mean_down = kShare * total(down);
-    float square[kLanes] = {}, by_across[kLanes] = {}, by_down[kLanes] = {};
-    for (int y = 0; y < kWindow; ++y) {
-        SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
-            const float contrast = x < kWindow ? window.value[y][x] - mean : 0.0f;
-            square[x] += contrast * contrast;
-            by_across[x] += contrast * window.across[y][x];
-            by_down[x] += contrast * window.down[y][x];
-        }
-    }
-    const float size = 1 / std::max(total(square), 1e-6f);
-    const float slope_across = size * total(by_across), slope_down = size * total(by_down);
-    float xx[kLanes] = {}, xy[kLanes] = {}, yy[kLanes] = {};
-    for (int y = 0; y < kWindow; ++y) {
-        SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
-            const float contrast = window.value[y][x] - mean;
-            const float dx = x < kWindow ? window.across[y][x] - mean_across - slope_across * contrast : 0.0f;
-            const float dy = x < kWindow ? window.down[y][x] - mean_down - slope_down * contrast : 0.0f;
-            window.across[y][x] = dx;
-            window.down[y][x] = dy;
-            xx[x] += dx * dx;
-            xy[x] += dx * dy;
-            yy[x] += dy * dy;
-        }
+        xx += window.across[y] * window.across[y];
+        xy += window.across[y] * window.down[y];
+        yy += window.down[y] * window.down[y];
     }
     return {total(xx), total(xy), total(yy)};
+}
+
+// The gradients without what the window looks like when it becomes brighter, gains contrast, turns or grows: sums of
+// them times a difference of two windows then say nothing of these (G. D. Hager and P. N. Belhumeur, "Efficient region
+// tracking with parametric models of geometry and illumination", 1998).
+[[gnu::always_inline]] inline void project(Window& window) {
+    constexpr int kLooks = 4;
+    constexpr int kAll = kLooks + 2;
+    const Row inside = kColumn < kWindow ? Row{} + 1.0f : Row{}, u = __builtin_convertvector(kColumn, Row) - kHalf;
+    const float middle = window.value[kWindow / 2][kWindow / 2];
+    const auto looks_and_gradients = [&](int y, Row* out) {
+        const float v = static_cast<float>(y) - kHalf;
+        const Row dx = window.across[y], dy = window.down[y];
+        out[0] = inside;
+        out[1] = inside * (window.value[y] - middle);
+        out[2] = dx * v - dy * u;
+        out[3] = dx * u + dy * v;
+        out[kLooks] = dx;
+        out[kLooks + 1] = dy;
+    };
+    Row sums[kAll][kAll] = {};
+    for (int y = 0; y < kWindow; ++y) {
+        Row row[kAll];
+        looks_and_gradients(y, row);
+        for (int i = 0; i < kAll; ++i) {
+            for (int k = 0; k <= i; ++k) sums[i][k] += row[i] * row[k];
+        }
+    }
+    float product[kAll][kAll], least[kLooks], share[2][kLooks] = {};
+    for (int i = 0; i < kAll; ++i) {
+        for (int k = 0; k <= i; ++k) product[i][k] = product[k][i] = total(sums[i][k]);
+    }
+    for (int n = 0; n < kLooks; ++n) least[n] = 1e-5f * product[n][n];
+    const auto counts = [&](int n) { return product[n][n] > least[n]; };  // it is not a sum of those before it
+    for (int n = 0; n < kLooks; ++n) {
+        for (int i = 0; counts(n) && i < kAll; ++i) {
+            const float factor = i == n ? 0.0f : product[i][n] / product[n][n];
+            for (int k = n + 1; k < kAll; ++k) product[i][k] -= factor * product[n][k];
+        }
+    }
+    for (int n = 0; n < kLooks; ++n) {
+        for (int g = 0; counts(n) && g < 2; ++g) share[g][n] = product[n][kLooks + g] / product[n][n];
+    }
+    for (int y = 0; y < kWindow; ++y) {
+        Row row[kAll];
+        looks_and_gradients(y, row);
+        for (int n = 0; n < kLooks; ++n) {
+            window.across[y] -= share[0][n] * row[n];
+            window.down[y] -= share[1][n] * row[n];
+        }
+    }
 }
 
 // The sums over the window of its gradients times the difference to another picture.
 inline void differ(const float* corner, int64_t stride, float a, float b, const Window& window, float* across,
                    float* down) {
-    float before[kLanes], after[kLanes], u[kLanes] = {}, v[kLanes] = {};
-    between(corner, a, before);
+    Row before = between(corner, a), u = {}, v = {};
     for (int y = 0; y < kWindow; ++y) {
-        between(corner + (y + 1) * stride, a, after);
-        SPIKED_LANES for (int x = 0; x < kLanes; ++x) {
-            const float difference = before[x] + b * (after[x] - before[x]) - window.value[y][x];
-            u[x] += difference * window.across[y][x];
-            v[x] += difference * window.down[y][x];
-            before[x] = after[x];
-        }
+        const Row after = between(corner + (y + 1) * stride, a);
+        const Row difference = before + b * (after - before) - window.value[y];
+        u += difference * window.across[y];
+        v += difference * window.down[y];
+        before = after;
     }
     *across = total(u);
     *down = total(v);
 }
 
 // Whether a place was found for the window around (x, y) of `from` in `to`, near (*u, *v), which it is put to.
-SPIKED_CLONES bool align(const Gray& from, const Gray& to, float x, float y, float* u, float* v) {
+template <bool kExactly>
+[[gnu::always_inline]] inline bool aligned(const Gray& from, const Gray& to, float x, float y, float* u, float* v) {
     if (!from.holds(x, y)) return false;
     const float left = std::floor(x - kHalf), top = std::floor(y - kHalf);
     Window window;
     cut(from.at(left - 1, top - 1), from.stride, x - kHalf - left, y - kHalf - top, window);
-    const Matrix g = project(window);
+    if (kExactly) project(window);
+    const Matrix g = products(window);
     const float spread = std::sqrt((g.xx - g.yy) * (g.xx - g.yy) + 4 * g.xy * g.xy);
     if (g.xx + g.yy - spread < 2 * kLeastEdge * kWindow * kWindow) return false;
     const float scale = 1 / (g.xx * g.yy - g.xy * g.xy);
@@ -166,6 +197,15 @@ SPIKED_CLONES bool align(const Gray& from, const Gray& to, float x, float y, flo
         if (du * du + dv * dv <= kStill2) break;
     }
     return to.holds(*u, *v);
+}
+
+SPIKED_CLONES bool align(const Gray& from, const Gray& to, float x, float y, float* u, float* v) {
+    return aligned<true>(from, to, x, y, u, v);
+}
+
+// From farther away: what counts is how far away.
+SPIKED_CLONES bool approach(const Gray& from, const Gray& to, float x, float y, float* u, float* v) {
+    return aligned<false>(from, to, x, y, u, v);
 }
 
 using Pictures = std::vector<Array<const float, 2>>;
@@ -189,7 +229,7 @@ bool descend(const std::vector<Gray>& from, const std::vector<Gray>& to, float x
     for (int level = static_cast<int>(from.size()) - 1; level >= 0; --level) {
         const float scale = 1.0f / static_cast<float>(1 << level);
         float at_u = *u * scale, at_v = *v * scale;
-        found = align(from[level], to[level], x * scale, y * scale, &at_u, &at_v);
+        found = (level ? approach : align)(from[level], to[level], x * scale, y * scale, &at_u, &at_v);
         *u = at_u / scale;
         *v = at_v / scale;
     }

@@ -21,6 +21,7 @@ constexpr int kLanes = 16;
 constexpr int kRing = kWindow + 2;
 constexpr int kIterations = 30;
 constexpr float kStill2 = 0.003f * 0.003f;  // px^2, a step that ends the search
+constexpr float kNear2 = 0.3f * 0.3f;       // px^2, a step that ends its first part
 constexpr float kLeastEdge = 0.1f;  // mean squared gradient a px across the weakest direction, in grey levels squared
 
 constexpr int kMargin = 24;  // px around a picture that repeat its edge
@@ -174,14 +175,8 @@ inline void differ(const float* corner, int64_t stride, float a, float b, const 
     *down = total(v);
 }
 
-// Whether a place was found for the window around (x, y) of `from` in `to`, near (*u, *v), which it is put to.
-template <bool kExactly>
-[[gnu::always_inline]] inline bool aligned(const Gray& from, const Gray& to, float x, float y, float* u, float* v) {
-    if (!from.holds(x, y)) return false;
-    const float left = std::floor(x - kHalf), top = std::floor(y - kHalf);
-    Window window;
-    cut(from.at(left - 1, top - 1), from.stride, x - kHalf - left, y - kHalf - top, window);
-    if (kExactly) project(window);
+// Whether a place was found for a window in `to`, near (*u, *v), which it is put to, by steps until one is this small.
+inline bool settle(const Window& window, const Gray& to, float last2, float* u, float* v) {
     const Matrix g = products(window);
     const float spread = std::sqrt((g.xx - g.yy) * (g.xx - g.yy) + 4 * g.xy * g.xy);
     if (g.xx + g.yy - spread < 2 * kLeastEdge * kWindow * kWindow) return false;
@@ -194,18 +189,22 @@ template <bool kExactly>
         const float du = (g.xy * down - g.yy * across) * scale, dv = (g.xy * across - g.xx * down) * scale;
         *u += du;
         *v += dv;
-        if (du * du + dv * dv <= kStill2) break;
+        if (du * du + dv * dv <= last2) break;
     }
     return to.holds(*u, *v);
 }
 
-SPIKED_CLONES bool align(const Gray& from, const Gray& to, float x, float y, float* u, float* v) {
-    return aligned<true>(from, to, x, y, u, v);
-}
-
-// From farther away: what counts is how far away.
-SPIKED_CLONES bool approach(const Gray& from, const Gray& to, float x, float y, float* u, float* v) {
-    return aligned<false>(from, to, x, y, u, v);
+// Whether a place was found for the window around (x, y) of `from` in `to`, near (*u, *v), which it is put to. How it
+// looks otherwise matters in the end only: gradients without that lead home from less far away.
+SPIKED_CLONES bool align(const Gray& from, const Gray& to, float x, float y, bool exactly, float* u, float* v) {
+    if (!from.holds(x, y)) return false;
+    const float left = std::floor(x - kHalf), top = std::floor(y - kHalf);
+    Window window;
+    cut(from.at(left - 1, top - 1), from.stride, x - kHalf - left, y - kHalf - top, window);
+    if (!settle(window, to, exactly ? kNear2 : kStill2, u, v)) return false;
+    if (!exactly) return true;
+    project(window);
+    return settle(window, to, kStill2, u, v);
 }
 
 using Pictures = std::vector<Array<const float, 2>>;
@@ -229,7 +228,7 @@ bool descend(const std::vector<Gray>& from, const std::vector<Gray>& to, float x
     for (int level = static_cast<int>(from.size()) - 1; level >= 0; --level) {
         const float scale = 1.0f / static_cast<float>(1 << level);
         float at_u = *u * scale, at_v = *v * scale;
-        found = (level ? approach : align)(from[level], to[level], x * scale, y * scale, &at_u, &at_v);
+        found = align(from[level], to[level], x * scale, y * scale, level == 0, &at_u, &at_v);
         *u = at_u / scale;
         *v = at_v / scale;
     }
@@ -318,8 +317,8 @@ void refine(const Pictures& births, const Array<const int64_t, 1>& birth, const 
         const auto guess_u = static_cast<float>(at.data()[2 * n] - 0.5);
         const auto guess_v = static_cast<float>(at.data()[2 * n + 1] - 0.5);
         float u = guess_u, v = guess_v, back_x = x, back_y = y;
-        good.data()[n] = align(born, to[0], x, y, &u, &v) && std::hypot(u - guess_u, v - guess_v) < near &&
-                         align(to[0], born, u, v, &back_x, &back_y) && std::hypot(back_x - x, back_y - y) < reach;
+        good.data()[n] = align(born, to[0], x, y, true, &u, &v) && std::hypot(u - guess_u, v - guess_v) < near &&
+                         align(to[0], born, u, v, true, &back_x, &back_y) && std::hypot(back_x - x, back_y - y) < reach;
         at.data()[2 * n] = u + 0.5;
         at.data()[2 * n + 1] = v + 0.5;
     }

@@ -123,6 +123,15 @@ def test_reconstruct_with_known_poses_writes_all_results(room: Path, tmp_path: P
     figures = json.loads((tmp_path / "score.json").read_text())
     assert figures["ate_percent"] < 0.5
     assert figures["psnr_db"] > 20
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for name in ("room.dat", "room.json", "groundtruth.tum"):
+        (bare / name).symlink_to(room / name)
+    held_out = json.loads((room / "views.json").read_text()) | {"views": []}
+    (bare / "views.json").write_text(json.dumps(held_out))
+    scored = run("evaluate", tmp_path, "--recording", bare / "room.dat")
+    assert scored.returncode == 0 and scored.stderr == "", scored.stderr
+    assert "ate_percent" in scored.stdout and "psnr" not in scored.stdout
 
 
 def test_a_recording_without_a_path_in_it_says_why_and_exits_with_1(tmp_path: Path) -> None:

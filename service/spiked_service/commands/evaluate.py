@@ -43,7 +43,8 @@ def evaluate(
     if score.errors is not None:
         figures |= vars(score.errors)
         views = _score_views(source, truth, estimate, Scene.read_ply(result / "scene.ply"))
-        figures |= {"psnr_db": views.mean_psnr_db, "ssim": views.mean_ssim}
+        if views is not None:
+            figures |= {"psnr_db": views.mean_psnr_db, "ssim": views.mean_ssim}
     for name, value in figures.items():
         output.print(f"{name:14s} {value:.4f}")
     if json_out is not None:
@@ -53,12 +54,14 @@ def evaluate(
             raise SceneError(f"cannot write {json_out}: {error.strerror}") from error
 
 
-def _score_views(recording: Recording, truth: Trajectory, estimate: Trajectory, scene: Scene) -> ViewScore:
-    """The held-out views, their true poses carried over into the estimate's world."""
+def _score_views(recording: Recording, truth: Trajectory, estimate: Trajectory, scene: Scene) -> ViewScore | None:
+    """The held-out views, their true poses carried over into the estimate's world; None where there are none."""
     sensor, folder = recording.sensor, recording.path.parent
     if sensor.intrinsics is None:
         raise SceneError(f"{recording.path} has no intrinsics in its sidecar, so its views cannot be rendered")
     held_out = _read_views(folder / "views.json")
+    if not held_out.views:
+        return None
     similarity = similarity_of_trajectories(truth, estimate, sensor.frame_rate_hz)
     matrices = [np.array(view.c2w) for view in held_out.views]
     poses = [similarity.poses(matrix[:3, :3], matrix[:3, 3]) for matrix in matrices]

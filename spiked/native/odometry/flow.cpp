@@ -22,6 +22,7 @@ constexpr int kRing = kWindow + 2;
 constexpr int kIterations = 30;
 constexpr float kStill2 = 0.003f * 0.003f;  // px^2, a step that ends the search
 constexpr float kNear2 = 0.3f * 0.3f;       // px^2, a step that ends its first part
+constexpr float kTurn2 = 0.05f * 0.05f;     // rad^2, or share^2, by which a window typically turns or grows
 constexpr float kLeastEdge = 0.1f;  // mean squared gradient a px across the weakest direction, in grey levels squared
 
 constexpr int kMargin = 24;  // px around a picture that repeat its edge
@@ -112,9 +113,10 @@ inline Matrix products(const Window& window) {
 // The gradients without what the window looks like when it becomes brighter, gains contrast, turns or grows: sums of
 // them times a difference of two windows then say nothing of these (G. D. Hager and P. N. Belhumeur, "Efficient region
 // tracking with parametric models of geometry and illumination", 1998).
-[[gnu::always_inline]] inline void project(Window& window) {
-    constexpr int kLooks = 4;
-    constexpr int kAll = kLooks + 2;
+// Turn and growth count as far as the window shows them beyond `noise2`, the variance of a pixel in grey levels
+// squared: where that is large, small ones are likelier.
+[[gnu::always_inline]] inline void project(Window& window, float noise2) {
+    constexpr int kLooks = 4, kAll = kLooks + 2;
     const Row inside = kColumn < kWindow ? Row{} + 1.0f : Row{}, u = __builtin_convertvector(kColumn, Row) - kHalf;
     const float middle = window.value[kWindow / 2][kWindow / 2];
     const auto looks_and_gradients = [&](int y, Row* out) {
@@ -140,6 +142,8 @@ inline Matrix products(const Window& window) {
         for (int k = 0; k <= i; ++k) product[i][k] = product[k][i] = total(sums[i][k]);
     }
     for (int n = 0; n < kLooks; ++n) least[n] = 1e-5f * product[n][n];
+    product[2][2] += noise2 / kTurn2;
+    product[3][3] += noise2 / kTurn2;
     const auto counts = [&](int n) { return product[n][n] > least[n]; };  // it is not a sum of those before it
     for (int n = 0; n < kLooks; ++n) {
         for (int i = 0; counts(n) && i < kAll; ++i) {
@@ -175,6 +179,25 @@ inline void differ(const float* corner, int64_t stride, float a, float b, const 
     *down = total(v);
 }
 
+// The variance over a window of its difference to another picture at (u, v).
+inline float difference2(const Window& window, const Gray& to, float u, float v) {
+    const float column = std::floor(u - kHalf), row = std::floor(v - kHalf), a = u - kHalf - column,
+                b = v - kHalf - row;
+    const float* corner = to.at(column, row);
+    const Row inside = kColumn < kWindow ? Row{} + 1.0f : Row{};
+    Row before = between(corner, a), sum = {}, square = {};
+    for (int y = 0; y < kWindow; ++y) {
+        const Row after = between(corner + (y + 1) * to.stride, a);
+        const Row difference = inside * (before + b * (after - before) - window.value[y]);
+        sum += difference;
+        square += difference * difference;
+        before = after;
+    }
+    constexpr float kShare = 1.0f / (kWindow * kWindow);
+    const float mean = kShare * total(sum);
+    return std::max(kShare * total(square) - mean * mean, 0.0f);
+}
+
 // Whether a place was found for a window in `to`, near (*u, *v), which it is put to, by steps until one is this small.
 inline bool settle(const Window& window, const Gray& to, float last2, float* u, float* v) {
     const Matrix g = products(window);
@@ -203,7 +226,7 @@ SPIKED_CLONES bool align(const Gray& from, const Gray& to, float x, float y, boo
     cut(from.at(left - 1, top - 1), from.stride, x - kHalf - left, y - kHalf - top, window);
     if (!settle(window, to, exactly ? kNear2 : kStill2, u, v)) return false;
     if (!exactly) return true;
-    project(window);
+    project(window, difference2(window, to, *u, *v));
     return settle(window, to, kStill2, u, v);
 }
 

@@ -43,6 +43,9 @@ FAST_STEPS = 1.8
 """Times as many steps for views of fast motion, which cost less each and say less of what is fine."""
 DENSIFY_EVERY = 20
 """Steps after which the view just seen gets splats where it is rendered worst: each part of the path has its turn."""
+SETTLING_SHARE = 0.15
+"""Last part of the refinement, in which the rates fall to nothing: each view pulls by its own noise, and the map would
+end where the last ones did."""
 YOUNG_STEPS = 800
 """Steps that a map which grows with the frames is looked at coarsely."""
 SEED_VIEWS = 11
@@ -477,7 +480,8 @@ class Reconstructor:
             if cancelled():
                 break
             coarse = max(0.0, 1 - done / (COARSE_SHARE * steps))
-            self._step(10 ** (-done / steps), densify=done < 0.7 * steps, coarse=coarse)
+            left = 1 - done / steps
+            self._step(10 ** (left - 1) * min(1.0, left / SETTLING_SHARE), densify=done < 0.7 * steps, coarse=coarse)
             if self._aligns(done, steps):
                 aligned += 1
                 self._align(2 / (1 + aligned))  # ever less of a step: what the map gets wrong would be a random walk

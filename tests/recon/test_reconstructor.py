@@ -1,11 +1,14 @@
 """The whole reconstruction on the simulated camera, on good days and on bad ones."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from spiked.errors import ConfigurationError
 from spiked.evaluate import psnr, score_trajectory, similarity_of_trajectories
 from spiked.recon import Options, Reconstructor, State
+from spiked.recon.mapping import Mapper
 from spiked.sensor import Intrinsics, Mosaic, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
 from spiked.trajectory import Trajectory
@@ -58,6 +61,27 @@ def test_a_shaken_camera_gives_its_path_and_a_scene_that_looks_right(
     seen = camera.view(truth.rotations[k], truth.centres[k])
     rendered = reconstructor.view(rotation[0], centre[0])[..., 0]
     assert psnr(rendered / reconstructor.white, seen / reconstructor.white) > 24
+
+
+def test_a_refinement_ends_settled(
+    shaken: tuple[SimulatedCamera, np.ndarray, Trajectory], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the last view alone pulls at is its noise."""
+    moved: list[float] = []
+    step = Mapper.step
+
+    def watched(mapper: Mapper, *arguments: Any) -> Any:
+        before = mapper.scene.means.copy()
+        done = step(mapper, *arguments)
+        moved.append(float(np.linalg.norm(mapper.scene.means - before, axis=1).mean()))
+        return done
+
+    monkeypatch.setattr(Mapper, "step", watched)
+    reconstructor = Reconstructor(sensor(), Options(steps=200))
+    feed(reconstructor, shaken[1])
+    reconstructor.finish()
+    assert len(moved) == 200
+    assert np.mean(moved[-4:]) < 0.2 * np.mean(moved[150:170])
 
 
 def test_the_scene_grows_while_frames_arrive(shaken: tuple[SimulatedCamera, np.ndarray, Trajectory]) -> None:

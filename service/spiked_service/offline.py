@@ -1,5 +1,6 @@
 """A whole recording through the reconstructor, as `spiked reconstruct` does it."""
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -38,22 +39,18 @@ def reconstruct_recording(
     cancelled: Callable[[], bool],
     budget_s: float | None = None,
 ) -> None:
-    """Feed every frame and gap, then refine; stops early when cancelled or when the budget in seconds is used up.
+    """Feed every frame and gap, then refine, in `budget_s` seconds where that is given; stops early when cancelled.
 
     Whatever stops it, the reconstructor holds what was reached by then.
     """
-    deadline = None if budget_s is None else time.monotonic() + budget_s
-
-    def over() -> bool:
-        return cancelled() or (deadline is not None and time.monotonic() > deadline)
-
+    deadline = math.inf if budget_s is None else time.monotonic() + budget_s
     expected = 0
     for piece in pieces(recording):
-        if over():
+        if cancelled() or time.monotonic() > deadline:
             break
         if piece.index > expected:
             reconstructor.gap(expected, piece.index - expected)
         reconstructor.feed(piece.index, recording.read(piece.first, piece.count))
         expected = piece.index + piece.count
         progress(reconstructor.status())
-    reconstructor.finish(progress, over)
+    reconstructor.finish(progress, cancelled, None if budget_s is None else deadline - time.monotonic())

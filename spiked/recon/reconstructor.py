@@ -420,10 +420,18 @@ class Reconstructor:
         return float(np.percentile(np.linalg.norm(moved, axis=1), 75))
 
     def finish(
-        self, progress: Callable[[Status], None] | None = None, cancelled: Callable[[], bool] = lambda: False
+        self,
+        progress: Callable[[Status], None] | None = None,
+        cancelled: Callable[[], bool] = lambda: False,
+        budget_s: float | None = None,
     ) -> None:
-        """Use what is left in the buffers and refine path and map together. Stops early when `cancelled` says so."""
+        """Use what is left in the buffers and refine path and map together.
+
+        Where the steps of the options take longer than `budget_s`, fewer are taken, from coarse to settled all the
+        same. Stops early when `cancelled` says so.
+        """
         begin = time.perf_counter()
+        deadline = np.inf if budget_s is None else begin + budget_s
         with self._one_blas_thread():
             for view in self._windows.flush():
                 self._add(view)
@@ -440,7 +448,7 @@ class Reconstructor:
         self._spent["tracking"] += time.perf_counter() - begin
         begin = time.perf_counter()
         if self._ready():
-            self._refine(progress, cancelled)
+            self._refine(progress, cancelled, deadline)
         self._spent["refining"] += time.perf_counter() - begin
         self._stage = "done"
         if progress:
@@ -463,7 +471,9 @@ class Reconstructor:
         self._odometry.points = self._odometry.points / self._unit
         self._odometry.spline = replace(spline, centres=spline.centres / self._unit)
 
-    def _refine(self, progress: Callable[[Status], None] | None, cancelled: Callable[[], bool]) -> None:
+    def _refine(
+        self, progress: Callable[[Status], None] | None, cancelled: Callable[[], bool], deadline: float
+    ) -> None:
         begin = time.perf_counter()
         self._stage = "refining"
         self._follow_focal()
@@ -476,17 +486,21 @@ class Reconstructor:
         order = np.linspace(0, len(usable) - 1, SEED_VIEWS).round().astype(int)
         self._seed([usable[i] for i in order[np.argsort(np.abs(order - order.mean()))]])
         steps, aligned = self._steps(), 0
+        seeded = time.perf_counter()
+        available_s = max(deadline - seeded, 1e-9)
         for done in range(steps):
-            if cancelled():
+            share = max(done / steps, (time.perf_counter() - seeded) / available_s)
+            if share >= 1 or cancelled():
                 break
-            coarse = max(0.0, 1 - done / (COARSE_SHARE * steps))
-            left = 1 - done / steps
-            self._step(10 ** (left - 1) * min(1.0, left / SETTLING_SHARE), densify=done < 0.7 * steps, coarse=coarse)
-            if self._aligns(done, steps):
-                aligned += 1
+            coarse = max(0.0, 1 - share / COARSE_SHARE)
+            decay = 10**-share * min(1.0, (1 - share) / SETTLING_SHARE)
+            self._step(decay, densify=share < 0.7, coarse=coarse)
+            due = min(ALIGNMENTS, int(ALIGNMENTS * share / ALIGNED_SHARE))
+            if due > aligned and self._aligns():
+                aligned = due
                 self._align(2 / (1 + aligned))  # ever less of a step: what the map gets wrong would be a random walk
             if done % 50 == 49:
-                self._progress = (done + 1) / steps
+                self._progress = max(share, (done + 1) / steps)
                 self._note(time.perf_counter() - begin)
                 if progress:
                     progress(self.status())
@@ -510,10 +524,8 @@ class Reconstructor:
         fast = float(np.mean([self._views[i].frames is not None for i in self._mappable()]))
         return round(self.options.steps * share * (1 + (FAST_STEPS - 1) * fast))
 
-    def _aligns(self, done: int, steps: int) -> bool:
-        wanted = self.options.refine_poses and self.options.poses is None and isinstance(self.path, Spline)
-        interval = max(1, int(ALIGNED_SHARE * steps) // ALIGNMENTS)
-        return wanted and (done + 1) % interval == 0 and done < ALIGNED_SHARE * steps
+    def _aligns(self) -> bool:
+        return self.options.refine_poses and self.options.poses is None and isinstance(self.path, Spline)
 
     def _align(self, share: float) -> None:
         spline = self.path

@@ -39,7 +39,9 @@ def reconstruct(
     file: Annotated[Path, typer.Argument(help="A recording.", readable=False)],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; made if it is not there.")],
     poses: Annotated[Path | None, typer.Option(help="Known poses, a TUM file, camera-to-world.")] = None,
-    seconds: Annotated[float | None, typer.Option(help="Stop after so long with what there is.", min=0.0)] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="Be done after about so long, with fewer steps.", min=0.0)
+    ] = None,
     steps: Annotated[int, typer.Option(help="Gradient steps of the final refinement.", min=0)] = Options().steps,
     seed: Annotated[int, typer.Option(help="The same seed gives the same result.")] = 0,
     threads: Annotated[int | None, typer.Option(help="Threads of the rasteriser; all cores if not given.")] = None,

@@ -72,7 +72,7 @@ class Fit:
 
 
 BOOT_VIEWS = 10
-MIN_PARALLAX_PX = 0.8
+MIN_PARALLAX_PX = 0.5
 """Motion that rotation cannot explain before a bootstrap is tried; tracks are good to 0.05 px."""
 MIN_POINTS = 15
 LEAST_SEEN, LEAST_SPREAD_PX, PLACED_PX = 5, 0.5, 2.0

@@ -66,7 +66,7 @@ def test_a_camera_with_a_clock_does_not_wait(
     rig.call("read", str(tmp_path / "wire"), 20)
     report = rig.report()
     numbers = lines_of(frames_of(tmp_path / "wire"))
-    assert numbers[0] > 1000  # it ran before anybody read
+    assert numbers[0] > 10  # more than its buffer holds went by before anybody read
     assert numbers == sorted(set(numbers))
     assert report.dropped + report.sent_frames == report.next_frame
     assert all(report.runs(number) for number in numbers)

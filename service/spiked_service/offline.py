@@ -53,4 +53,4 @@ def reconstruct_recording(
         reconstructor.feed(piece.index, recording.read(piece.first, piece.count))
         expected = piece.index + piece.count
         progress(reconstructor.status())
-    reconstructor.finish(progress, cancelled, None if budget_s is None else deadline - time.monotonic())
+    reconstructor.finish(progress, cancelled, deadline - time.monotonic())

@@ -167,13 +167,19 @@ def test_the_delay_of_a_track_is_that_of_the_edges_around_it() -> None:
     assert abs(edges_with(late, np.uint8).delays(image, np.array([[15.0, 15.0]]))[0] - 2.5) < 0.1
 
 
+def steady(seed: int = 0) -> Tracks:
+    """Tracks of a scene that moved half a pixel from each of four views to the next, 1.5 px in all."""
+    tracks = Tracks(target=60)
+    for n in range(4):
+        tracks.add(n, picture(scene((0.5 * n, 0.0), seed), 1.0))
+    return tracks
+
+
 @pytest.mark.parametrize(("jump_px", "least_right"), [(0.0, 1.0), (2.5, 0.9), (9.0, 0.55)])
 def test_tracks_outlive_a_motion_that_nobody_expected(jump_px: float, least_right: float) -> None:
     began = right = kept = 0
     for seed in range(6):
-        tracks = Tracks(target=60)
-        for n in range(4):
-            tracks.add(n, picture(scene((0.5 * n, 0.0), seed), 1.0))
+        tracks = steady(seed)
         before = dict(zip(tracks.ids.tolist(), tracks.at, strict=True))
         motion = tracks.add(4, picture(scene((2.0 + jump_px, 0.0), seed), 1.0))
         assert motion == pytest.approx(0.5 + jump_px, abs=0.05)
@@ -187,9 +193,7 @@ def test_tracks_outlive_a_motion_that_nobody_expected(jump_px: float, least_righ
 def test_tracks_that_go_on_as_they_went_are_not_searched(
     monkeypatch: pytest.MonkeyPatch, jump_px: float, looks_again: bool
 ) -> None:
-    tracks, searches = Tracks(target=60), []
-    for n in range(4):
-        tracks.add(n, picture(scene((0.5 * n, 0.0)), 1.0))
+    tracks, searches = steady(), []
     sought = Tracks._sought
     monkeypatch.setattr(Tracks, "_sought", lambda *all_: searches.append(1) or sought(*all_))
     tracks.add(4, picture(scene((1.5 + jump_px, 0.0)), 1.0))

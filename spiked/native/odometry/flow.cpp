@@ -45,8 +45,8 @@ struct Gray {
 
 // A row of the window and what fills up a vector.
 typedef float Row __attribute__((vector_size(4 * kLanes)));
-typedef int32_t Which __attribute__((vector_size(4 * kLanes)));
-constexpr Which kColumn = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+constexpr Row kInside = {1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1};
+constexpr Row kFromMiddle = {-6, -5, -4, -3, -2, -1, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9};  // px
 
 struct Window {
     Row value[kWindow], across[kWindow], down[kWindow];
@@ -80,16 +80,25 @@ inline Row between(const float* row, float a) {
     return here + a * (load(row + 1) - here);
 }
 
-// The window whose corner is at (left + a, top + b), with its gradients (Scharr), which are 0 beyond its last column.
-inline void cut(const float* corner, int64_t stride, float a, float b, Window& window) {
-    float ring[kRing][kLanes + 4] = {};
+// `take` gets the number and the values of each of `count` rows from (x, y) on, the place between pixels or not.
+template <class Take>
+[[gnu::always_inline]] inline void each_row(const Gray& of, float x, float y, int count, const Take& take) {
+    const float left = std::floor(x), top = std::floor(y), a = x - left, b = y - top;
+    const float* corner = of.at(left, top);
     Row before = between(corner, a);
-    for (int y = 0; y < kRing; ++y) {
-        const Row after = between(corner + (y + 1) * stride, a), row = before + b * (after - before);
-        std::memcpy(ring[y], &row, sizeof row);
+    for (int n = 0; n < count; ++n) {
+        const Row after = between(corner + (n + 1) * of.stride, a);
+        take(n, before + b * (after - before));
         before = after;
     }
-    const Row inside = kColumn < kWindow ? Row{} + 1.0f / 32 : Row{};
+}
+
+// The window around (x, y), with its gradients (Scharr), which are 0 beyond its last column.
+[[gnu::always_inline]] inline void cut(const Gray& of, float x, float y, Window& window) {
+    float ring[kRing][kLanes + 4] = {};
+    each_row(of, x - kHalf - 1, y - kHalf - 1, kRing,
+             [&](int n, const Row& row) { std::memcpy(ring[n], &row, sizeof row); });
+    const Row inside = kInside / 32;
     for (int y = 0; y < kWindow; ++y) {
         const float *p = ring[y], *q = ring[y + 1], *r = ring[y + 2];
         const Row above = load(p), below = load(r), above2 = load(p + 2), below2 = load(r + 2);
@@ -117,15 +126,14 @@ inline Matrix products(const Window& window) {
 // squared: where that is large, small ones are likelier.
 [[gnu::always_inline]] inline void project(Window& window, float noise2) {
     constexpr int kLooks = 4, kAll = kLooks + 2;
-    const Row inside = kColumn < kWindow ? Row{} + 1.0f : Row{}, u = __builtin_convertvector(kColumn, Row) - kHalf;
     const float middle = window.value[kWindow / 2][kWindow / 2];
     const auto looks_and_gradients = [&](int y, Row* out) {
         const float v = static_cast<float>(y) - kHalf;
         const Row dx = window.across[y], dy = window.down[y];
-        out[0] = inside;
-        out[1] = inside * (window.value[y] - middle);
-        out[2] = dx * v - dy * u;
-        out[3] = dx * u + dy * v;
+        out[0] = kInside;
+        out[1] = kInside * (window.value[y] - middle);
+        out[2] = dx * v - dy * kFromMiddle;
+        out[3] = dx * kFromMiddle + dy * v;
         out[kLooks] = dx;
         out[kLooks + 1] = dy;
     };
@@ -164,35 +172,27 @@ inline Matrix products(const Window& window) {
     }
 }
 
-// The sums over the window of its gradients times the difference to another picture.
-inline void differ(const float* corner, int64_t stride, float a, float b, const Window& window, float* across,
-                   float* down) {
-    Row before = between(corner, a), u = {}, v = {};
-    for (int y = 0; y < kWindow; ++y) {
-        const Row after = between(corner + (y + 1) * stride, a);
-        const Row difference = before + b * (after - before) - window.value[y];
-        u += difference * window.across[y];
-        v += difference * window.down[y];
-        before = after;
-    }
-    *across = total(u);
-    *down = total(v);
+// The sums over the window of its gradients times the difference to another picture at (u, v).
+[[gnu::always_inline]] inline void differ(const Window& window, const Gray& to, float u, float v, float* across,
+                                          float* down) {
+    Row by_across = {}, by_down = {};
+    each_row(to, u - kHalf, v - kHalf, kWindow, [&](int n, const Row& row) {
+        const Row difference = row - window.value[n];
+        by_across += difference * window.across[n];
+        by_down += difference * window.down[n];
+    });
+    *across = total(by_across);
+    *down = total(by_down);
 }
 
-// The variance over a window of its difference to another picture at (u, v).
-inline float difference2(const Window& window, const Gray& to, float u, float v) {
-    const float column = std::floor(u - kHalf), row = std::floor(v - kHalf), a = u - kHalf - column,
-                b = v - kHalf - row;
-    const float* corner = to.at(column, row);
-    const Row inside = kColumn < kWindow ? Row{} + 1.0f : Row{};
-    Row before = between(corner, a), sum = {}, square = {};
-    for (int y = 0; y < kWindow; ++y) {
-        const Row after = between(corner + (y + 1) * to.stride, a);
-        const Row difference = inside * (before + b * (after - before) - window.value[y]);
+// The variance over a window of that difference.
+[[gnu::always_inline]] inline float difference2(const Window& window, const Gray& to, float u, float v) {
+    Row sum = {}, square = {};
+    each_row(to, u - kHalf, v - kHalf, kWindow, [&](int n, const Row& row) {
+        const Row difference = kInside * (row - window.value[n]);
         sum += difference;
         square += difference * difference;
-        before = after;
-    }
+    });
     constexpr float kShare = 1.0f / (kWindow * kWindow);
     const float mean = kShare * total(sum);
     return std::max(kShare * total(square) - mean * mean, 0.0f);
@@ -206,9 +206,8 @@ inline bool settle(const Window& window, const Gray& to, float last2, float* u, 
     const float scale = 1 / (g.xx * g.yy - g.xy * g.xy);
     for (int n = 0; n < kIterations; ++n) {
         if (!to.holds(*u, *v)) return false;
-        const float column = std::floor(*u - kHalf), row = std::floor(*v - kHalf);
         float across, down;
-        differ(to.at(column, row), to.stride, *u - kHalf - column, *v - kHalf - row, window, &across, &down);
+        differ(window, to, *u, *v, &across, &down);
         const float du = (g.xy * down - g.yy * across) * scale, dv = (g.xy * across - g.xx * down) * scale;
         *u += du;
         *v += dv;
@@ -221,9 +220,8 @@ inline bool settle(const Window& window, const Gray& to, float last2, float* u, 
 // looks otherwise matters in the end only: gradients without that lead home from less far away.
 SPIKED_CLONES bool align(const Gray& from, const Gray& to, float x, float y, bool exactly, float* u, float* v) {
     if (!from.holds(x, y)) return false;
-    const float left = std::floor(x - kHalf), top = std::floor(y - kHalf);
     Window window;
-    cut(from.at(left - 1, top - 1), from.stride, x - kHalf - left, y - kHalf - top, window);
+    cut(from, x, y, window);
     if (!settle(window, to, exactly ? kNear2 : kStill2, u, v)) return false;
     if (!exactly) return true;
     project(window, difference2(window, to, *u, *v));

@@ -233,6 +233,15 @@ class Odometry:
             self.path_error = CERTAINTY * path_error(self._adjusted[0], self.spline, self._adjusted[1], SCALE_PX / 2)
         self._review()
 
+    def information(self) -> Array | None:
+        """How firmly the tracks hold `spline`, with all points free: [6 knots, 6 knots], inverse covariance of
+        (rotation vector on the left, centre), as if their errors were independent. None before it was adjusted."""
+        if self._adjusted is None or self.spline is None or not len(self._adjusted[0].camera):
+            return None
+        bundle, times = self._adjusted
+        noise_px = max(bundle.noise_px(), 1e-3)
+        return np.asarray(bundle.spline_information(self.spline, times, SCALE_PX / 2) / noise_px**2)
+
     def _review(self) -> None:
         """Judge every pose by the path and the points as they are in the end."""
         judged: list[tuple[Fit, int]] = []

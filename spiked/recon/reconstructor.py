@@ -21,7 +21,7 @@ from spiked.recon.mapping import Mapper, Sight, fill_mosaic
 from spiked.recon.odometry import SAME_FOCAL, WORST_PATH_ERROR, Odometry, State
 from spiked.recon.options import Options
 from spiked.recon.passage import Passage
-from spiked.recon.refine import align_spline
+from spiked.recon.refine import Known, align_spline
 from spiked.recon.tracks import picture, white_of
 from spiked.recon.views import Image, View, Windows, luminance
 from spiked.render import Camera
@@ -37,9 +37,9 @@ COARSE_SHARE = 0.6
 """Part of the refinement in which large images are looked at with fewer, larger pixels: a quarter of the work each."""
 SMALL_PIXELS = 130_000
 """Images up to here get all the steps that the options say."""
-LARGE_POWER = 0.3
+LARGE_POWER = 0.4
 """The steps of larger ones fall with this power of their pixels: each costs more, and they have more to settle."""
-FAST_STEPS = 1.8
+FAST_STEPS = 2.5
 """Times as many steps for views of fast motion, which cost less each and say less of what is fine."""
 DENSIFY_EVERY = 20
 """Steps after which the view just seen gets splats where it is rendered worst: each part of the path has its turn."""
@@ -53,9 +53,9 @@ SEED_VIEWS = 11
 SWEEP_NEIGHBOURS = 5
 SURE_DEPTH = 0.6
 """Pixels of less confidence wait for a view that sees their place better: at the edges few others look there."""
-ALIGNMENTS = 7
+ALIGNMENTS = 5
 """Times that the whole path is aligned with the map in a refinement."""
-ALIGNED_SHARE = 0.6
+ALIGNED_SHARE = 0.7
 """Part of the refinement in which that happens; then the map settles on the path that was found."""
 STALE_PX = 0.05
 """A map that was drawn along a path which then moved farther than this in the image, in a tenth of the views, is drawn
@@ -486,6 +486,8 @@ class Reconstructor:
         order = np.linspace(0, len(usable) - 1, SEED_VIEWS).round().astype(int)
         self._seed([usable[i] for i in order[np.argsort(np.abs(order - order.mean()))]])
         steps, aligned = self._steps(), 0
+        tracked, information = self._odometry.spline, self._odometry.information()
+        known = None if tracked is None or information is None else Known(tracked, information)
         seeded = time.perf_counter()
         available_s = max(deadline - seeded, 1e-9)
         for done in range(steps):
@@ -498,7 +500,7 @@ class Reconstructor:
             due = min(ALIGNMENTS, int(ALIGNMENTS * share / ALIGNED_SHARE))
             if due > aligned and self._aligns():
                 aligned = due
-                self._align(2 / (1 + aligned))  # ever less of a step: what the map gets wrong would be a random walk
+                self._align(known, 2 / (1 + aligned))  # ever less of it: an unsettled map makes the path a random walk
             if done % 50 == 49:
                 self._progress = max(share, (done + 1) / steps)
                 self._note(time.perf_counter() - begin)
@@ -527,7 +529,7 @@ class Reconstructor:
     def _aligns(self) -> bool:
         return self.options.refine_poses and self.options.poses is None and isinstance(self.path, Spline)
 
-    def _align(self, share: float) -> None:
+    def _align(self, known: Known | None, share: float) -> None:
         spline = self.path
         assert isinstance(spline, Spline)
         numbered = [(i, self._views[i]) for i in self._mappable()]
@@ -538,6 +540,7 @@ class Reconstructor:
             numbered[::every],
             self._mapper,
             lambda view: self._passing(view, spline) or self._sight(view, spline, pixel),
+            known,
             share,
         )
 

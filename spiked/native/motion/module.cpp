@@ -7,6 +7,8 @@
 #include <stdexcept>
 #include <vector>
 
+#include "../clones.hpp"
+
 namespace nb = nanobind;
 
 namespace spiked {
@@ -20,10 +22,10 @@ constexpr int kShare = 4;  // the weight image has one pixel for 4x4 of the sens
 
 // Adds `value` at (x, y), a place between pixel centres at whole numbers, to the four pixels around it.
 inline void splat(float* image, int64_t width, int64_t height, float x, float y, float value) {
-    const float fx = std::floor(x), fy = std::floor(y);
-    if (!(fx >= 0 && fy >= 0 && fx < static_cast<float>(width - 1) && fy < static_cast<float>(height - 1))) return;
-    const float u = x - fx, v = y - fy;
-    float* at = image + static_cast<int64_t>(fy) * width + static_cast<int64_t>(fx);
+    if (!(x >= 0 && y >= 0 && x < static_cast<float>(width - 1) && y < static_cast<float>(height - 1))) return;
+    const auto column = static_cast<int32_t>(x), row = static_cast<int32_t>(y);
+    const float u = x - static_cast<float>(column), v = y - static_cast<float>(row);
+    float* at = image + row * width + column;
     at[0] += (1 - u) * (1 - v) * value;
     at[1] += u * (1 - v) * value;
     at[width] += (1 - u) * v * value;
@@ -53,7 +55,8 @@ struct Fields {
     const float* of(int64_t n) const { return data + n * rows * columns * 2; }
 };
 
-void add_spikes(const Sensor& sensor, const Fields& fields, const uint8_t* frames, int64_t frame_stride, float* out) {
+SPIKED_CLONES void add_spikes(const Sensor& sensor, const Fields& fields, const uint8_t* frames, int64_t frame_stride,
+                              float* out) {
     std::vector<float> line(fields.columns * 2);
     for (int64_t n = 0; n < fields.frames; ++n) {
         for (int64_t y = 0; y < sensor.height; ++y) {
@@ -80,7 +83,7 @@ void add_spikes(const Sensor& sensor, const Fields& fields, const uint8_t* frame
 }
 
 // How much of the sensor comes to lie where.
-void add_weight(const Sensor& sensor, const Fields& fields, float* out) {
+SPIKED_CLONES void add_weight(const Sensor& sensor, const Fields& fields, float* out) {
     const int64_t width = (sensor.width + kShare - 1) / kShare, height = (sensor.height + kShare - 1) / kShare;
     std::vector<float> line(fields.columns * 2);
     for (int64_t n = 0; n < fields.frames; ++n) {

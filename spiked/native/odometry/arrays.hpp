@@ -12,6 +12,7 @@ namespace spiked {
 template <class T, int N>
 using Array = nb::ndarray<T, nb::ndim<N>, nb::c_contig, nb::device::cpu>;
 
+void bind_dense(nb::module_& m);
 void bind_depth(nb::module_& m);
 void bind_normal(nb::module_& m);
 void bind_pose(nb::module_& m);

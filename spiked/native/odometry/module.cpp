@@ -2,6 +2,7 @@
 #include "arrays.hpp"
 
 NB_MODULE(_odometry, m) {
+    spiked::bind_dense(m);
     spiked::bind_depth(m);
     spiked::bind_normal(m);
     spiked::bind_pose(m);

@@ -36,7 +36,7 @@ BETAS = 0.9, 0.99
 """Adam's memory, in steps that see a splat: many see few."""
 NUISANCES_FROM = 50
 """Steps before they are estimated at all: first the map has to look like something."""
-GAINS_FROM = 1500
+GAINS_FROM = 800
 """Steps before the gains of pixels are: they would take on what the geometry has yet to explain."""
 NUISANCE_STEPS = 200
 """Steps between estimates of the pixels' gains."""

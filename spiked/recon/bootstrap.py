@@ -20,6 +20,8 @@ SCALE_PX = 0.3
 """Scale of the Cauchy loss: tracks on spike-aligned rates are good to about 0.05 px."""
 INLIER_PX = 1.0
 LEAST_INLIERS = 0.6
+MIN_PARALLAX_PX = 0.5
+"""Motion that rotation cannot explain before a bootstrap is tried; tracks are good to 0.05 px."""
 PARALLAX_NOISES = 5.0
 """Parallax, in standard deviations of a place on a track, that a first map needs: with less, depths are noise."""
 SAME = 0.8
@@ -92,7 +94,7 @@ class Verdict:
     """Parallax that would do, where there was too little for the noise that was seen."""
 
 
-def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = 0.8) -> Verdict:
+def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = MIN_PARALLAX_PX) -> Verdict:
     """Try all guesses on `views`. Accepts when there is enough parallax for the noise of the tracks, inliers > 60 % and
     every different outcome, the depth-reversed one above all, is clearly worse."""
     if len(views.ids) < 30:

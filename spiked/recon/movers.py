@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.recon.bootstrap import Hypothesis, Verdict, Views, bootstrap, converge_without
+from spiked.recon.bootstrap import MIN_PARALLAX_PX, Hypothesis, Verdict, Views, bootstrap, converge_without
 
 SHARE = (0.04, 0.45)
 """Part of the tracks that may be left out: fewer bend nothing, and more may be the scene."""
@@ -24,7 +24,7 @@ CLEARLY = 0.85
 ROUNDS = 20
 
 
-def first_map(views: Views, seed: int = 0, min_parallax_px: float = 0.8) -> Verdict:
+def first_map(views: Views, seed: int = 0, min_parallax_px: float = MIN_PARALLAX_PX) -> Verdict:
     """As `bootstrap`, but without the tracks that move apart where those contradict the others."""
     verdict = bootstrap(views, seed, min_parallax_px)
     if not verdict.tried:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import spiked.native._odometry as _odometry
 from spiked.pose import Array, exp_so3, log_so3, mean_rotation
-from spiked.recon.bootstrap import INLIER_PX, LEAST_INLIERS, MORE_MOTION, SCALE_PX, Views
+from spiked.recon.bootstrap import INLIER_PX, LEAST_INLIERS, MIN_PARALLAX_PX, MORE_MOTION, SCALE_PX, Views
 from spiked.recon.bundle import Bundle
 from spiked.recon.certainty import path_error
 from spiked.recon.edges import Edges
@@ -72,8 +72,6 @@ class Fit:
 
 
 BOOT_VIEWS = 10
-MIN_PARALLAX_PX = 0.5
-"""Motion that rotation cannot explain before a bootstrap is tried; tracks are good to 0.05 px."""
 MIN_POINTS = 15
 LEAST_SEEN, LEAST_SPREAD_PX, PLACED_PX = 5, 0.5, 2.0
 """A track has a place in space when so many views saw it, along rays that spread by so much, and none sees the place so

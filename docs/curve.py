@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from spiked.evaluate import score_views, similarity_of_trajectories
 from spiked.recon import Options, Reconstructor, Status
@@ -85,18 +86,28 @@ def main() -> None:
     parser.add_argument("--live", action="store_true")
     parser.add_argument("--interval", type=float, default=2.0, help="seconds between scores")
     options = parser.parse_args()
+    curves = {}
+    for folder in options.streams:
+        print(folder.name)
+        curves[folder.name] = reconstruct(folder, options.live, options.interval)
+    draw(curves, options.out)
+
+
+def draw(curves: dict[str, list[tuple[float, float]]], out: Path) -> None:
+    """One line for each stream, over the logarithm of the seconds."""
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    for folder in options.streams:
-        print(folder.name)
-        points = reconstruct(folder, options.live, options.interval)
-        axes.plot(*zip(*points, strict=True), marker=".", label=folder.name)
+    for name, points in curves.items():
+        axes.plot(*zip(*points, strict=True), marker=".", label=name)
     axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set(xlabel="seconds from the first frame", ylabel="PSNR of held-out views, dB")
     axes.grid(alpha=0.3)
     axes.legend()
-    figure.savefig(options.out, dpi=110)
+    figure.savefig(out, dpi=110)
 
 
 if __name__ == "__main__":

@@ -28,10 +28,11 @@ import spiked.recon.bootstrap as bootstrap
 from spiked.blocks import Window
 from spiked.evaluate import score_trajectory
 from spiked.pose import Array
-from spiked.recon import MapOptions, Options, Reconstructor, mapping, odometry, reconstructor, smooth, views
+from spiked.recon import MapOptions, Options, Reconstructor, mapping, odometry, reconstructor, refine, smooth, views
 from spiked.recon.edges import Edges
 from spiked.recon.levels import Level, Target
 from spiked.recon.mapping import Mapper, Sight, fill_mosaic
+from spiked.recon.odometry import Odometry
 from spiked.recon.views import Image, View
 from spiked.recording import open_recording
 from spiked.render.loss import dssim
@@ -39,7 +40,7 @@ from spiked.render.splats import Image as Rendered
 from spiked.spline import Spline
 from spiked.trajectory import Trajectory
 
-GREY, COLOUR = "living", "camp_color"
+GREY, COLOUR, KINKED = "living", "camp_color", "garden_fast"
 CHUNK = 64
 
 
@@ -53,6 +54,8 @@ class Row:
     patches: Callable[[], Iterator[None]] | None = None
     path: bool = False
     """Whether it is about the path: poses are not given."""
+    aligned: bool = False
+    """And that after the map was made and the path aligned with it."""
     window_frames: int | None = None
     steps_share: float = 1.0
 
@@ -218,6 +221,14 @@ def rows() -> list[Row]:
     for spacing, degree in ((8, 3), (32, 3), (128, 3), (8, 1), (16, 1)):
         name = f"path: spline of degree {degree}, {spacing} frames a knot"
         table.append(Row(name, path=True, patches=splines(spacing, degree)))
+    held, forgotten = (refine, "HELD", 1e9), (Odometry, "information", lambda _: None)
+    for stream in (GREY, KINKED):
+        for name, patches in (
+            ("as it is", None),
+            ("what tracks knew not counted", lambda: patched(forgotten)),
+            ("places of the map held as well", lambda: patched(held, forgotten)),
+        ):
+            table.append(Row(f"path with the map: {name}", stream, path=True, aligned=True, patches=patches))
     return table
 
 
@@ -239,7 +250,7 @@ def run(row: Row, streams: Path, steps: int) -> dict[str, Any]:
     recording = open_recording(folder / f"{row.stream}.dat")
     truth = Trajectory.read_tum(folder / "groundtruth.tum")
     options = Options(
-        steps=0 if row.path else round(steps * row.steps_share),
+        steps=0 if row.path and not row.aligned else round(steps * row.steps_share),
         poses=None if row.path else truth,
         window_frames=row.window_frames,
         mapping=replace(MapOptions(), **row.mapping),

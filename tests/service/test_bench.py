@@ -4,8 +4,10 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from spiked_service.benchmarks import files, sustained, tracking
+from spiked_service.benchmarks.growth import peak_bytes
 from spiked_service.benchmarks.report import Machine, document, text
 from spiked_service.cli import app
 from typer.testing import CliRunner
@@ -66,6 +68,13 @@ def test_rows_as_text_and_as_a_document() -> None:
 def test_growth_is_fitted() -> None:
     law = renderer.Scaling("cubes", [1.0, 10.0, 100.0], [2.0, 2e3, 2e6])
     assert law.exponent == pytest.approx(3)
+
+
+def test_memory_is_that_of_the_step_and_not_of_who_asks() -> None:
+    held = np.ones(1 << 29, np.uint8)
+    small, large = peak_bytes(1_000), peak_bytes(100_000)
+    assert small < held.nbytes  # where getrusage is asked, a process begins with the peak of its parent
+    assert 14 * 4 * 99_000 < large - small < 5_000 * 99_000  # at least its parameters
 
 
 def test_the_command_explains_itself() -> None:

@@ -16,6 +16,13 @@ struct Pose {
     const double* centre;
 };
 
+// A vector in camera axes, in those of the world.
+inline void to_world(const double* rotation, const double* local, double* out) {
+    for (int i = 0; i < 3; ++i) {
+        out[i] = rotation[3 * i] * local[0] + rotation[3 * i + 1] * local[1] + rotation[3 * i + 2] * local[2];
+    }
+}
+
 struct Seen {
     double error[2];  // px: image minus observation
     double ray[3];    // from the camera's centre, in world axes

@@ -1,4 +1,5 @@
 // What all strong pixels of one view say of its pose and of the places that they see.
+#include <algorithm>
 #include <cmath>
 #include <stdexcept>
 #include <unordered_map>
@@ -60,13 +61,12 @@ size_t sum_pixels(const Image& error, const Image& du, const Image& dv, const Im
             if (!(w > 0) || !(z > kNearest)) continue;
             const double x = (u + 0.5 - cx) / fx * z, y = (v + 0.5 - cy) / fy * z;
             // Where the map's point moves to, its colour goes: at a fixed pixel one sees what lay the other way.
-            const double a = -du.data()[n] * fx / z, b = -dv.data()[n] * fy / z, c = -(a * x + b * y) / z;
+            const double a = -du.data()[n] * fx / z, b = -dv.data()[n] * fy / z;
+            const double slope[3] = {a, b, -(a * x + b * y) / z}, local[3] = {x, y, z};
             double row[kRow], ray[3], point[3];
-            for (int i = 0; i < 3; ++i) {
-                row[i] = r[3 * i] * a + r[3 * i + 1] * b + r[3 * i + 2] * c;
-                ray[i] = r[3 * i] * x + r[3 * i + 1] * y + r[3 * i + 2] * z;
-                point[i] = centre.data()[i] + ray[i];
-            }
+            to_world(r, slope, row);
+            to_world(r, local, ray);
+            for (int i = 0; i < 3; ++i) point[i] = centre.data()[i] + ray[i];
             by_pose(row, ray, row + kPlace);
             row[kPlace + kPose] = error.data()[n];
             const int64_t key = place_of(point, z, width_rad);

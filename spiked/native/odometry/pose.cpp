@@ -116,12 +116,12 @@ double displacement(const Array<const double, 2>& hessian, const Array<const dou
         const double across = (n / 2 % kSteps) * 2.0 / (kSteps - 1) - 1,
                      down = (n / 2 / kSteps) * 2.0 / (kSteps - 1) - 1;
         const double x = across * cx / fx, y = down * cy / fy;
-        const double local[3] = {n % 2 ? 0 : fx, n % 2 ? fy : 0, n % 2 ? -fy * y : -fx * x};
+        const double slope[3] = {(n % 2 ? 0 : fx) / depth, (n % 2 ? fy : 0) / depth,
+                                 (n % 2 ? -fy * y : -fx * x) / depth};
+        const double local[3] = {depth * x, depth * y, depth};
         double by_point[3], ray[3], row[6], solved[6], h[36];
-        for (int i = 0; i < 3; ++i) {
-            by_point[i] = (r[3 * i] * local[0] + r[3 * i + 1] * local[1] + r[3 * i + 2] * local[2]) / depth;
-            ray[i] = depth * (r[3 * i] * x + r[3 * i + 1] * y + r[3 * i + 2]);
-        }
+        to_world(r, slope, by_point);
+        to_world(r, local, ray);
         by_pose(by_point, ray, row);
         std::copy_n(row, 6, solved);
         std::copy_n(hessian.data(), 36, h);

@@ -1,4 +1,4 @@
-"""Poses over ZeroMQ, noticing what was lost: python zmq_events.py [first port, 8651]"""
+"""Poses over ZeroMQ, noticing what was lost: python zmq_events.py [port of events, 8651] [of the state, the next]"""
 
 import sys
 
@@ -6,10 +6,11 @@ import msgpack
 import zmq
 
 port = int(sys.argv[1]) if len(sys.argv) > 1 else 8651
+state_port = int(sys.argv[2]) if len(sys.argv) > 2 else port + 1
 context = zmq.Context()
 
 question = context.socket(zmq.REQ)
-question.connect(f"tcp://127.0.0.1:{port + 1}")
+question.connect(f"tcp://127.0.0.1:{state_port}")
 question.send(msgpack.packb({"get": "state"}))
 for message in msgpack.unpackb(question.recv())["messages"]:
     print("now:", message["topic"], message["data"].get("state", ""), flush=True)

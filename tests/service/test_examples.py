@@ -101,15 +101,18 @@ def test_the_path_is_drawn_and_poses_come_over_zmq(daemon: Callable[..., Any], t
     command = [sys.executable, "-m", "spiked_service", "simulate", "-o", str(tmp_path / "room"), "--motion", "arc"]
     subprocess.run([*command, "--frames", "1280", "--width", "400", "--height", "250"], check=True, capture_output=True)
     one = daemon()
-    port = one.http.get("system").json()["zmq"]["events"].rpartition(":")[2]
+    zmq = one.http.get("system").json()["zmq"]
+    ports = [zmq[name].rpartition(":")[2] for name in ("events", "state")]
     with (
         running(sys.executable, str(EXAMPLES / "live_trajectory.py"), websocket(one), cwd=tmp_path),
-        running(sys.executable, str(EXAMPLES / "zmq_events.py"), port) as poses,
+        running(sys.executable, str(EXAMPLES / "zmq_events.py"), *ports) as poses,
     ):
         wait_for(lambda: one.http.get("system").json()["event_clients"] == 1, "the example listens")
         body = {"source": f"replay:{tmp_path / 'room' / 'simulated.dat'}", "options": {"steps": 10}}
         assert one.http.post("captures", json=body).status_code == 201
-        frame, *position = poses.get(timeout=4 * DEADLINE_S).split()
+        while (line := poses.get(timeout=4 * DEADLINE_S)).startswith("now:"):  # the state as it was found
+            pass
+        frame, *position = line.split()
         assert int(frame) >= 0 and len(position) == 3
         wait_for((tmp_path / "trajectory.png").is_file, "the picture is there")
 

@@ -486,8 +486,7 @@ class Reconstructor:
         order = np.linspace(0, len(usable) - 1, SEED_VIEWS).round().astype(int)
         self._seed([usable[i] for i in order[np.argsort(np.abs(order - order.mean()))]])
         steps, aligned = self._steps(), 0
-        tracked, information = self._odometry.spline, self._odometry.information()
-        known = None if tracked is None or information is None else Known(tracked, information)
+        known = self._known() if self._aligns() else None
         seeded = time.perf_counter()
         available_s = max(deadline - seeded, 1e-9)
         for done in range(steps):
@@ -528,6 +527,11 @@ class Reconstructor:
 
     def _aligns(self) -> bool:
         return self.options.refine_poses and self.options.poses is None and isinstance(self.path, Spline)
+
+    def _known(self) -> Known | None:
+        """The path as the tracks have it, before the map moves it."""
+        tracked, information = self._odometry.spline, self._odometry.information()
+        return None if tracked is None or information is None else Known(tracked, information)
 
     def _align(self, known: Known | None, share: float) -> None:
         spline = self.path

@@ -10,7 +10,7 @@
 #include <new>
 #include <type_traits>
 
-namespace raster {
+namespace spiked {
 
 constexpr size_t kHugePage = size_t{2} << 20;  // bytes
 
@@ -47,4 +47,4 @@ class Buffer {
     size_t capacity_ = 0;
 };
 
-}  // namespace raster
+}  // namespace spiked

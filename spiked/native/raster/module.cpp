@@ -1,35 +1,35 @@
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
-
+// The rasteriser: checks the shapes of its arguments.
 #include "bindings.hpp"
 #include "renderer.hpp"
 
-namespace nb = nanobind;
-using namespace raster;
+using namespace spiked;
 
 namespace {
 
-Lens lens_of(double fx, double fy, double cx, double cy, int width, int height, double near) {
+// The projection's Jacobian is taken at x/z and y/z clamped to this multiple of the half field of view, as in the
+// published code of 3D Gaussian splatting (Kerbl et al. 2023): beyond, its linearisation of the projection diverges.
+constexpr double kSlopeLimit = 1.3;
+
+PinholeF camera_of(double fx, double fy, double cx, double cy, int width, int height, double near) {
     expect(width > 0 && height > 0 && width <= kMaxSide && height <= kMaxSide, "image sides are 1 to 4096 pixels");
-    Lens lens;
-    lens.fx = static_cast<float>(fx), lens.fy = static_cast<float>(fy);
-    lens.cx = static_cast<float>(cx), lens.cy = static_cast<float>(cy);
-    lens.limit_x = static_cast<float>(1.3 * 0.5 * width / fx);
-    lens.limit_y = static_cast<float>(1.3 * 0.5 * height / fy);
-    lens.near = static_cast<float>(near);
-    lens.width = width, lens.height = height;
-    lens.tiles_x = (width + kTile - 1) / kTile, lens.tiles_y = (height + kTile - 1) / kTile;
-    return lens;
+    PinholeF camera;
+    camera.fx = static_cast<float>(fx), camera.fy = static_cast<float>(fy);
+    camera.cx = static_cast<float>(cx), camera.cy = static_cast<float>(cy);
+    camera.limit_x = static_cast<float>(kSlopeLimit * 0.5 * width / fx);
+    camera.limit_y = static_cast<float>(kSlopeLimit * 0.5 * height / fy);
+    camera.near = static_cast<float>(near);
+    camera.width = width, camera.height = height;
+    camera.tiles_x = (width + kTile - 1) / kTile, camera.tiles_y = (height + kTile - 1) / kTile;
+    return camera;
 }
 
-void forward(Renderer& self, Read<float, 2> means, Read<float, 2> quats, Read<float, 2> log_scales,
-             Read<float, 1> opacity_logits, Read<float, 2> colours, Read<double, 3> rotations, Read<double, 2> centres,
-             std::optional<Read<float, 3>> weights, std::optional<Read<float, 3>> windows,
-             std::optional<Read<uint8_t, 2>> channels, Read<float, 1> background, WriteAny<float> values,
-             Write<float, 2> alpha, Write<float, 2> depth) {
+void forward(Renderer& self, Array<const float, 2> means, Array<const float, 2> quats, Array<const float, 2> log_scales,
+             Array<const float, 1> opacity_logits, Array<const float, 2> colours, Array<const double, 3> rotations,
+             Array<const double, 2> centres, std::optional<Array<const float, 3>> weights,
+             std::optional<Array<const float, 3>> windows, std::optional<Array<const uint8_t, 2>> channels,
+             Array<const float, 1> background, AnyArray<float> values, Array<float, 2> alpha, Array<float, 2> depth) {
     const size_t n = means.shape(0), s = rotations.shape(0), c = colours.shape(1);
-    const size_t height = self.lens().height, width = self.lens().width;
+    const size_t height = self.camera().height, width = self.camera().width;
     expect(means.shape(1) == 3 && quats.shape(0) == n && quats.shape(1) == 4 && log_scales.shape(0) == n &&
                log_scales.shape(1) == 3 && opacity_logits.shape(0) == n && colours.shape(0) == n,
            "splat arrays disagree");
@@ -61,13 +61,13 @@ void forward(Renderer& self, Read<float, 2> means, Read<float, 2> quats, Read<fl
     self.forward(splats, views, background.data(), values.data(), alpha.data(), depth.data());
 }
 
-void backward(Renderer& self, ReadAny<float> d_values, Write<float, 2> means, Write<float, 2> quats,
-              Write<float, 2> log_scales, Write<float, 1> opacity_logits, Write<float, 2> colours,
-              Write<double, 2> rotation, Write<double, 2> centre, Write<float, 1> contribution,
-              Write<float, 1> radius_px) {
+void backward(Renderer& self, AnyArray<const float> d_values, Array<float, 2> means, Array<float, 2> quats,
+              Array<float, 2> log_scales, Array<float, 1> opacity_logits, Array<float, 2> colours,
+              Array<double, 2> rotation, Array<double, 2> centre, Array<float, 1> contribution,
+              Array<float, 1> radius_px) {
     expect(self.poses() > 0, "backward follows forward");
     const size_t n = self.splats().count, s = self.poses(), c = self.splats().colours;
-    const size_t pixels = static_cast<size_t>(self.lens().height) * self.lens().width;
+    const size_t pixels = static_cast<size_t>(self.camera().height) * self.camera().width;
     expect(d_values.size() == pixels * (self.mosaic() ? 1 : c), "d_values has the wrong size");
     expect(means.size() == 3 * n && quats.size() == 4 * n && log_scales.size() == 3 * n && opacity_logits.size() == n &&
                colours.size() == c * n && rotation.size() == 3 * s && centre.size() == 3 * s &&
@@ -82,13 +82,13 @@ void backward(Renderer& self, ReadAny<float> d_values, Write<float, 2> means, Wr
 }  // namespace
 
 NB_MODULE(_raster, m) {
-    bind_losses(m);
-    bind_charge(m);
+    bind_adam(m);
+    bind_ssim(m);
     nb::class_<Renderer>(m, "Renderer")
         .def(
             "__init__",
             [](Renderer* self, double fx, double fy, double cx, double cy, int width, int height, double near,
-               int threads) { new (self) Renderer(lens_of(fx, fy, cx, cy, width, height, near), threads); },
+               int threads) { new (self) Renderer(camera_of(fx, fy, cx, cy, width, height, near), threads); },
             nb::kw_only(), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"), nb::arg("width"),
             nb::arg("height"), nb::arg("near"), nb::arg("threads"))
         .def("forward", &forward, nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"), nb::arg("opacity_logits"),

@@ -1,5 +1,8 @@
-// Splats to screen and gradients back. Notation as in the pose gradient of the design: W world to camera, p = W (mu -
+// Splats to screen and gradients back. Notation: W world to camera, p = W (mu -
 // c), J the Jacobian of the projection, M = J W (splat spread), Sigma2D = M M^T + 0.3 I.
+
+namespace spiked {
+namespace {
 
 constexpr float kDilation = 0.3f;           // px^2, added to the projected covariance
 constexpr float kLog2Cut = 7.994353437f;    // log2(255)
@@ -27,12 +30,14 @@ static inline void write_rows(float* rows, int first, int last, const Vec in[Col
 
 // Makes a quaternion wxyz a unit one; returns the factor.
 static inline Vec normalise(Vec q[4]) {
-    Vec scale = 1.0f / root(max(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3], splat(1e-24f)));
+    Vec scale = 1.0f / sqrt(max(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3], broadcast(1e-24f)));
     for (int k = 0; k < 4; ++k) q[k] *= scale;
     return scale;
 }
 
-static inline Vec scale_of(Vec log_scale) { return exp2_fine(clamp(log_scale, splat(-30.0f), splat(30.0f)) * kLog2e); }
+static inline Vec scale_of(Vec log_scale) {
+    return exp2_fine(clamp(log_scale, broadcast(-30.0f), broadcast(30.0f)) * kLog2e);
+}
 
 static void prepare(const SplatArrays& splats, int first, int last, float* const mean[3], float* const spread[9],
                     float* log2_opacity) {
@@ -52,12 +57,12 @@ static void prepare(const SplatArrays& splats, int first, int last, float* const
             Vec s = scale_of(log_scale[k]);
             for (int row = 0; row < 3; ++row) store(spread[3 * row + k] + base, rotation[3 * row + k] * s);
         }
-        logit = clamp(logit, splat(-30.0f), splat(30.0f));
+        logit = clamp(logit, broadcast(-30.0f), broadcast(30.0f));
         store(log2_opacity + base, 0.0f - log2_fine(1.0f + exp2_fine(-kLog2e * logit)));
     }
 }
 
-struct Projection {
+struct ProjectionLanes {
     Vec offset[3];  // mu - c, world
     Vec x, y, z, over_z;
     Vec slope_x, slope_y;  // x/z and y/z, clamped
@@ -68,8 +73,8 @@ struct Projection {
     Vec p, q, r;
 };
 
-static inline Projection project_lanes(const Prepared& s, const Lens& lens, const View& view, int base) {
-    Projection o;
+static inline ProjectionLanes project_lanes(const Prepared& s, const PinholeF& camera, const View& view, int base) {
+    ProjectionLanes o;
     for (int k = 0; k < 3; ++k) o.offset[k] = (load(s.mean[k] + base) - view.centre_high[k]) - view.centre_low[k];
     const float* w = view.rotation;
     auto turn = [&](int row, Vec a, Vec b, Vec c) { return w[3 * row] * a + w[3 * row + 1] * b + w[3 * row + 2] * c; };
@@ -83,9 +88,9 @@ static inline Projection project_lanes(const Prepared& s, const Lens& lens, cons
     o.over_z = 1.0f / o.z;
     o.raw_x = o.x * o.over_z;
     o.raw_y = o.y * o.over_z;
-    o.slope_x = clamp(o.raw_x, splat(-lens.limit_x), splat(lens.limit_x));
-    o.slope_y = clamp(o.raw_y, splat(-lens.limit_y), splat(lens.limit_y));
-    Vec jx = lens.fx * o.over_z, jy = lens.fy * o.over_z;
+    o.slope_x = clamp(o.raw_x, broadcast(-camera.limit_x), broadcast(camera.limit_x));
+    o.slope_y = clamp(o.raw_y, broadcast(-camera.limit_y), broadcast(camera.limit_y));
+    Vec jx = camera.fx * o.over_z, jy = camera.fy * o.over_z;
     for (int k = 0; k < 3; ++k) {
         o.m0[k] = jx * (o.b[k] - o.slope_x * o.b[6 + k]);
         o.m1[k] = jy * (o.b[3 + k] - o.slope_y * o.b[6 + k]);
@@ -99,15 +104,15 @@ static inline Projection project_lanes(const Prepared& s, const Lens& lens, cons
     // |a x b|^2 is the determinant without the dilation, free of the cancellation in xx yy - xy^2.
     Vec c0 = a[1] * b[2] - a[2] * b[1], c1 = a[2] * b[0] - a[0] * b[2], c2 = a[0] * b[1] - a[1] * b[0];
     o.determinant = c0 * c0 + c1 * c1 + c2 * c2 + kDilation * (aa + bb) + kDilation * kDilation;
-    o.p = root(kHalfLog2e * o.yy / o.determinant);
+    o.p = sqrt(kHalfLog2e * o.yy / o.determinant);
     o.q = -kHalfLog2e * o.xy / (o.determinant * o.p);
-    o.r = root(kHalfLog2e / o.yy);
+    o.r = sqrt(kHalfLog2e / o.yy);
     return o;
 }
 
-// Writes kLanes records of splats that are seen, and their keys.
-static inline void write_records(const Vec fields[kRecordFields], Int visible, int base, int count, Record* records,
-                                 uint32_t* keys) {
+// Writes kLanes records of visible splats, and their keys.
+static inline void write_records(const Vec fields[kRecordFields], Int visible, int base, int count,
+                                 ProjectedSplat* records, uint32_t* keys) {
     alignas(64) float out[kRecordFields][kLanes];
     alignas(64) int32_t seen[kLanes];
     for (int k = 0; k < kRecordFields; ++k) store(out[k], fields[k]);
@@ -122,22 +127,22 @@ static inline void write_records(const Vec fields[kRecordFields], Int visible, i
     }
 }
 
-static void project(const Prepared& splats, const Lens& lens, const View& view, int count, int first, int last,
-                    Record* records, uint32_t* keys) {
+static void project(const Prepared& splats, const PinholeF& camera, const View& view, int count, int first, int last,
+                    ProjectedSplat* records, uint32_t* keys) {
     for (int base = first; base < last; base += kLanes) {
-        Projection o = project_lanes(splats, lens, view, base);
-        Vec u = o.raw_x * lens.fx + lens.cx, v = o.raw_y * lens.fy + lens.cy;
+        ProjectionLanes o = project_lanes(splats, camera, view, base);
+        Vec u = o.raw_x * camera.fx + camera.cx, v = o.raw_y * camera.fy + camera.cy;
         Vec log2_opacity = load(splats.log2_opacity + base);
         Vec reach = log2_opacity + kLog2Cut;  // u^2 + w^2 at the rim
-        Vec half_x = root(max(reach, splat(0.0f)) * o.xx / kHalfLog2e);
-        Vec half_y = root(max(reach, splat(0.0f)) * o.yy / kHalfLog2e);
+        Vec half_x = sqrt(max(reach, broadcast(0.0f)) * o.xx / kHalfLog2e);
+        Vec half_y = sqrt(max(reach, broadcast(0.0f)) * o.yy / kHalfLog2e);
         Vec middle = 0.5f * (o.xx + o.yy), spread = 0.5f * (o.xx - o.yy);
-        Vec largest = middle + root(spread * spread + o.xy * o.xy);
-        Vec radius = root(max(reach, splat(0.0f)) * largest / kHalfLog2e);
-        Int inside = (u + half_x >= 0.5f) & (u - half_x <= lens.width - 0.5f) & (v + half_y >= 0.5f) &
-                     (v - half_y <= lens.height - 0.5f);
+        Vec largest = middle + sqrt(spread * spread + o.xy * o.xy);
+        Vec radius = sqrt(max(reach, broadcast(0.0f)) * largest / kHalfLog2e);
+        Int inside = (u + half_x >= 0.5f) & (u - half_x <= camera.width - 0.5f) & (v + half_y >= 0.5f) &
+                     (v - half_y <= camera.height - 0.5f);
         Int sound = is_finite(u + v) & is_finite(o.determinant) & is_finite(radius) & (o.p > 0.0f) & is_finite(o.q);
-        Int visible = inside & sound & (o.z >= lens.near) & (reach >= 0.0f);
+        Int visible = inside & sound & (o.z >= camera.near) & (reach >= 0.0f);
         const Vec fields[kRecordFields] = {
             u, v, o.p, o.q, o.r, log2_opacity, o.z, radius, half_x, half_y, o.xy / o.xx * half_x, 1.0f / o.p};
         write_records(fields, visible, base, count, records, keys);
@@ -148,10 +153,10 @@ static inline void add(float* p, Vec v) { store(p, load(p) + v); }
 
 // Adds the gradients of one projection by the splat and the pose: g_u, g_v by the mean on screen, d_m0, d_m1 by M's
 // rows.
-static inline void unproject_lanes(const Prepared& splats, const Lens& lens, const View& view, const Projection& o,
-                                   Int seen, int base, int into, Vec g_u, Vec g_v, const Vec d_m0[3], const Vec d_m1[3],
-                                   const SplatGradients& out, double pose[6]) {
-    Vec jx = lens.fx * o.over_z, jy = lens.fy * o.over_z;
+static inline void unproject_lanes(const Prepared& splats, const PinholeF& camera, const View& view,
+                                   const ProjectionLanes& o, Int seen, int base, int into, Vec g_u, Vec g_v,
+                                   const Vec d_m0[3], const Vec d_m1[3], const SplatGradients& out, double pose[6]) {
+    Vec jx = camera.fx * o.over_z, jy = camera.fy * o.over_z;
     Vec d_spread[9], d_jx{}, d_jy{}, d_jxz{}, d_jyz{};
     for (int k = 0; k < 3; ++k) {
         const Vec d0 = d_m0[k], d1 = d_m1[k];
@@ -162,21 +167,21 @@ static inline void unproject_lanes(const Prepared& splats, const Lens& lens, con
         Vec b0 = jx * d0, b1 = jy * d1, b2 = -(jx * o.slope_x * d0 + jy * o.slope_y * d1);
         for (int row = 0; row < 3; ++row) {
             const float* w = view.rotation + row;
-            d_spread[3 * row + k] = choose(seen, w[0] * b0 + w[3] * b1 + w[6] * b2, Vec{});
+            d_spread[3 * row + k] = select(seen, w[0] * b0 + w[3] * b1 + w[6] * b2, Vec{});
         }
     }
     Vec over_z2 = o.over_z * o.over_z;
     // Where the slope is clamped, jxz = -fx slope / z depends on z only.
-    Vec free_x = choose(o.slope_x == o.raw_x, splat(1.0f), Vec{});
-    Vec free_y = choose(o.slope_y == o.raw_y, splat(1.0f), Vec{});
-    Vec gx = jx * g_u - free_x * lens.fx * over_z2 * d_jxz;
-    Vec gy = jy * g_v - free_y * lens.fy * over_z2 * d_jyz;
-    Vec gz = lens.fx * over_z2 * (o.slope_x * d_jxz + free_x * o.raw_x * d_jxz - d_jx - o.x * g_u) +
-             lens.fy * over_z2 * (o.slope_y * d_jyz + free_y * o.raw_y * d_jyz - d_jy - o.y * g_v);
+    Vec free_x = select(o.slope_x == o.raw_x, broadcast(1.0f), Vec{});
+    Vec free_y = select(o.slope_y == o.raw_y, broadcast(1.0f), Vec{});
+    Vec gx = jx * g_u - free_x * camera.fx * over_z2 * d_jxz;
+    Vec gy = jy * g_v - free_y * camera.fy * over_z2 * d_jyz;
+    Vec gz = camera.fx * over_z2 * (o.slope_x * d_jxz + free_x * o.raw_x * d_jxz - d_jx - o.x * g_u) +
+             camera.fy * over_z2 * (o.slope_y * d_jyz + free_y * o.raw_y * d_jyz - d_jy - o.y * g_v);
     Vec d_mean[3];
     for (int k = 0; k < 3; ++k) {
         const float* w = view.rotation + k;
-        d_mean[k] = choose(seen, w[0] * gx + w[3] * gy + w[6] * gz, Vec{});
+        d_mean[k] = select(seen, w[0] * gx + w[3] * gy + w[6] * gz, Vec{});
         add(out.mean[k] + into, d_mean[k]);
     }
     for (int k = 0; k < 9; ++k) add(out.spread[k] + into, d_spread[k]);
@@ -187,7 +192,7 @@ static inline void unproject_lanes(const Prepared& splats, const Lens& lens, con
         for (int j = 0; j < 3; ++j)
             turn -= d_spread[3 * b + j] * load(splats.spread[3 * a + j] + base) -
                     d_spread[3 * a + j] * load(splats.spread[3 * b + j] + base);
-        turn = choose(seen, turn, Vec{});
+        turn = select(seen, turn, Vec{});
         for (int i = 0; i < kLanes; ++i) {
             pose[k] += turn[i];
             pose[3 + k] += d_mean[k][i];
@@ -195,7 +200,7 @@ static inline void unproject_lanes(const Prepared& splats, const Lens& lens, con
     }
 }
 
-static void unproject(const Prepared& splats, const Lens& lens, const View& view, int first, const float* sums,
+static void unproject(const Prepared& splats, const PinholeF& camera, const View& view, int first, const float* sums,
                       const uint8_t* visible, int colours, const SplatGradients& out, double pose[6]) {
     for (int at = 0; at < kGroup; at += kLanes) {
         const int base = first + at, into = base - out.first;
@@ -206,7 +211,7 @@ static void unproject(const Prepared& splats, const Lens& lens, const View& view
         add(out.share + into, sum(kShare));
         for (int k = 0; k < colours; ++k) add(out.colour[k] + into, sum(kColour0 + k));
 
-        Projection o = project_lanes(splats, lens, view, base);
+        ProjectionLanes o = project_lanes(splats, camera, view, base);
         // Offsets times the conic are (p u, q u + r w) / kHalfLog2e, so nothing has to be inverted.
         constexpr float scale = 1.0f / kHalfLog2e;
         Vec su = sum(kVu), sw = sum(kVw), suu = sum(kVuu), suw = sum(kVuw), sww = sum(kVww);
@@ -220,7 +225,7 @@ static void unproject(const Prepared& splats, const Lens& lens, const View& view
             d_m0[k] = c_xx * o.m0[k] + c_xy * o.m1[k];
             d_m1[k] = c_xy * o.m0[k] + c_yy * o.m1[k];
         }
-        unproject_lanes(splats, lens, view, o, seen, base, into, g_u, g_v, d_m0, d_m1, out, pose);
+        unproject_lanes(splats, camera, view, o, seen, base, into, g_u, g_v, d_m0, d_m1, out, pose);
     }
 }
 
@@ -233,15 +238,15 @@ static void finish(const SplatArrays& splats, const Prepared& prepared, const Sp
         read_rows<1>(splats.opacity_logits, base, last, &logit);
         read_rows<4>(splats.quats, base, last, quat);
         read_rows<3>(splats.log_scales, base, last, log_scale);
-        // What was never seen may not even be finite.
+        // A splat that was never visible may have values that are not finite.
         const Int seen = radius > 0.0f;
         auto write = [&](float* rows, Vec v) {
-            v = choose(seen, v, Vec{});
+            v = select(seen, v, Vec{});
             write_rows<1>(rows, base, last, &v);
         };
         write(out.contribution, load(sums.share + from) * share_scale);
-        write(out.opacity_logits,
-              load(sums.log_opacity + from) / (1.0f + exp2_fine(clamp(logit, splat(-30.0f), splat(30.0f)) * kLog2e)));
+        write(out.opacity_logits, load(sums.log_opacity + from) /
+                                      (1.0f + exp2_fine(clamp(logit, broadcast(-30.0f), broadcast(30.0f)) * kLog2e)));
 
         Vec mean[3], colour[3], d[9], d_log_scale[3];  // d: of the rotation, row-major
         for (int k = 0; k < 3; ++k) mean[k] = load(sums.mean[k] + from);
@@ -256,7 +261,7 @@ static void finish(const SplatArrays& splats, const Prepared& prepared, const Sp
                 along += g * load(prepared.spread[3 * i + j] + base);
                 d[3 * i + j] = g * scale;
             }
-            d_log_scale[j] = choose(seen, along, Vec{});
+            d_log_scale[j] = select(seen, along, Vec{});
         }
         write_rows<3>(out.log_scales, base, last, d_log_scale);
 
@@ -267,7 +272,10 @@ static void finish(const SplatArrays& splats, const Prepared& prepared, const Sp
                     2.0f * (w * (d[2] - d[6]) + x * (d[1] + d[3]) + z * (d[5] + d[7]) - 2.0f * y * (d[0] + d[8])),
                     2.0f * (w * (d[3] - d[1]) + x * (d[2] + d[6]) + y * (d[5] + d[7]) - 2.0f * z * (d[0] + d[4]))};
         const Vec radial = w * g[0] + x * g[1] + y * g[2] + z * g[3];
-        for (int k = 0; k < 4; ++k) g[k] = choose(seen, (g[k] - quat[k] * radial) * over, Vec{});
+        for (int k = 0; k < 4; ++k) g[k] = select(seen, (g[k] - quat[k] * radial) * over, Vec{});
         write_rows<4>(out.quats, base, last, g);
     }
 }
+
+}  // namespace
+}  // namespace spiked

@@ -5,7 +5,7 @@
 #include <cstring>
 #include <utility>
 
-namespace raster {
+namespace spiked {
 
 namespace {
 
@@ -27,8 +27,8 @@ View view_of(const double* rotation, const double* centre) {
 
 }  // namespace
 
-Renderer::Renderer(const Lens& lens, int threads)
-    : kernels_(choose_kernels()), lens_(lens), pool_(threads), emissions_(threads), scratch_(threads) {}
+Renderer::Renderer(const PinholeF& camera, int threads)
+    : kernels_(choose_kernels()), camera_(camera), pool_(threads), pair_runs_(threads), scratch_(threads) {}
 
 void Renderer::forward(const SplatArrays& splats, const Views& views, const float background[3], float* values,
                        float* alpha, float* depth) {
@@ -37,7 +37,7 @@ void Renderer::forward(const SplatArrays& splats, const Views& views, const floa
     sub_poses_ = moving() ? views.count - 1 : views.count;
     if (static_cast<int>(views_.size()) < views.count) views_.resize(views.count);
     for (int i = 0; i < views.count; ++i) views_[i].view = view_of(views.rotations + 9 * i, views.centres + 3 * i);
-    if (moving()) set_passages();
+    if (moving()) set_sub_frames();
     prepare();
     std::fill_n(radius_.grow(splats.count), splats.count, 0.0f);
     for (int i = 0; i < sub_poses_; ++i) {
@@ -45,30 +45,31 @@ void Renderer::forward(const SplatArrays& splats, const Views& views, const floa
         project(sub);
         sort(sub);
         bin(sub);
-        const size_t tiles = static_cast<size_t>(lens_.tiles_x) * lens_.tiles_y;
+        const size_t tiles = static_cast<size_t>(camera_.tiles_x) * camera_.tiles_y;
         sub.colour.grow(tiles * splats.colours * kTilePixels);
         sub.ends.grow(tiles * kBlocks * kMaxParts);
     }
-    pool_.run(lens_.tiles_x * lens_.tiles_y, [&](int tile, int thread) {
+    pool_.run(camera_.tiles_x * camera_.tiles_y, [&](int tile, int thread) {
         TileImage* image = scratch_[thread].image.grow(1);
         std::memset(static_cast<void*>(image), 0, sizeof *image);
         for (int i = 0; i < sub_poses_; ++i)
             kernels_.forward(tile_of(views_[i], tile, thread), splats.colours, background, planes_of(i),
                              state_of(views_[i], tile), image);
-        kernels_.store(tile_of(views_[0], tile, thread), image, splats.colours, planes_of(0), values, alpha, depth);
+        kernels_.store_tile(tile_of(views_[0], tile, thread), image, splats.colours, planes_of(0), values, alpha,
+                            depth);
     });
 }
 
-void Renderer::set_passages() {
+void Renderer::set_sub_frames() {
     pool_.run(sub_poses_, [&](int i, int) {
         double weight, square;
-        Passage& passage = views_[i].passage;
-        kernels_.cover(planes_of(i), static_cast<int64_t>(lens_.width) * lens_.height, &weight, &square,
-                       &passage.time_reach);
-        passage.begin = views_[i].view;
-        passage.end = views_[i + 1].view;
+        SubFrame& sub_frame = views_[i].sub_frame;
+        kernels_.cover(planes_of(i), static_cast<int64_t>(camera_.width) * camera_.height, &weight, &square,
+                       &sub_frame.time_reach);
+        sub_frame.begin = views_[i].view;
+        sub_frame.end = views_[i + 1].view;
         // The variance of an even motion is a twelfth of its square.
-        passage.blur = weight > 0 ? static_cast<float>(square / weight / 12) : 0.0f;
+        sub_frame.blur = weight > 0 ? static_cast<float>(square / weight / 12) : 0.0f;
     });
 }
 
@@ -91,10 +92,10 @@ void Renderer::project(SubPose& sub) {
     pool_.run(chunks_of(stride_), [&](int chunk, int) {
         const int first = chunk * kChunk, last = std::min(stride_, first + kChunk);
         if (moving()) {
-            kernels_.project_moving(prepared_, lens_, sub.passage, splats_.count, first, last, raw_.data(),
+            kernels_.project_moving(prepared_, camera_, sub.sub_frame, splats_.count, first, last, raw_.data(),
                                     raw_motions_.data(), keys_.data());
         } else {
-            kernels_.project(prepared_, lens_, sub.view, splats_.count, first, last, raw_.data(), keys_.data());
+            kernels_.project(prepared_, camera_, sub.view, splats_.count, first, last, raw_.data(), keys_.data());
         }
         for (int n = first; n < std::min(last, splats_.count); ++n)
             if (keys_[n] != kCulled) radius_[n] = std::max(radius_[n], raw_[n].radius);
@@ -128,7 +129,7 @@ void Renderer::sort(SubPose& sub) {
         for (int rank = chunk * kChunk; rank < last; ++rank) {
             if (rank + kAhead < last) __builtin_prefetch(&raw_[from[rank + kAhead].splat]);
             const uint32_t splat = from[rank].splat;
-            Record& record = sub.records[rank] = raw_[splat];
+            ProjectedSplat& record = sub.records[rank] = raw_[splat];
             for (int k = 0; k < splats_.colours; ++k) record.colour[k] = splats_.colour[splats_.colours * splat + k];
             record.splat = splat;
             if (moving()) sub.motions[rank] = raw_motions_[splat];
@@ -136,26 +137,26 @@ void Renderer::sort(SubPose& sub) {
     });
 }
 
-// Lists the splats of every tile in order of depth: pairs are emitted splat by splat, then sorted by tile by counting.
+// Lists the splats of every tile in order of depth: pairs are written splat by splat, then sorted by tile by counting.
 void Renderer::bin(SubPose& sub) {
-    const int tiles = lens_.tiles_x * lens_.tiles_y, runs = pool_.threads();
-    const size_t rows = static_cast<size_t>(lens_.tiles_y) * 4 + kGroup;
+    const int tiles = camera_.tiles_x * camera_.tiles_y, runs = pool_.threads();
+    const size_t rows = static_cast<size_t>(camera_.tiles_y) * 4 + kGroup;
     uint32_t* counts = sub.first_pair.grow(splats_.count + 1);
     std::fill_n(counts, splats_.count, 0u);
     auto first_rank = [&](int run) { return static_cast<int>(static_cast<int64_t>(sub.visible) * run / runs); };
     pool_.run(runs, [&](int run, int) {
-        Emission& emission = emissions_[run];
-        int32_t* columns = emission.columns.grow(2 * kEmitBatch * rows);
-        uint32_t* tile_counts = emission.tile_counts.grow(tiles);
+        PairRun& run_pairs = pair_runs_[run];
+        int32_t* columns = run_pairs.columns.grow(2 * kSplatBatch * rows);
+        uint32_t* tile_counts = run_pairs.tile_counts.grow(tiles);
         std::fill_n(tile_counts, tiles, 0u);
-        emission.size = 0;
+        run_pairs.size = 0;
         int rank = first_rank(run);
         for (const int last = first_rank(run + 1); rank < last;) {
-            const size_t room = emission.size + kEmitBatch * (static_cast<size_t>(tiles) + 4);
-            if (emission.pairs.size() < room) emission.pairs.resize(2 * room);
-            const Pairs out{emission.pairs.data(), static_cast<uint32_t>(emission.pairs.size()), &emission.size, counts,
-                            tile_counts};
-            rank = kernels_.emit(sub.records.data(), rank, last, lens_, columns, out);
+            const size_t room = run_pairs.size + kSplatBatch * (static_cast<size_t>(tiles) + 4);
+            if (run_pairs.pairs.size() < room) run_pairs.pairs.resize(2 * room);
+            const TilePairList out{run_pairs.pairs.data(), static_cast<uint32_t>(run_pairs.pairs.size()),
+                                   &run_pairs.size, counts, tile_counts};
+            rank = kernels_.intersect_tiles(sub.records.data(), rank, last, camera_, columns, out);
         }
     });
 
@@ -167,23 +168,23 @@ void Renderer::bin(SubPose& sub) {
     sum = 0;
     for (int tile = 0; tile < tiles; ++tile) {
         tile_start[tile] = sum;
-        for (int run = 0; run < runs; ++run) sum += std::exchange(emissions_[run].tile_counts[tile], sum);
+        for (int run = 0; run < runs; ++run) sum += std::exchange(pair_runs_[run].tile_counts[tile], sum);
     }
     tile_start[tiles] = sum;
 
-    Entry* entries = sub.entries.grow(sum);
+    TileEntry* entries = sub.entries.grow(sum);
     uint32_t* places = sub.places.grow(static_cast<size_t>(sum) + kAhead);
     std::fill_n(places + sum, kAhead, 0u);
     pool_.run(runs, [&](int run, int) {
-        Emission& emission = emissions_[run];
+        PairRun& run_pairs = pair_runs_[run];
         uint32_t slot = 0, rank = kCulled;
-        for (uint32_t i = 0; i < emission.size; ++i, ++slot) {
-            const Pair pair = emission.pairs[i];
+        for (uint32_t i = 0; i < run_pairs.size; ++i, ++slot) {
+            const TilePair pair = run_pairs.pairs[i];
             if (pair.rank != rank) {
                 rank = pair.rank;
                 slot = sub.first_pair[sub.records[rank].splat];
             }
-            const uint32_t place = emission.tile_counts[pair.tile_blocks >> 16]++;
+            const uint32_t place = run_pairs.tile_counts[pair.tile_blocks >> 16]++;
             entries[place] = {rank, pair.tile_blocks & 0xffffu};
             places[slot] = place;
         }
@@ -193,13 +194,13 @@ void Renderer::bin(SubPose& sub) {
 Tile Renderer::tile_of(const SubPose& sub, int tile, int thread) {
     const uint32_t start = sub.tile_start[tile];
     const int count = static_cast<int>(sub.tile_start[tile + 1] - start);
-    return {&lens_,
+    return {&camera_,
             sub.records.data(),
             moving() ? sub.motions.data() : nullptr,
             sub.entries.data() + start,
             count,
-            tile % lens_.tiles_x,
-            tile / lens_.tiles_x,
+            tile % camera_.tiles_x,
+            tile / camera_.tiles_x,
             scratch_[thread].local.grow(static_cast<size_t>(count) * 16),
             scratch_[thread].listed.grow(static_cast<size_t>(count) + kGroup),
             scratch_[thread].blocks.grow(static_cast<size_t>(count) + kGroup)};
@@ -211,7 +212,7 @@ TileState Renderer::state_of(const SubPose& sub, int tile) const {
 }
 
 Planes Renderer::planes_of(int sub_pose) const {
-    const size_t plane = static_cast<size_t>(lens_.width) * lens_.height;
+    const size_t plane = static_cast<size_t>(camera_.width) * camera_.height;
     return {planes_.weights ? planes_.weights + sub_pose * plane : nullptr,
             1.0f / static_cast<float>(sub_poses_),
             planes_.channels,
@@ -222,7 +223,7 @@ Planes Renderer::planes_of(int sub_pose) const {
 
 void Renderer::backward(const float* d_values, const GradientArrays& out) {
     for (int i = 0; i < sub_poses_; ++i) views_[i].slots.grow(static_cast<size_t>(views_[i].pairs) * slot_floats());
-    pool_.run(lens_.tiles_x * lens_.tiles_y, [&](int tile, int thread) {
+    pool_.run(camera_.tiles_x * camera_.tiles_y, [&](int tile, int thread) {
         for (int i = 0; i < sub_poses_; ++i)
             kernels_.backward(tile_of(views_[i], tile, thread), splats_.colours, d_values, planes_of(i),
                               state_of(views_[i], tile),
@@ -251,10 +252,10 @@ void Renderer::backward(const float* d_values, const GradientArrays& out) {
                 gather(views_[i], at, group, visible);
                 if (std::none_of(visible, visible + kGroup, [](uint8_t v) { return v != 0; })) continue;
                 if (moving()) {
-                    kernels_.unproject_moving(prepared_, lens_, views_[i].passage, at, group, visible, splats_.colours,
-                                              sums, pose, pose + 6);
+                    kernels_.unproject_moving(prepared_, camera_, views_[i].sub_frame, at, group, visible,
+                                              splats_.colours, sums, pose, pose + 6);
                 } else {
-                    kernels_.unproject(prepared_, lens_, views_[i].view, at, group, visible, splats_.colours, sums,
+                    kernels_.unproject(prepared_, camera_, views_[i].view, at, group, visible, splats_.colours, sums,
                                        pose);
                 }
             }
@@ -301,4 +302,4 @@ int64_t Renderer::block_evaluations() const {
     return sum;
 }
 
-}  // namespace raster
+}  // namespace spiked

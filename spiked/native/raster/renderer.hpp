@@ -1,32 +1,32 @@
-// Renders splats from a few sub-poses, or from a camera on its way past a few poses, into one weighted image, and the
-// gradients of that image.
+// Renders splats from a few sub-poses, or from a camera that moves through a few poses, into one weighted image, and
+// the gradients of that image.
 #pragma once
 #include <vector>
 
+#include "../common/pool.hpp"
 #include "buffer.hpp"
 #include "kernels.hpp"
-#include "pool.hpp"
 
-namespace raster {
+namespace spiked {
 
-// Everything of one sub-pose, or of one sub-frame on a camera's way, that the backward pass needs again.
+// State of one sub-pose, or of one sub-frame of a moving camera, that the backward pass reuses.
 struct SubPose {
     View view;
-    Passage passage;
+    SubFrame sub_frame;
     int visible = 0;
     uint32_t pairs = 0;
-    Buffer<Record> records;       // [visible], by depth
-    Buffer<Motion> motions;       // [visible], by depth; while the camera moves
-    Buffer<uint32_t> first_pair;  // [splats + 1]
-    Buffer<uint32_t> places;      // [pairs] by splat: which of the entries it is
-    Buffer<uint32_t> tile_start;  // [tiles + 1]
-    Buffer<Entry> entries;        // [pairs], by tile, then depth
-    Buffer<float> colour;         // [tiles][colours][kTilePixels]
-    Buffer<int32_t> ends;         // [tiles][kBlocks * kMaxParts]
-    Buffer<float> slots;          // [pairs][slot_floats], by tile
+    Buffer<ProjectedSplat> records;  // [visible], by depth
+    Buffer<Motion> motions;          // [visible], by depth; while the camera moves
+    Buffer<uint32_t> first_pair;     // [splats + 1]
+    Buffer<uint32_t> places;         // [pairs] by splat: which of the entries it is
+    Buffer<uint32_t> tile_start;     // [tiles + 1]
+    Buffer<TileEntry> entries;       // [pairs], by tile, then depth
+    Buffer<float> colour;            // [tiles][colours][kTilePixels]
+    Buffer<int32_t> ends;            // [tiles][kBlocks * kMaxParts]
+    Buffer<float> slots;             // [pairs][slot_floats], by tile
 };
 
-// What to see the splats from, and when.
+// Poses and exposure windows to render from.
 struct Views {
     const double *rotations, *centres;  // [count][9] camera to world, [count][3]
     int count;
@@ -39,7 +39,7 @@ struct Views {
 
 class Renderer {
   public:
-    Renderer(const Lens& lens, int threads);
+    Renderer(const PinholeF& camera, int threads);
 
     // The splats and the planes of the views must stay as they are until backward() is done.
     void forward(const SplatArrays&, const Views&, const float background[3], float* values, float* alpha,
@@ -48,16 +48,16 @@ class Renderer {
 
     const char* instructions() const { return kernels_.name; }
     int threads() const { return pool_.threads(); }
-    const Lens& lens() const { return lens_; }
+    const PinholeF& camera() const { return camera_; }
     const SplatArrays& splats() const { return splats_; }
     int poses() const { return planes_.count; }
     bool mosaic() const { return planes_.channels != nullptr; }
-    // Blocks of 16 pixels times splats that the last forward() had to look at, at most.
+    // Upper bound of the blocks of 16 pixels times splats that the last forward() evaluated.
     int64_t block_evaluations() const;
 
   private:
     void prepare();
-    void set_passages();
+    void set_sub_frames();
     void project(SubPose&);
     void sort(SubPose&);
     void bin(SubPose&);
@@ -66,20 +66,20 @@ class Renderer {
     Planes planes_of(int sub_pose) const;
     void gather(const SubPose&, int first, float* sums, uint8_t* visible) const;
     bool moving() const { return planes_.start != nullptr; }
-    int slot_floats() const { return raster::slot_floats(splats_.colours, moving()); }
+    int slot_floats() const { return spiked::slot_floats(splats_.colours, moving()); }
 
-    const Kernels& kernels_;
-    Lens lens_;
+    const RasterKernels& kernels_;
+    PinholeF camera_;
     Pool pool_;
     SplatArrays splats_{};
-    Views planes_{};     // of which only the planes outlive forward()
+    Views planes_{};     // only its planes are used after forward()
     int sub_poses_ = 0;  // or sub-frames
     std::vector<SubPose> views_;
 
     int stride_ = 0;
     Buffer<float> prepared_store_;
     Prepared prepared_{};
-    Buffer<Record> raw_;
+    Buffer<ProjectedSplat> raw_;
     Buffer<Motion> raw_motions_;
     Buffer<float> radius_;  // [splats], largest over the sub-poses
     Buffer<uint32_t> keys_;
@@ -87,13 +87,13 @@ class Renderer {
         uint32_t key, splat;
     };
     Buffer<Item> items_, spare_;
-    struct Emission {  // of one run of ranks
+    struct PairRun {  // of one run of ranks
         Buffer<int32_t> columns;
         Buffer<uint32_t> tile_counts;  // then where in `entries` the run's next pair of a tile goes
-        std::vector<Pair> pairs;
+        std::vector<TilePair> pairs;
         uint32_t size;
     };
-    std::vector<Emission> emissions_;
+    std::vector<PairRun> pair_runs_;
     struct Scratch {
         Buffer<float> local;
         Buffer<uint32_t> listed;
@@ -105,4 +105,4 @@ class Renderer {
     Buffer<double> poses_;  // [chunks][poses][6]
 };
 
-}  // namespace raster
+}  // namespace spiked

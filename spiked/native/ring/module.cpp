@@ -1,4 +1,4 @@
-// Python's hold on the shared part of a ring; spiked/ring documents and wraps it.
+// Python bindings of the shared part of a ring; spiked/ring documents and wraps them.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
@@ -14,7 +14,7 @@
 namespace nb = nanobind;
 using namespace nb::literals;
 
-namespace spiked::ring {
+namespace spiked {
 namespace {
 
 using Memory = nb::ndarray<uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
@@ -59,14 +59,13 @@ class Control {
         return shared_->log[position % log_places_].read(position);
     }
 
-    // Tells readers that slots below `total` - slots in the ring are about to change; to be called before changing
-    // them.
+    // Announces that slots below `total` - slots in the ring are about to change. Call it before changing them.
     void reserve(uint64_t total) {
         shared_->reserved.store(total, std::memory_order_relaxed);
         std::atomic_thread_fence(std::memory_order_release);
     }
 
-    // How many slots were ever reserved; to be called after reading a slot, to know whether it was still whole.
+    // Number of slots reserved so far. Call it after reading a slot, to check that it was not overwritten meanwhile.
     uint64_t reserved() const {
         std::atomic_thread_fence(std::memory_order_acquire);
         return shared_->reserved.load(std::memory_order_relaxed);
@@ -140,12 +139,12 @@ NB_MODULE(_ring, m) {
         .def("writer", [](const Control& self) { return self.shared().writer.read(); })
         .def("publish_condition",
              [](Control& self, int64_t state, const std::string& reason) {
-                 self.shared().condition.publish({state, to_chars<sizeof(Condition::reason)>(reason)});
+                 self.shared().device_status.publish({state, to_chars<sizeof(DeviceStatus::reason)>(reason)});
              })
         .def("condition",
              [](const Control& self) {
-                 const Condition condition = self.shared().condition.read();
-                 return nb::make_tuple(condition.state, to_bytes(condition.reason));
+                 const DeviceStatus status = self.shared().device_status.read();
+                 return nb::make_tuple(status.state, to_bytes(status.reason));
              })
         .def("reserve", &Control::reserve, "total"_a)
         .def("reserved", &Control::reserved)
@@ -160,4 +159,4 @@ NB_MODULE(_ring, m) {
         .def("place", &Control::place, "index"_a, nb::rv_policy::reference_internal);
 }
 
-}  // namespace spiked::ring
+}  // namespace spiked

@@ -1,6 +1,6 @@
-// The part of the ring that several processes read and write at once, as lock-free atomics over shared memory.
+// The part of the ring that several processes access at once: lock-free atomics in shared memory.
 //
-// Nothing here is ever held: a process killed between any two instructions leaves every other one able to go on.
+// There are no locks: a process that is killed between any two instructions blocks no other process.
 #pragma once
 
 #include <linux/futex.h>
@@ -17,16 +17,16 @@
 #include <optional>
 #include <type_traits>
 
-namespace spiked::ring {
+namespace spiked {
 
 static_assert(std::atomic<uint64_t>::is_always_lock_free && std::atomic<uint32_t>::is_always_lock_free,
               "atomics that hide a lock cannot be shared between processes");
 
-// The latest value of a T with one writing process and any number of reading ones.
-// The new value goes into the copy that nobody reads, then the version turns to it: the value is never torn, even when
-// its owner is killed half-way, and a reader only repeats when the owner has published twice meanwhile.
+// The latest value of a T, with one writing process and any number of readers.
+// The new value is written to the copy that is not current, then the version selects it. The value is never torn, even
+// if the writer is killed half-way. A reader repeats only if the writer has published twice meanwhile.
 template <class T>
-class Record {
+class DoubleBuffer {
     static_assert(std::is_trivially_copyable_v<T> && sizeof(T) % 8 == 0);
     static constexpr size_t words = sizeof(T) / 8;
     using Words = std::array<uint64_t, words>;
@@ -39,7 +39,7 @@ class Record {
         const uint64_t next = version_.load(std::memory_order_relaxed) + 1;
         Words source;
         std::memcpy(source.data(), &value, sizeof(T));
-        // Keeps the stores below behind the previous version: a reader that sees one of them sees that version too.
+        // Orders the stores below after the previous version: a reader that sees one of them sees that version, too.
         std::atomic_thread_fence(std::memory_order_release);
         for (size_t i = 0; i < words; ++i) copies_[next & 1][i].store(source[i], std::memory_order_relaxed);
         version_.store(next, std::memory_order_release);
@@ -60,7 +60,7 @@ class Record {
     }
 };
 
-// What one position of the log says: frames in a slot, or a loss.
+// One position of the log: frames in a slot, or a loss.
 struct Entry {
     int64_t first = 0;
     int64_t count = 0;
@@ -68,7 +68,7 @@ struct Entry {
     int64_t slot = 0;   // absolute number of the slot with the frames; of a loss, the number of the next one
 };
 
-// A position of the log, guarded by a sequence lock whose number is that of the entry it holds.
+// A position of the log with a sequence lock. The sequence number is 2 * position + 2 while the entry is valid.
 class LogPlace {
     std::atomic<uint64_t> sequence_;
     std::atomic<int64_t> first_, count_, cause_, slot_;
@@ -98,8 +98,8 @@ class LogPlace {
     }
 };
 
-// Wakes processes by a futex on a shared word. The kernel forgets a waiter that dies, and a ring that comes between
-// looking and sleeping changes the word, so it is never missed.
+// Wakes processes by a futex on a shared word. The kernel removes a waiter that dies. A ring() between reading the
+// value and sleeping changes the word, so it is never missed.
 class Bell {
     std::atomic<uint32_t> word_;
 
@@ -142,7 +142,7 @@ struct ReaderCounters {
     int64_t lagging = 0;
 };
 
-struct Condition {
+struct DeviceStatus {
     int64_t state = 0;
     std::array<char, 192> reason{};  // UTF-8, padded with zeros
 };
@@ -153,26 +153,26 @@ struct ReaderLabel {
     std::array<char, 48> name{};  // UTF-8, padded with zeros
 };
 
-// Where one reader says how far it is. `owner` is claimed by compare-and-swap from free or from a dead process; the
-// label is true once `described_by` is the owner.
+// Progress of one reader. `owner` is claimed by compare-and-swap from free or from a dead process. The label is valid
+// once `described_by` equals the owner.
 struct ReaderPlace {
     alignas(64) std::atomic<uint64_t> owner;
     std::atomic<uint64_t> described_by;
-    Record<ReaderLabel> label;
-    Record<ReaderCounters> counters;
+    DoubleBuffer<ReaderLabel> label;
+    DoubleBuffer<ReaderCounters> counters;
 };
 
 constexpr size_t reader_places = 16;
 
-// All zero is the state before the first frame, so a fresh file needs no further set-up.
+// All zero is the state before the first frame, so a new file needs no initialisation.
 struct Shared {
-    alignas(64) Record<WriterCounters> writer;
-    Record<Condition> condition;
+    alignas(64) DoubleBuffer<WriterCounters> writer;
+    DoubleBuffer<DeviceStatus> device_status;
     alignas(64) std::atomic<uint64_t> reserved;
     alignas(64) Bell committed;
     alignas(64) Bell progress;
     ReaderPlace readers[reader_places];
-    alignas(64) LogPlace log[1];  // in truth as many as the file has room for
+    alignas(64) LogPlace log[1];  // as many as the file has room for
 };
 
-}  // namespace spiked::ring
+}  // namespace spiked

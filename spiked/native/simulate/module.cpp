@@ -1,4 +1,4 @@
-// Python bindings of the simulator: shapes are checked here, the work is done without the interpreter's lock.
+// Python bindings of the simulator: check shapes, then work without the interpreter's lock.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/vector.h>
@@ -11,7 +11,7 @@
 #include "sensor.hpp"
 
 namespace nb = nanobind;
-using namespace spiked::simulate;
+using namespace spiked;
 
 namespace {
 

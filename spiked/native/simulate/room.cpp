@@ -7,9 +7,9 @@
 #include <limits>
 #include <thread>
 
-#include "../clones.hpp"
+#include "../common/clones.hpp"
 
-namespace spiked::simulate {
+namespace spiked {
 namespace {
 
 constexpr int kTile = 16;
@@ -28,7 +28,7 @@ Vec to_local(const float* axes, const float* p) {
     return out;
 }
 
-// A box as the camera sees it: in the box's own frame the ray of pixel (x, y) is origin + t (corner + x dx + y dy),
+// A box relative to the camera: in the box's own frame the ray of pixel (x, y) is origin + t (corner + x dx + y dy),
 // where t is the z depth in the camera.
 struct View {
     Vec origin, corner, dx, dy;
@@ -86,24 +86,24 @@ View view_of(const Box& box, const Pinhole& camera) {
     return view;
 }
 
-// Where rays cross the slabs of a box: they are inside between `enter` and `leave`, through faces that count from 0
+// Intersection of a ray with a box: inside between depths `enter` and `leave`, through faces that count from 0
 // to 5.
-struct Crossing {
+struct BoxIntersection {
     float enter, leave, enter_face, leave_face;
 };
 
-inline Crossing cross(const float* half, const View& view, float x, float y) {
+inline BoxIntersection intersect_box(const float* half, const View& view, float x, float y) {
     float in[3], out[3], backwards[3];
     for (int a = 0; a < 3; ++a) {
         float d = view.corner.v[a] + x * view.dx.v[a] + y * view.dy.v[a];
         backwards[a] = d < 0.0f ? 1.0f : 0.0f;
-        // A ray in the plane of a slab must give a large number: an infinity would turn into NaN below.
+        // A ray in the plane of a slab must give a large number: infinity would become NaN below.
         d += 1e-20f;
         const float t0 = (-half[a] - view.origin.v[a]) / d, t1 = (half[a] - view.origin.v[a]) / d;
         in[a] = t0 < t1 ? t0 : t1;
         out[a] = t0 < t1 ? t1 : t0;
     }
-    // Arithmetic instead of choices: GCC 12 turns choices into branches, which cannot be vectorised.
+    // Arithmetic instead of conditions: GCC 12 compiles conditions to branches, which cannot be vectorised.
     const float in1 = in[1] > in[0] ? 1.0f : 0.0f, in01 = in[1] > in[0] ? in[1] : in[0];
     const float in2 = in[2] > in01 ? 1.0f : 0.0f, enter = in[2] > in01 ? in[2] : in01;
     const float out1 = out[1] < out[0] ? 1.0f : 0.0f, out01 = out[1] < out[0] ? out[1] : out[0];
@@ -116,7 +116,7 @@ inline Crossing cross(const float* half, const View& view, float x, float y) {
 
 SPIKED_CLONES void cast_shell(const float* half, const View& view, int count, Rays& rays) {
     for (int i = 0; i < count; ++i) {
-        const Crossing c = cross(half, view, rays.x[i], rays.y[i]);
+        const BoxIntersection c = intersect_box(half, view, rays.x[i], rays.y[i]);
         const float hit = c.leave > kNear ? 1.0f : 0.0f;
         rays.depth[i] = hit * c.leave + (1.0f - hit) * kFar;
         rays.surface[i] = -1.0f + hit * (c.leave_face + 1.0f);
@@ -126,7 +126,7 @@ SPIKED_CLONES void cast_shell(const float* half, const View& view, int count, Ra
 SPIKED_CLONES void cast_box(const float* half, const View& view, int first_surface, int count, Rays& rays) {
     const float first = static_cast<float>(first_surface);
     for (int i = 0; i < count; ++i) {
-        const Crossing c = cross(half, view, rays.x[i], rays.y[i]);
+        const BoxIntersection c = intersect_box(half, view, rays.x[i], rays.y[i]);
         const float hit = (c.enter < c.leave ? 1.0f : 0.0f) * (c.enter < rays.depth[i] ? 1.0f : 0.0f) *
                           (c.enter > kNear ? 1.0f : 0.0f);
         rays.depth[i] = hit * c.enter + (1.0f - hit) * rays.depth[i];
@@ -237,7 +237,7 @@ struct Painter {
         }
         const int x0 = tile_x * kTile, y0 = tile_y * kTile;
         const int columns = std::min(kTile, camera.width - x0), rows = std::min(kTile, camera.height - y0);
-        // With a border of one pixel, so that edges between tiles are seen from both sides.
+        // With a border of one pixel, so that edges between tiles are found from both sides.
         Rays lines[kTile + 2];
         for (int y = -1; y <= rows; ++y) {
             Rays& line = lines[y + 1];
@@ -314,4 +314,4 @@ void Room::render(const Pinhole& camera, float* image, float* depth, int threads
     for (std::thread& helper : helpers) helper.join();
 }
 
-}  // namespace spiked::simulate
+}  // namespace spiked

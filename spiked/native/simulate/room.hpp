@@ -2,7 +2,7 @@
 #include <cstdint>
 #include <vector>
 
-namespace spiked::simulate {
+namespace spiked {
 
 struct Pinhole {
     int width, height;
@@ -11,7 +11,7 @@ struct Pinhole {
     float centre[3];
 };
 
-// An oriented box; box 0 of a room is its shell and is seen from inside.
+// An oriented box; box 0 of a room is its shell, visible from inside.
 struct Box {
     float centre[3];
     float axes[9];  // rows are the box's own axes in world coordinates
@@ -36,4 +36,4 @@ struct Room {
     void render(const Pinhole& camera, float* image, float* depth, int threads) const;
 };
 
-}  // namespace spiked::simulate
+}  // namespace spiked

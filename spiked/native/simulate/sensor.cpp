@@ -4,9 +4,9 @@
 #include <cmath>
 #include <vector>
 
-#include "../clones.hpp"
+#include "../common/clones.hpp"
 
-namespace spiked::simulate {
+namespace spiked {
 namespace {
 
 // A counter-based generator: the draw depends only on (seed, frame, pixel), so threads and batches cannot change it.
@@ -62,7 +62,7 @@ SPIKED_CLONES void expose_row(const Row& row, int width, float weight, float glo
         const float excess = std::max(-left, 0.0f);
         const float lost = static_cast<float>(static_cast<int>(excess / threshold[x])) * threshold[x];
         const float next = threshold[x] * (1.0f + jitter * normal(mix(bits ^ key2))) - (excess - lost);
-        // Arithmetic instead of a choice: GCC 12 turns the choice into a branch, which cannot be vectorised.
+        // Arithmetic instead of a condition: GCC 12 compiles the condition to a branch, which cannot be vectorised.
         const int32_t spike = left <= 0.0f;
         missing[x] = left + static_cast<float>(spike) * (next - left);
         fired[x] = spike;
@@ -102,4 +102,4 @@ void expose_rows(const Exposure& exposure, const PixelMaps& maps, const FrameFor
     }
 }
 
-}  // namespace spiked::simulate
+}  // namespace spiked

@@ -1,7 +1,7 @@
 #pragma once
 #include <cstdint>
 
-namespace spiked::simulate {
+namespace spiked {
 
 // The fixed part of a pixel, upright row-major, one float a pixel; charges in nominal thresholds (= expected spikes).
 struct PixelMaps {
@@ -29,4 +29,4 @@ struct Exposure {
 void expose_rows(const Exposure& exposure, const PixelMaps& maps, const FrameFormat& format, float jitter,
                  uint64_t seed, float* missing, uint8_t* out, int row_begin, int row_end);
 
-}  // namespace spiked::simulate
+}  // namespace spiked

@@ -1,4 +1,4 @@
-// Python's hold on the wire parsers; spiked_driver.framing and spiked_driver.pcie document and wrap them.
+// Python bindings of the wire parsers; spiked_driver.framing and spiked_driver.pcie document and wrap them.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 
@@ -8,13 +8,13 @@
 namespace nb = nanobind;
 using namespace nb::literals;
 
-namespace spiked::wire {
+namespace spiked {
 namespace {
 
 using Bytes = nb::ndarray<const uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Frames = nb::ndarray<uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
-// A parser that keeps the chunk alive which it reads in place.
+// A parser and the chunk that it reads in place.
 template <class Parser>
 struct Holder {
     Parser parser;
@@ -76,4 +76,4 @@ NB_MODULE(_wire, m) {
     bind<PcieParser>(m, "PcieParser");
 }
 
-}  // namespace spiked::wire
+}  // namespace spiked

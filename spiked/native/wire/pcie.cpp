@@ -1,6 +1,6 @@
 #include "pcie.hpp"
 
-namespace spiked::wire {
+namespace spiked {
 namespace {
 
 constexpr uint16_t first_tag = 500, last_tag = 500 | 3 << 10;
@@ -27,7 +27,7 @@ PcieParser::Tags read_tags(const uint8_t* frame) {
     return tags;
 }
 
-// Every line of every channel once, from line 500 of channel 0 to line 500 of channel 3.
+// Whether the tags are every line of every channel once, from line 500 of channel 0 to line 500 of channel 3.
 bool is_order(const PcieParser::Tags& tags) {
     std::array<bool, 4096> seen{};
     for (const uint16_t value : tags) {
@@ -38,7 +38,7 @@ bool is_order(const PcieParser::Tags& tags) {
     return tags.front() == first_tag && tags.back() == last_tag;
 }
 
-// Copies a frame and says whether all its tags are as they must be.
+// Copies a frame. Returns whether all its tags are those of the order.
 bool copy_frame(const uint8_t* frame, const PcieParser::Tags& order, uint8_t* out) {
     unsigned wrong = 0;
     for (size_t row = 0; row < PcieParser::rows; ++row) {
@@ -61,7 +61,7 @@ void PcieParser::feed(const uint8_t* chunk, size_t bytes) {
 Event PcieParser::next(uint8_t* out, size_t capacity) {
     Event frames{Kind::frames, next_index_, 0};
     while (static_cast<size_t>(frames.count) < capacity) {
-        const Step step = look(out + static_cast<size_t>(frames.count) * compact_bytes);
+        const Step step = parse(out + static_cast<size_t>(frames.count) * compact_bytes);
         if (step == Step::frame) {
             stream_.advance(frame_bytes);
             ++next_index_;
@@ -83,7 +83,7 @@ Event PcieParser::next(uint8_t* out, size_t capacity) {
     return frames.count ? frames : Event{};
 }
 
-PcieParser::Step PcieParser::look(uint8_t* out) {
+PcieParser::Step PcieParser::parse(uint8_t* out) {
     const uint8_t* p = stream_.data();
     const size_t available = stream_.available();
     if (available < half_bytes) {
@@ -93,17 +93,17 @@ PcieParser::Step PcieParser::look(uint8_t* out) {
         }
         return Step::starve;
     }
-    if (tag(p) != first_tag) return damaged(p, available);
+    if (tag(p) != first_tag) return skip_damage(p, available);
     if (available < frame_bytes || (!learned_ && !finished_ && available < 2 * frame_bytes))
-        return finished_ ? damaged(p, available) : Step::starve;
-    if (!learned_ && !learn(p, available)) return damaged(p, available);
-    if (!copy_frame(p, order_, out)) return damaged(p, available);
+        return finished_ ? skip_damage(p, available) : Step::starve;
+    if (!learned_ && !learn_order(p, available)) return skip_damage(p, available);
+    if (!copy_frame(p, order_, out)) return skip_damage(p, available);
     return contiguous_ || counters_.received == 0 ? Step::frame : Step::gap;
 }
 
-// In which order lines and channels come is not published: two whole frames that agree show it, at the end of a stream
-// one by itself.
-bool PcieParser::learn(const uint8_t* p, size_t available) {
+// The order of lines and channels is not published. It is taken from two whole frames that agree, or from one at the
+// end of a stream.
+bool PcieParser::learn_order(const uint8_t* p, size_t available) {
     const Tags order = read_tags(p);
     if (!is_order(order)) return false;
     if (available >= 2 * frame_bytes && read_tags(p + frame_bytes) != order) return false;
@@ -113,16 +113,16 @@ bool PcieParser::learn(const uint8_t* p, size_t available) {
     return true;
 }
 
-// Moves on to the next place where a frame may begin: line 500 of channel 0, behind line 500 of channel 3. Damage may
-// be of any length, so any byte is looked at.
-PcieParser::Step PcieParser::damaged(const uint8_t* p, size_t available) {
+// Skips to the next possible start of a frame: line 500 of channel 0 after line 500 of channel 3. Damage may have any
+// length, so every byte is searched.
+PcieParser::Step PcieParser::skip_damage(const uint8_t* p, size_t available) {
     if (learned_ && contiguous_) {
         ++counters_.resyncs;
         contiguous_ = false;
     }
     if (available < 2 * half_bytes && !finished_) return Step::starve;
     constexpr uint8_t last_high = last_tag >> 4;
-    // What remains may be the beginning of the two half-lines looked for.
+    // The remaining bytes may be the start of these two half-lines.
     size_t skip = finished_ ? available : available - 2 * half_bytes + 1;
     const uint8_t* end = p + available - half_bytes;
     for (const uint8_t* at = p; at + half_bytes <= end; ++at) {
@@ -140,9 +140,9 @@ PcieParser::Step PcieParser::damaged(const uint8_t* p, size_t available) {
     return Step::skip;
 }
 
-// There is no frame counter on this wire: at least one frame was damaged, and as many more as there are bytes skipped.
+// The stream has no frame counter: one frame for each 128,000 skipped bytes, rounded, and at least one.
 int64_t PcieParser::lost_frames() const {
     return std::max<int64_t>(1, static_cast<int64_t>((skipped_since_frame_ + frame_bytes / 2) / frame_bytes));
 }
 
-}  // namespace spiked::wire
+}  // namespace spiked

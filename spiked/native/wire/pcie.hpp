@@ -6,7 +6,7 @@
 
 #include "stream.hpp"
 
-namespace spiked::wire {
+namespace spiked {
 
 class PcieParser {
   public:
@@ -17,11 +17,11 @@ class PcieParser {
 
     void feed(const uint8_t* chunk, size_t bytes);
     void keep() { stream_.keep(); }
-    // No more bytes come: the frame held back for want of its successor is delivered by the next call of next.
+    // No more bytes follow: a frame that awaits its successor is delivered by the next call of next.
     void finish() { finished_ = true; }
     // Bytes were lost before the next chunk.
     void mark_loss() { contiguous_ = false; }
-    // Fills `out`, of `capacity` compact frames, as far as it goes before a gap or the end of the bytes.
+    // Fills `out`, of `capacity` compact frames, up to a gap or the end of the bytes.
     Event next(uint8_t* out, size_t capacity);
     const Counters& counters() const { return counters_; }
     int64_t next_index() const { return next_index_; }
@@ -29,9 +29,9 @@ class PcieParser {
   private:
     enum class Step { frame, gap, skip, starve };
 
-    Step look(uint8_t* out);
-    bool learn(const uint8_t* p, size_t available);
-    Step damaged(const uint8_t* p, size_t available);
+    Step parse(uint8_t* out);
+    bool learn_order(const uint8_t* p, size_t available);
+    Step skip_damage(const uint8_t* p, size_t available);
     int64_t lost_frames() const;
 
     Stream stream_{2 * frame_bytes};
@@ -44,4 +44,4 @@ class PcieParser {
     bool finished_ = false;
 };
 
-}  // namespace spiked::wire
+}  // namespace spiked

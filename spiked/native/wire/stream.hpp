@@ -1,4 +1,4 @@
-// A byte stream that arrives in chunks of any size and is looked at in contiguous pieces, copying only at the seams.
+// A byte stream that arrives in chunks of any size and is read in contiguous pieces. Only the seams are copied.
 #pragma once
 
 #include <algorithm>
@@ -8,7 +8,7 @@
 #include <stdexcept>
 #include <vector>
 
-namespace spiked::wire {
+namespace spiked {
 
 inline uint16_t load16(const uint8_t* p) {
     uint16_t value;
@@ -28,7 +28,7 @@ inline uint64_t load64(const uint8_t* p) {
 inline void store64(uint8_t* p, uint64_t value) { std::memcpy(p, &value, sizeof value); }
 
 class Stream {
-    size_t window_;              // nobody looks further ahead than this
+    size_t window_;              // largest number of bytes that are read ahead
     std::vector<uint8_t> seam_;  // the unread tail of earlier chunks, and the beginning of this one while it is needed
     size_t seam_tail_ = 0;       // how much of the seam is from earlier chunks
     size_t cursor_ = 0;          // in the seam while it is not empty, else in the chunk
@@ -40,7 +40,7 @@ class Stream {
   public:
     explicit Stream(size_t window) : window_(window) { seam_.reserve(2 * window); }
 
-    // The chunk must stay until the next call of feed or keep.
+    // The chunk must stay valid until the next call of feed or keep.
     void feed(const uint8_t* chunk, size_t bytes) {
         keep();
         chunk_ = chunk;
@@ -49,7 +49,7 @@ class Stream {
         seam_.insert(seam_.end(), chunk, chunk + (in_seam() ? std::min(bytes, window_) : 0));
     }
 
-    // Copies what is left of the chunk, which may go away then.
+    // Copies the unread rest of the chunk, which may then be freed.
     void keep() {
         if (in_seam()) {
             const size_t seen = seam_.size() - seam_tail_;
@@ -81,7 +81,7 @@ class Stream {
 
 enum class Kind { none, frames, device_gap, host_gap };
 
-// What a parser found next: `count` frames from index `first` on, delivered or lost.
+// `count` frames from index `first` on, delivered or lost.
 struct Event {
     Kind kind = Kind::none;
     int64_t first = 0;
@@ -91,11 +91,11 @@ struct Event {
 struct Counters {
     uint64_t bytes = 0;       // fed
     uint64_t received = 0;    // frames delivered
-    uint64_t lost = 0;        // frames told of in gaps
-    uint64_t duplicates = 0;  // frames that came again or late, and were dropped
+    uint64_t lost = 0;        // frames reported in gaps
+    uint64_t duplicates = 0;  // frames that came again or late and were dropped
     uint64_t skipped = 0;     // bytes that belong to no delivered or duplicated frame
-    uint64_t resyncs = 0;     // times that the frames no longer followed one another
-    uint64_t restarts = 0;    // times that the camera's counters began anew
+    uint64_t resyncs = 0;     // times that synchronisation was lost
+    uint64_t restarts = 0;    // times that the camera's counters started anew
 };
 
-}  // namespace spiked::wire
+}  // namespace spiked

@@ -2,7 +2,7 @@
 
 #include <cstdlib>
 
-namespace spiked::wire {
+namespace spiked {
 namespace {
 
 constexpr size_t stride = UsbParser::row_bytes + 2;
@@ -10,7 +10,7 @@ constexpr size_t stride = UsbParser::row_bytes + 2;
 bool has_magic(const uint8_t* p) { return load32(p) == UsbParser::magic; }
 uint32_t session_offset(const uint8_t* header) { return load32(header + 8) - 50 * load32(header + 12); }
 
-// Whether the whole rows among `bytes` bytes behind the header have the numbers 0, 1, 2, ...
+// Whether the complete rows among `bytes` bytes from the header on have the numbers 0, 1, 2, ...
 bool rows_run(const uint8_t* header, size_t bytes) {
     const uint8_t* tag = header + UsbParser::header_bytes + UsbParser::row_bytes;
     const size_t whole = std::min(UsbParser::rows, (bytes - UsbParser::header_bytes) / stride);
@@ -26,7 +26,7 @@ void copy_rows(const uint8_t* header, uint8_t* out) {
 }
 
 // Frames from counter `from` to `to`. Lines are counted modulo 2^32, which is no multiple of 250: only one direction
-// gives whole frames, so a step back cannot be taken for a long way forward.
+// gives whole frames, so a step back is never mistaken for a long step forward.
 std::optional<int64_t> frames_between(uint32_t from, uint32_t to) {
     const uint32_t ahead = to - from, back = from - to;
     if (ahead % UsbParser::rows == 0) return ahead / UsbParser::rows;
@@ -60,7 +60,7 @@ Event UsbParser::next(uint8_t* out, size_t capacity) {
     Event frames{Kind::frames, next_index_, 0};
     while (static_cast<size_t>(frames.count) < capacity) {
         Event gap;
-        const Step step = look(gap);
+        const Step step = parse(gap);
         if (step == Step::frame) {
             copy_rows(stream_.data(), out + static_cast<size_t>(frames.count) * compact_bytes);
             stream_.advance(frame_bytes);
@@ -72,17 +72,17 @@ Event UsbParser::next(uint8_t* out, size_t capacity) {
             contiguous_ = true;
         } else if (step == Step::gap || step == Step::starve) {
             if (step == Step::starve && finished_ && frames.count == 0 && seen_index_ >= next_index_)
-                return lose(seen_index_ + 1 - next_index_, Kind::host_gap);
-            // A gap is found again by the next call, after the frames before it.
-            if (frames.count == 0) return step == Step::gap ? lose(gap.count, gap.kind) : Event{};
+                return report_gap(seen_index_ + 1 - next_index_, Kind::host_gap);
+            // The next call finds the gap again, after the frames before it.
+            if (frames.count == 0) return step == Step::gap ? report_gap(gap.count, gap.kind) : Event{};
             return frames;
         }
     }
     return frames.count ? frames : Event{};
 }
 
-// Looks at what lies ahead without delivering it; skips what is nothing.
-UsbParser::Step UsbParser::look(Event& gap) {
+// Classifies the next bytes without delivering them; skips bytes of no frame.
+UsbParser::Step UsbParser::parse(Event& gap) {
     const uint8_t* p = stream_.data();
     const size_t available = stream_.available();
     if (available < header_bytes) {
@@ -92,34 +92,34 @@ UsbParser::Step UsbParser::look(Event& gap) {
         }
         return Step::starve;
     }
-    if (!has_magic(p)) return damaged(p, available);
+    if (!has_magic(p)) return skip_damage(p, available);
     const std::optional<int64_t> ahead = lock_ ? frames_ahead(p) : std::nullopt;
-    if (!ahead) return look_for_lock(p, available);
+    if (!ahead) return synchronise(p, available);
     const bool sound = rows_run(p, available);
     if (*ahead >= 0) {
         seen_index_ = std::max(seen_index_, next_index_ + *ahead);
-        // The header alone tells of what the camera did not send; damage blurs whose loss it was.
+        // The header alone shows what the camera did not send. Behind damage the loss is the host's.
         if (*ahead > 0 && (contiguous_ || (sound && available >= frame_bytes))) {
             gap = Event{contiguous_ ? Kind::device_gap : Kind::host_gap, next_index_, *ahead};
             return Step::gap;
         }
     }
-    if (!sound || (finished_ && available < frame_bytes)) return damaged(p, available);
+    if (!sound || (finished_ && available < frame_bytes)) return skip_damage(p, available);
     if (available < frame_bytes) return Step::starve;
-    if (*ahead < 0) return late(*ahead);
+    if (*ahead < 0) return drop_late(*ahead);
     late_run_ = 0;
     return Step::frame;
 }
 
-UsbParser::Step UsbParser::late(int64_t ahead) {
+UsbParser::Step UsbParser::drop_late(int64_t ahead) {
     late_run_ = late_run_ && ahead == late_ahead_ + 1 ? late_run_ + 1 : 1;
     late_ahead_ = ahead;
-    if (late_run_ > anew_frames) {
+    if (late_run_ > restart_frames) {
         ++counters_.restarts;
-        counters_.duplicates -= anew_frames;
-        counters_.skipped += anew_frames * frame_bytes;
+        counters_.duplicates -= restart_frames;
+        counters_.skipped += restart_frames * frame_bytes;
         lock_->expected += static_cast<uint32_t>(ahead) * static_cast<uint32_t>(rows);
-        go_on_after(anew_frames);
+        continue_after(restart_frames);
         contiguous_ = true;
         return Step::skip;
     }
@@ -128,13 +128,13 @@ UsbParser::Step UsbParser::late(int64_t ahead) {
     return Step::skip;
 }
 
-// A first frame counts when its rows are right and the next header follows and agrees: a header by itself may be junk.
-UsbParser::Step UsbParser::look_for_lock(const uint8_t* p, size_t available) {
-    if (!rows_run(p, available)) return damaged(p, available);
+// A first frame is accepted if its rows are right and the next header follows and agrees: a lone header may be junk.
+UsbParser::Step UsbParser::synchronise(const uint8_t* p, size_t available) {
+    if (!rows_run(p, available)) return skip_damage(p, available);
     const bool whole = available >= frame_bytes;
     if (available < frame_bytes + header_bytes) {
         if (!finished_) return Step::starve;
-        if (!whole || lock_ || broken_) return damaged(p, available);
+        if (!whole || lock_ || broken_) return skip_damage(p, available);
         lock_on(p);
         return Step::frame;
     }
@@ -142,44 +142,44 @@ UsbParser::Step UsbParser::look_for_lock(const uint8_t* p, size_t available) {
     const auto step = frames_between(load32(p + 12), load32(following + 12));
     const bool confirmed = has_magic(following) && load32(p + 4) == load32(following + 4) &&
                            session_offset(p) == session_offset(following) && step && *step > 0;
-    if (!confirmed) return damaged(p, available);
+    if (!confirmed) return skip_damage(p, available);
     const bool again = lock_.has_value();
     lock_on(p);
     if (broken_) {
-        come_back(*broken_);
+        resume_count(*broken_);
         return Step::skip;
     }
     if (!again) return Step::frame;
-    // The camera began anew without being told to. How long it was away is not to be seen; it was away.
+    // The camera restarted by itself. Its counters do not show for how long; at least one frame is lost.
     ++counters_.restarts;
-    go_on_after(1);
+    continue_after(1);
     contiguous_ = true;
     return Step::skip;
 }
 
-void UsbParser::come_back(const Break& broken) {
+void UsbParser::resume_count(const Break& broken) {
     const bool same = broken.former.word1 == lock_->word1 && broken.former.offset == lock_->offset;
     const auto ahead = same ? frames_between(broken.former.expected, lock_->expected) : std::nullopt;
     if (ahead && *ahead >= 0 && std::abs(*ahead - broken.lost) <= broken.tolerance) {
         lock_->expected = broken.former.expected;
     } else {
         ++counters_.restarts;
-        go_on_after(std::max<int64_t>(1, broken.lost));
+        continue_after(std::max<int64_t>(1, broken.lost));
     }
     contiguous_ = broken.kind == Kind::device_gap;
     broken_.reset();
 }
 
-// The frame that the lock now expects comes after so many lost ones, and after all whose header was seen.
-void UsbParser::go_on_after(int64_t lost) {
+// The next frame of the lock follows `lost` lost ones, and all frames whose header was seen.
+void UsbParser::continue_after(int64_t lost) {
     lost = std::max(lost, seen_index_ + 1 - next_index_);
     lock_->expected -= static_cast<uint32_t>(lost) * static_cast<uint32_t>(rows);
     late_run_ = 0;
 }
 
-// Moves on to the next place where a header may begin. Damage may be of any length, so every byte is such a place; the
-// 4-byte steps in which the camera sends are among them.
-UsbParser::Step UsbParser::damaged(const uint8_t* p, size_t available) {
+// Skips to the next possible start of a header. Damage may have any length, so a header may start at any byte, not only
+// at the multiples of 4 at which the camera sends.
+UsbParser::Step UsbParser::skip_damage(const uint8_t* p, size_t available) {
     static constexpr uint8_t pattern[4] = {0x00, 0x63, 0x60, 0x63};
     if (contiguous_ && lock_) ++counters_.resyncs;
     if (lock_) contiguous_ = false;
@@ -199,7 +199,7 @@ void UsbParser::lock_on(const uint8_t* header) {
     lock_ = Lock{load32(header + 4), session_offset(header), load32(header + 12)};
 }
 
-Event UsbParser::lose(int64_t count, Kind kind) {
+Event UsbParser::report_gap(int64_t count, Kind kind) {
     const Event gap{kind, next_index_, count};
     next_index_ += count;
     counters_.lost += static_cast<uint64_t>(count);
@@ -207,4 +207,4 @@ Event UsbParser::lose(int64_t count, Kind kind) {
     return gap;
 }
 
-}  // namespace spiked::wire
+}  // namespace spiked

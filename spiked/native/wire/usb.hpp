@@ -5,7 +5,7 @@
 
 #include "stream.hpp"
 
-namespace spiked::wire {
+namespace spiked {
 
 class UsbParser {
   public:
@@ -16,50 +16,50 @@ class UsbParser {
 
     void feed(const uint8_t* chunk, size_t bytes);
     void keep() { stream_.keep(); }
-    // No more bytes come: what is held back for want of its successor is delivered or lost by the next calls of next.
+    // No more bytes follow: a frame that awaits the next header is delivered or lost by the next calls of next.
     void finish() { finished_ = true; }
     // Bytes were lost before the next chunk.
     void mark_loss();
-    // The stream broke off, and what comes next may come from a camera that counts anew: unread bytes are dropped.
-    // `lost` frames are missing by the host's clock; the camera's own count is taken instead if it runs on and differs
-    // by at most `tolerance`. Called again before a frame came, the later call counts.
+    // The stream was interrupted and the camera may count anew: unread bytes are dropped. `lost` frames are missing by
+    // the host's clock; the camera's count is used instead if it continues and differs by at most `tolerance`. If
+    // called again before the next frame, the later call is used.
     void resume(int64_t lost, int64_t tolerance, Kind kind);
-    // Fills `out`, of `capacity` compact frames, as far as it goes before a gap or the end of the bytes.
+    // Fills `out`, of `capacity` compact frames, up to a gap or the end of the bytes.
     Event next(uint8_t* out, size_t capacity);
     const Counters& counters() const { return counters_; }
     int64_t next_index() const { return next_index_; }
 
   private:
-    // What the headers of one session share, and where it stands.
+    // Constants of the headers of one session, and its position.
     struct Lock {
         uint32_t word1;
         uint32_t offset;    // w2 - 50 w3: both count the same lines, and modulo 2^32 this never changes
         uint32_t expected;  // w3 of the frame next_index_
     };
-    // A break in the stream whose length the next two headers tell.
+    // A break in the stream. The next two headers show its length.
     struct Break {
         Lock former;
         int64_t lost, tolerance;
         Kind kind;
     };
     enum class Step { frame, gap, skip, starve };
-    // So many frames in a row that are all late are no repetition: the camera counts anew, from a number below.
-    static constexpr int64_t anew_frames = 1000;
+    // More late frames in a row are no repetition: the camera counts anew, from a lower number. 50 ms at 20 kHz.
+    static constexpr int64_t restart_frames = 1000;
 
-    Step look(Event& gap);
-    Step look_for_lock(const uint8_t* p, size_t available);
-    Step damaged(const uint8_t* p, size_t available);
-    Step late(int64_t ahead);
-    void come_back(const Break& broken);
-    void go_on_after(int64_t lost);
+    Step parse(Event& gap);
+    Step synchronise(const uint8_t* p, size_t available);
+    Step skip_damage(const uint8_t* p, size_t available);
+    Step drop_late(int64_t ahead);
+    void resume_count(const Break& broken);
+    void continue_after(int64_t lost);
     std::optional<int64_t> frames_ahead(const uint8_t* header) const;
     void lock_on(const uint8_t* header);
-    Event lose(int64_t count, Kind kind);
+    Event report_gap(int64_t count, Kind kind);
 
     Stream stream_{frame_bytes + header_bytes};
     std::optional<Lock> lock_;
     std::optional<Break> broken_;
-    int64_t late_run_ = 0, late_ahead_ = 0;  // frames in a row that were late, and how far ahead (below 0) the last was
+    int64_t late_run_ = 0, late_ahead_ = 0;  // late frames in a row, and the last one's distance ahead (below 0)
     Counters counters_;
     int64_t next_index_ = 0;
     int64_t seen_index_ = -1;  // the last frame whose header was seen
@@ -67,4 +67,4 @@ class UsbParser {
     bool finished_ = false;
 };
 
-}  // namespace spiked::wire
+}  // namespace spiked

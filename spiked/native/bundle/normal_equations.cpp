@@ -1,0 +1,306 @@
+// Normal equations of poses and points with Cauchy weights; the points are eliminated (Schur complement).
+// (B. Triggs et al., "Bundle adjustment - a modern synthesis", 1999.)
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <stdexcept>
+#include <vector>
+
+#include "../common/arrays.hpp"
+#include "../common/clones.hpp"
+#include "../geometry/camera.hpp"
+#include "bindings.hpp"
+
+namespace spiked {
+namespace {
+
+using In2 = Array<const double, 2>;
+using In3 = Array<const double, 3>;
+using Index = Array<const int64_t, 1>;
+using Index2 = Array<const int64_t, 2>;
+
+constexpr double kMaxSquare = 1e6;  // limit of a squared error, in units of the scale
+constexpr double kProductLimit =
+    1e290;                          // one logarithm is taken of a product of many factors; above this it could overflow
+constexpr double kDiagonal = 1e-9;  // added to the diagonal of a point's Hessian
+
+// Observations of points by cameras. The constructor checks all indices.
+struct Observations {
+    Observations(const In3& rotations, const In2& centres, const In2& points, const Index& camera, const Index& point,
+                 const In2& pixels)
+        : rotations(rotations.data()),
+          centres(centres.data()),
+          points(points.data()),
+          pixels(pixels.data()),
+          camera(camera.data()),
+          point(point.data()),
+          cameras(static_cast<int64_t>(centres.shape(0))),
+          point_count(static_cast<int64_t>(points.shape(0))),
+          count(static_cast<int64_t>(camera.shape(0))) {
+        if (rotations.shape(0) != centres.shape(0) || rotations.shape(1) != 3 || rotations.shape(2) != 3 ||
+            centres.shape(1) != 3 || points.shape(1) != 3 || pixels.shape(1) != 2) {
+            throw std::invalid_argument("expected rotations [C, 3, 3], centres [C, 3], points [P, 3], pixels [M, 2]");
+        }
+        if (point.shape(0) != camera.shape(0) || pixels.shape(0) != camera.shape(0)) {
+            throw std::invalid_argument("camera, point and pixels must have one entry for each observation");
+        }
+        for (int64_t m = 0; m < count; ++m) {
+            if (this->camera[m] < 0 || this->camera[m] >= cameras || this->point[m] < 0 ||
+                this->point[m] >= point_count) {
+                throw std::invalid_argument("an observation names a camera or point that does not exist");
+            }
+        }
+    }
+
+    Projection project(const Pinhole& k, int64_t m) const {
+        return spiked::project(k, {rotations + 9 * camera[m], centres + 3 * camera[m]}, points + 3 * point[m],
+                               pixels + 2 * m);
+    }
+
+    // Observation numbers by point: those of p are order[first[p]] to order[first[p + 1] - 1].
+    void by_point(std::vector<int64_t>& first, std::vector<int64_t>& order) const {
+        first.assign(point_count + 1, 0);
+        order.resize(count);
+        for (int64_t m = 0; m < count; ++m) ++first[point[m] + 1];
+        for (int64_t p = 0; p < point_count; ++p) first[p + 1] += first[p];
+        std::vector<int64_t> next(first.begin(), first.end() - 1);
+        for (int64_t m = 0; m < count; ++m) order[next[point[m]]++] = m;
+    }
+
+    const double *rotations, *centres, *points, *pixels;
+    const int64_t *camera, *point;
+    int64_t cameras, point_count, count;
+};
+
+double cauchy_square(const Projection& projection, double scale) {
+    if (!projection.in_front) return 2 * kMaxSquare;
+    const double u = projection.error[0] / scale, v = projection.error[1] / scale;
+    return std::min(u * u, kMaxSquare) + std::min(v * v, kMaxSquare);
+}
+
+void residuals(const In3& rotations, const In2& centres, const In2& points, const Index& camera, const Index& point,
+               const In2& pixels, double fx, double fy, double cx, double cy, const Array<double, 2>& out) {
+    const Observations observations(rotations, centres, points, camera, point, pixels);
+    if (out.shape(0) != camera.shape(0) || out.shape(1) != 2) throw std::invalid_argument("out must be [M, 2]");
+    for (int64_t m = 0; m < observations.count; ++m) {
+        const Projection projection = observations.project({fx, fy, cx, cy}, m);
+        for (int i = 0; i < 2; ++i) {
+            out.data()[2 * m + i] = projection.in_front ? projection.error[i] : std::numeric_limits<double>::infinity();
+        }
+    }
+}
+
+double cost(const In3& rotations, const In2& centres, const In2& points, const Index& camera, const Index& point,
+            const In2& pixels, double fx, double fy, double cx, double cy, double scale) {
+    const Observations observations(rotations, centres, points, camera, point, pixels);
+    double sum = 0, product = 1;
+    for (int64_t m = 0; m < observations.count; ++m) {
+        product *= 1 + cauchy_square(observations.project({fx, fy, cx, cy}, m), scale);
+        if (product < kProductLimit) continue;
+        sum += std::log(product);
+        product = 1;
+    }
+    return (sum + std::log(product)) / static_cast<double>(observations.count);
+}
+
+// The inverse of the lower Cholesky factor of a symmetric 3x3 matrix, row-major; its upper part is zero.
+void inverse_cholesky(const double* v, double* out) {
+    const double a = std::sqrt(v[0]), b = v[3] / a, c = v[6] / a;
+    const double d = std::sqrt(std::max(v[4] - b * b, kDiagonal)), e = (v[7] - b * c) / d;
+    const double f = std::sqrt(std::max(v[8] - c * c - e * e, kDiagonal));
+    out[0] = 1 / a;
+    out[1] = out[2] = out[5] = 0;
+    out[3] = -b / (a * d);
+    out[4] = 1 / d;
+    out[6] = (b * e - c * d) / (a * d * f);
+    out[7] = -e / (d * f);
+    out[8] = 1 / f;
+}
+
+// Six parameters of a pose, padded to a whole vector.
+constexpr int kPoseStride = 8;
+
+struct System {
+    double scale, damping;
+    int64_t size, unknown, each;  // D, D without the focal length, slots of a pose
+    const int64_t* slots;
+    const double* shares;
+    double *hessian, *gradient, *eliminated, *pull, *roots;
+    bool focal;
+};
+
+// Sums over the observations of each pose, in rows of kPoseStride.
+struct PoseSums {
+    explicit PoseSums(int64_t cameras)
+        : hessian(6 * kPoseStride * cameras), gradient(kPoseStride * cameras), focal(kPoseStride * cameras) {}
+
+    std::vector<double> hessian, gradient, focal;
+};
+
+// Sums over all observations of a point.
+struct PointSums {
+    double hessian[9] = {}, gradient[3] = {}, focal[3] = {};
+};
+
+// Adds one row (u or v) of an observation; `cross` [3][kPoseStride] is its block of point and pose.
+inline void add_row(const Projection& projection, int row, double weight, double* own, double* own_gradient,
+                    double* cross, PointSums& sums) {
+    const double* b = projection.by_point[row];
+    double a[kPoseStride] = {};
+    by_pose(b, projection.ray, a);
+    const double error = weight * projection.error[row];
+    for (int i = 0; i < 3; ++i) {
+        const double wb = weight * b[i];
+        for (int j = 0; j < 3; ++j) sums.hessian[3 * i + j] += wb * b[j];
+        sums.gradient[i] += b[i] * error;
+        for (int j = 0; j < kPoseStride; ++j) cross[kPoseStride * i + j] += wb * a[j];
+    }
+    for (int i = 0; i < 6; ++i) {
+        const double wa = weight * a[i];
+        for (int j = 0; j < kPoseStride; ++j) own[kPoseStride * i + j] += wa * a[j];
+    }
+    for (int j = 0; j < kPoseStride; ++j) own_gradient[j] += a[j] * error;
+}
+
+// Eliminates a point: writes its root, its pull and its rows of `eliminated`.
+inline void eliminate(const System& system, int64_t p, PointSums& sums, const std::vector<int64_t>& used,
+                      double* cross) {
+    for (int i = 0; i < 3; ++i) sums.hessian[4 * i] = sums.hessian[4 * i] * (1 + system.damping) + kDiagonal;
+    double* root = system.roots + 9 * p;
+    inverse_cholesky(sums.hessian, root);
+    for (int a = 0; a < 3; ++a) {
+        const double *r = root + 3 * a, *g = sums.gradient, *f = sums.focal;
+        double* to = system.eliminated + (3 * p + a) * system.size;
+        system.pull[3 * p + a] = r[0] * g[0] + r[1] * g[1] + r[2] * g[2];
+        if (system.focal) to[system.unknown] = r[0] * f[0] + r[1] * f[1] + r[2] * f[2];
+        for (const int64_t slot : used) {
+            const double* from = cross + 3 * kPoseStride * slot;
+            for (int i = 0; i < 6; ++i) {
+                to[6 * slot + i] = r[0] * from[i] + r[1] * from[kPoseStride + i] + r[2] * from[2 * kPoseStride + i];
+            }
+        }
+    }
+    for (const int64_t slot : used) std::fill_n(cross + 3 * kPoseStride * slot, 3 * kPoseStride, 0.0);
+}
+
+SPIKED_CLONES void add_landmarks(const Observations& observations, const Pinhole& k, const System& system,
+                                 PoseSums& poses) {
+    std::vector<double> cross(3 * kPoseStride * (system.unknown / 6 + 1));
+    std::vector<char> touched(system.unknown / 6 + 1);
+    std::vector<int64_t> used, first, order;
+    observations.by_point(first, order);
+    for (int64_t p = 0; p < observations.point_count; ++p) {
+        PointSums sums;
+        used.clear();
+        for (int64_t n = first[p]; n < first[p + 1]; ++n) {
+            const int64_t m = order[n], c = observations.camera[m];
+            const Projection projection = observations.project(k, m);
+            if (!projection.in_front) continue;
+            const double weight = 1 / (1 + cauchy_square(projection, system.scale));
+            double block[3 * kPoseStride] = {};
+            for (int row = 0; row < 2; ++row) {
+                add_row(projection, row, weight, poses.hessian.data() + 6 * kPoseStride * c,
+                        poses.gradient.data() + kPoseStride * c, block, sums);
+                if (!system.focal) continue;
+                const double f = projection.error[row] + observations.pixels[2 * m + row] - (row ? k.cy : k.cx);
+                double a[6];
+                by_pose(projection.by_point[row], projection.ray, a);
+                system.hessian[system.size * system.size - 1] += weight * f * f;
+                system.gradient[system.unknown] += weight * f * projection.error[row];
+                for (int i = 0; i < 3; ++i) sums.focal[i] += weight * f * projection.by_point[row][i];
+                for (int i = 0; i < 6; ++i) poses.focal[kPoseStride * c + i] += weight * f * a[i];
+            }
+            for (int64_t s = c * system.each; s < (c + 1) * system.each; ++s) {
+                const int64_t slot = system.slots[s];
+                const double share = system.shares[s];
+                if (slot < 0 || share == 0) continue;
+                if (!touched[slot]) used.push_back(slot);
+                touched[slot] = 1;
+                double* into = cross.data() + 3 * kPoseStride * slot;
+                for (int i = 0; i < 3 * kPoseStride; ++i) into[i] += share * block[i];
+            }
+        }
+        for (const int64_t slot : used) touched[slot] = 0;
+        eliminate(system, p, sums, used, cross.data());
+    }
+}
+
+// Adds the poses' sums to the slots that they are made of.
+void scatter_to_slots(const System& system, int64_t cameras, const PoseSums& poses) {
+    for (int64_t c = 0; c < cameras; ++c) {
+        for (int64_t s = c * system.each; s < (c + 1) * system.each; ++s) {
+            const int64_t slot = system.slots[s];
+            const double share = system.shares[s];
+            if (slot < 0 || share == 0) continue;
+            for (int i = 0; i < 6; ++i) {
+                double* row = system.hessian + (6 * slot + i) * system.size;
+                system.gradient[6 * slot + i] += share * poses.gradient[kPoseStride * c + i];
+                for (int64_t t = c * system.each; t < (c + 1) * system.each; ++t) {
+                    const int64_t other = system.slots[t];
+                    if (other < 0 || system.shares[t] == 0) continue;
+                    const double* own = poses.hessian.data() + (6 * c + i) * kPoseStride;
+                    for (int j = 0; j < 6; ++j) row[6 * other + j] += share * system.shares[t] * own[j];
+                }
+                if (!system.focal) continue;
+                row[system.unknown] += share * poses.focal[kPoseStride * c + i];
+                system.hessian[system.unknown * system.size + 6 * slot + i] += share * poses.focal[kPoseStride * c + i];
+            }
+        }
+    }
+}
+
+void linearise(const In3& rotations, const In2& centres, const In2& points, const Index& camera, const Index& point,
+               const In2& pixels, double fx, double fy, double cx, double cy, double scale, double damping,
+               const Index2& slots, const In2& shares, bool focal, const Array<double, 2>& hessian,
+               const Array<double, 1>& gradient, const Array<double, 2>& eliminated, const Array<double, 2>& pull,
+               const Array<double, 3>& roots, const Array<double, 3>& pose_hessian) {
+    const Observations observations(rotations, centres, points, camera, point, pixels);
+    const int64_t size = static_cast<int64_t>(hessian.shape(0)), unknown = size - focal;
+    const auto count = static_cast<size_t>(observations.point_count),
+               cameras = static_cast<size_t>(observations.cameras);
+    if (static_cast<int64_t>(hessian.shape(1)) != size || static_cast<int64_t>(gradient.shape(0)) != size ||
+        static_cast<int64_t>(eliminated.shape(1)) != size || eliminated.shape(0) != 3 * count ||
+        pull.shape(0) != count || pull.shape(1) != 3 || roots.shape(0) != count || roots.shape(1) != 3 ||
+        roots.shape(2) != 3 || pose_hessian.shape(0) != cameras || pose_hessian.shape(1) != 6 ||
+        pose_hessian.shape(2) != 6 || unknown < 0 || unknown % 6) {
+        throw std::invalid_argument(
+            "expected hessian [D, D], gradient [D], eliminated [3 P, D], pull [P, 3], roots [P, 3, 3], "
+            "pose_hessian [C, 6, 6] with D six times the slots, and one more for a free focal length");
+    }
+    if (slots.shape(0) != cameras || shares.shape(0) != cameras || shares.shape(1) != slots.shape(1)) {
+        throw std::invalid_argument("slots and shares must be [C, K]");
+    }
+    for (size_t i = 0; i < cameras * slots.shape(1); ++i) {
+        if (slots.data()[i] < -1 || slots.data()[i] >= unknown / 6) {
+            throw std::invalid_argument("a slot is -1 for a fixed pose, or below the number of slots");
+        }
+    }
+    const System system = {
+        scale,        damping,       size,           unknown,         static_cast<int64_t>(slots.shape(1)),
+        slots.data(), shares.data(), hessian.data(), gradient.data(), eliminated.data(),
+        pull.data(),  roots.data(),  focal};
+    nb::gil_scoped_release release;
+    std::fill_n(hessian.data(), size * size, 0.0);
+    std::fill_n(gradient.data(), size, 0.0);
+    std::fill_n(eliminated.data(), 3 * observations.point_count * size, 0.0);
+    PoseSums poses(observations.cameras);
+    add_landmarks(observations, {fx, fy, cx, cy}, system, poses);
+    scatter_to_slots(system, observations.cameras, poses);
+    for (int64_t n = 0; n < 6 * observations.cameras; ++n) {
+        std::copy_n(poses.hessian.data() + n * kPoseStride, 6, pose_hessian.data() + 6 * n);
+    }
+}
+
+}  // namespace
+
+void bind_normal_equations(nb::module_& m) {
+    m.def("residuals", &residuals,
+          "Image minus observation in px, [M, 2]; infinite for a point at or behind its camera.");
+    m.def("cost", &cost, "Mean over observations of the Cauchy loss log(1 + e^2 / scale^2).");
+    m.def("linearise", &linearise,
+          "Hessian [D, D] and gradient [D] of what the poses are made of: slots [C, K] of six numbers each, with\n"
+          "shares [C, K], and the logarithm of the focal length where it is free. Each point's damped 3x3 Hessian V\n"
+          "is taken out: with roots R = chol(V)^-1, `eliminated` holds the rows R cross^T and `pull` R gradient.");
+}
+
+}  // namespace spiked

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from spiked.blocks import aligned_window
 from spiked.errors import CalibrationError
 from spiked.recording import Recording
-from spiked.sensor import Sensor
+from spiked.sensor import Image, Sensor
 
-Image = NDArray[np.float32]
+__all__ = ["Calibration", "mean_rate"]
 
 LONGEST_FRAMES = 60_000
-"""Frames of a recording that are looked at: a run of blocks has 16-bit offsets."""
+"""Frames of a recording that are used: offsets have 16 bits."""
 HOT_SHARE = 0.2
-"""A pixel that fires in the dark at more than this part of the even light's median rate is of no use."""
+"""A pixel is hot if its dark rate exceeds this share of the even light's median rate."""
 GAIN_LIMITS = (0.2, 4.0)
 """Pixels whose gain relative to the median lies outside are dead, or stuck."""
 
@@ -41,7 +41,7 @@ class Calibration:
             raise CalibrationError("a calibration's gains must be positive and its dark rates finite")
 
     def check(self, sensor: Sensor) -> None:
-        """Raises CalibrationError when it is of another sensor."""
+        """Raises CalibrationError if it is of another sensor."""
         if self.gain.shape != (sensor.height, sensor.width):
             height, width = self.gain.shape
             raise CalibrationError(
@@ -68,7 +68,7 @@ class Calibration:
 
     @classmethod
     def read(cls, path: Path) -> "Calibration":
-        """Raises CalibrationError when it is not there or not a calibration."""
+        """Raises CalibrationError if the file is missing or not a calibration."""
         try:
             with np.load(path, allow_pickle=False) as archive:
                 gain, dark, dead = (archive[name] for name in ("gain", "dark", "dead"))
@@ -138,7 +138,7 @@ def _square_sum(image: Image, reach: int) -> Image:
 
 
 def _typical(net: Image, sensor: Sensor) -> Image:
-    """The median rate, of each colour of a mosaic by itself: the light's colour is not the pixels' gain."""
+    """The median rate, per colour of a mosaic: the light's colour must not enter the gains."""
     if sensor.mosaic is None:
         return np.full_like(net, max(float(np.median(net)), 1e-9))
     channels = sensor.mosaic.channels(*net.shape)

@@ -1,8 +1,10 @@
-"""The few exceptions a user of spiked meets. Each message says what was wrong, where, and what to do."""
+"""The exceptions of spiked. Each message says what is wrong, where, and what to do."""
+
+__all__ = ["CalibrationError", "ConfigurationError", "RecordingError", "SceneError", "SourceError", "SpikedError"]
 
 
 class SpikedError(Exception):
-    """Base of every error that is the user's to mend; the command line prints it on one line and exits with 2."""
+    """Base of all errors that a user can fix; the command line prints the message on one line and exits with 2."""
 
 
 class RecordingError(SpikedError):

@@ -1,7 +1,7 @@
-"""How good a trajectory and its pictures are against the truth: ATE, RPE, coverage, PSNR, SSIM.
+"""Scores a trajectory and its renders against the truth: ATE, RPE, coverage, PSNR, SSIM.
 
 Trajectories are camera-to-world rotations [n, 3, 3] and centres [n, 3] of the same frames. An estimate's length unit
-and world frame are its own, so the truth is carried over by a similarity before anything is compared.
+and world frame are its own, so the truth is aligned by a similarity first.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,6 +15,23 @@ from spiked.errors import ConfigurationError
 from spiked.pose import exp_so3, log_so3
 from spiked.trajectory import Trajectory
 
+__all__ = [
+    "PoseErrors",
+    "Similarity",
+    "TrajectoryScore",
+    "ViewScore",
+    "best_gain",
+    "pose_errors",
+    "psnr",
+    "refine_pose",
+    "score_trajectory",
+    "score_views",
+    "similarity_of_poses",
+    "similarity_of_trajectories",
+    "ssim",
+    "umeyama",
+]
+
 Array = NDArray[np.float64]
 Render = Callable[[Array, Array], NDArray[np.float32]]
 """A picture [H, W] or [H, W, 3] from a camera-to-world rotation [3, 3] and centre [3]."""
@@ -26,6 +43,11 @@ MATCH_FRAMES = 0.6
 """A pose belongs to a frame if their times lie less than this many frames apart."""
 
 _UNIT_POSES = 24
+MIN_SCORED_FRAMES = 48
+"""Least number of frames with a pose: 1.5 times `RPE_FRAMES`, so that relative errors have at least 16 pairs."""
+
+Poses = tuple[Array, Array]
+"""Camera-to-world rotations [n, 3, 3] and centres [n, 3]."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +59,11 @@ class Similarity:
     translation: Array  # [3]
 
     def points(self, points: Array) -> Array:
-        """Carries points [..., 3] over."""
+        """Transform points [..., 3]."""
         return self.scale * points @ self.rotation.T + self.translation
 
     def poses(self, rotations: Array, centres: Array) -> tuple[Array, Array]:
-        """Carries camera-to-world poses [..., 3, 3], [..., 3] over."""
+        """Transform camera-to-world poses [..., 3, 3], [..., 3]."""
         return self.rotation @ rotations, self.points(centres)
 
 
@@ -55,24 +77,24 @@ class PoseErrors:
     """The same for 24 poses after both paths are centred and scaled to unit Frobenius norm (the convention of the
     CF-3DGS and InstantSplat tables; a camera that never moves scores 0.204)."""
     rpe_r_deg: float
-    """Mean angle between true and estimated turn over 32 frames, in degrees."""
+    """Mean angle between true and estimated rotation over 32 frames, in degrees."""
     rpe_t_percent: float
-    """Mean difference between true and estimated way over 32 frames, in % of the truth's RMS radius."""
+    """Mean difference between true and estimated translation over 32 frames, in % of the truth's RMS radius."""
 
 
 @dataclass(frozen=True)
 class TrajectoryScore:
-    """How much of the truth has a pose, and how good those poses are."""
+    """Coverage of the true frames, and errors of the poses found."""
 
     coverage: float
     """Share of the true frames that have an estimated pose."""
     errors: PoseErrors | None
-    """None where fewer than 48 frames have a pose."""
+    """None if fewer than `MIN_SCORED_FRAMES` frames have a pose."""
 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Likeness of held-out views, values in [0, 1] after one gain for all."""
+    """PSNR and SSIM of held-out views, values in [0, 1] after one gain for all."""
 
     psnr_db: list[float]
     ssim: list[float]
@@ -89,8 +111,8 @@ class ViewScore:
         return float(np.mean(self.ssim))
 
 
-def umeyama(source: Array, target: Array) -> Similarity:
-    """The similarity that carries points `source` [n, 3] onto `target` [n, 3] with the least squares.
+def umeyama(*, source: Array, target: Array) -> Similarity:
+    """The least-squares similarity from points `source` [n, 3] to `target` [n, 3].
 
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991.
     """
@@ -104,12 +126,14 @@ def umeyama(source: Array, target: Array) -> Similarity:
     return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
 
 
-def similarity_of_poses(truth_rotations: Array, truth_centres: Array, rotations: Array, centres: Array) -> Similarity:
+def similarity_of_poses(*, truth: Poses, estimate: Poses) -> Similarity:
     """The similarity from the truth's world to the estimate's, its rotation from the orientations.
 
-    Positions alone leave a turn about a straight path undetermined; orientations do not. The rotation is the chordal
-    mean of the frames' own, scale and translation are least squares.
+    Each argument is camera-to-world rotations [n, 3, 3] and centres [n, 3]. Positions alone do not determine the
+    rotation about a straight path; orientations do. The rotation is the chordal mean of the relative rotations; scale
+    and translation are least squares.
     """
+    (truth_rotations, truth_centres), (rotations, centres) = truth, estimate
     u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", rotations, truth_rotations))
     rotation = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     turned = truth_centres @ rotation.T
@@ -119,8 +143,9 @@ def similarity_of_poses(truth_rotations: Array, truth_centres: Array, rotations:
     return Similarity(scale, rotation, centres.mean(0) - scale * turned.mean(0))
 
 
-def pose_errors(truth_rotations: Array, truth_centres: Array, rotations: Array, centres: Array) -> PoseErrors:
+def pose_errors(*, truth: Poses, estimate: Poses) -> PoseErrors:
     """Errors of an estimate [n] against the truth [n], n >= 2. Raises ConfigurationError for shapes that do not fit."""
+    (truth_rotations, truth_centres), (rotations, centres) = truth, estimate
     n = len(truth_centres)
     if n < 2 or any(len(array) != n for array in (truth_rotations, rotations, centres)):
         raise ConfigurationError(
@@ -129,7 +154,7 @@ def pose_errors(truth_rotations: Array, truth_centres: Array, rotations: Array, 
     radius = float(np.sqrt(((truth_centres - truth_centres.mean(0)) ** 2).sum(1).mean()))
     if radius == 0:
         raise ConfigurationError("the true camera never moves, so errors relative to the size of its path mean nothing")
-    fit = umeyama(centres, truth_centres)
+    fit = umeyama(source=centres, target=truth_centres)
     ate = _rms(fit.points(centres) - truth_centres)
     apart = min(RPE_FRAMES, n - 1)
     turn, way = _relative(truth_rotations, truth_centres, apart)
@@ -143,19 +168,22 @@ def pose_errors(truth_rotations: Array, truth_centres: Array, rotations: Array, 
     )
 
 
-def score_trajectory(truth: Trajectory, estimate: Trajectory, frame_rate_hz: float) -> TrajectoryScore:
+def score_trajectory(*, truth: Trajectory, estimate: Trajectory, frame_rate_hz: float) -> TrajectoryScore:
     """Match an estimate to the truth by time stamp and score it."""
     j = estimate.nearest(truth.times_s, MATCH_FRAMES / frame_rate_hz)
     found = j >= 0
     coverage = float(found.mean())
-    if found.sum() < 48:
+    if found.sum() < MIN_SCORED_FRAMES:
         return TrajectoryScore(coverage, None)
     rows = j[found]
-    errors = pose_errors(truth.rotations[found], truth.centres[found], estimate.rotations[rows], estimate.centres[rows])
+    errors = pose_errors(
+        truth=(truth.rotations[found], truth.centres[found]),
+        estimate=(estimate.rotations[rows], estimate.centres[rows]),
+    )
     return TrajectoryScore(coverage, errors)
 
 
-def similarity_of_trajectories(truth: Trajectory, estimate: Trajectory, frame_rate_hz: float) -> Similarity:
+def similarity_of_trajectories(*, truth: Trajectory, estimate: Trajectory, frame_rate_hz: float) -> Similarity:
     """`similarity_of_poses` of the frames that both have.
 
     Raises ConfigurationError where they have fewer than two frames in common.
@@ -166,7 +194,8 @@ def similarity_of_trajectories(truth: Trajectory, estimate: Trajectory, frame_ra
         raise ConfigurationError("estimate and truth have fewer than two frames in common; do their time stamps agree?")
     rows = j[found]
     return similarity_of_poses(
-        truth.rotations[found], truth.centres[found], estimate.rotations[rows], estimate.centres[rows]
+        truth=(truth.rotations[found], truth.centres[found]),
+        estimate=(estimate.rotations[rows], estimate.centres[rows]),
     )
 
 
@@ -191,16 +220,22 @@ def ssim(image: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
     return float(likeness.mean())
 
 
-def best_gain(images: Sequence[NDArray[np.floating]], truths: Sequence[NDArray[np.floating]]) -> float:
-    """The one factor for all images that brings them nearest to the truths by least squares."""
+def best_gain(images: Sequence[NDArray[np.floating]], *, truths: Sequence[NDArray[np.floating]]) -> float:
+    """Least-squares gain that fits all images, [h, w] or [h, w, 3], to truths of the same shapes."""
     pairs = [(np.asarray(i, np.float64), np.asarray(t, np.float64)) for i, t in zip(images, truths, strict=True)]
     return float(sum((i * t).sum() for i, t in pairs) / max(float(sum((i * i).sum() for i, _ in pairs)), 1e-12))
 
 
 def refine_pose(
-    render: Render, pose: tuple[Array, Array], truth: NDArray[np.float32], gain: float, *, length: float, steps: int = 8
+    render: Render,
+    pose: tuple[Array, Array],
+    *,
+    truth: NDArray[np.float32],
+    gain: float,
+    length: float,
+    steps: int = 8,
 ) -> tuple[Array, Array]:
-    """The pose whose picture is nearest to `truth`, the scene frozen: robust Gauss-Newton with a numeric Jacobian.
+    """The pose whose render is nearest to `truth`, with a fixed scene: robust Gauss-Newton with a numeric Jacobian.
 
     pose: rotation [3, 3] and centre [3] to start from; length: a typical depth in the scene's unit, which sets the
     steps.
@@ -224,21 +259,25 @@ def refine_pose(
 
 def score_views(
     render: Render,
+    *,
     poses: Sequence[tuple[Array, Array]],
     truths: Sequence[NDArray[np.float32]],
     length: float,
     refine: bool = True,
 ) -> ViewScore:
-    """Score renders of held-out poses, already carried into the scene's frame, against pictures in [0, 1].
+    """Score renders at held-out poses, given in the scene's frame, against images in [0, 1].
 
-    With `refine`, each pose is first refined on its picture, so that the score is the scene's and not the similarity's.
+    With `refine`, each pose is first refined on its image, so that errors of the similarity do not count.
     """
     at = list(poses)
-    gain = best_gain([render(*pose) for pose in at], truths)
+    gain = best_gain([render(*pose) for pose in at], truths=truths)
     if refine:
-        at = [refine_pose(render, pose, truth, gain, length=length) for pose, truth in zip(at, truths, strict=True)]
+        at = [
+            refine_pose(render, pose, truth=truth, gain=gain, length=length)
+            for pose, truth in zip(at, truths, strict=True)
+        ]
     images = [render(*pose) for pose in at]
-    gain = best_gain(images, truths)
+    gain = best_gain(images, truths=truths)
     shown = [np.clip(gain * image, 0, 1) for image in images]
     pairs = list(zip(shown, truths, strict=True))
     return ViewScore([psnr(i, t) for i, t in pairs], [ssim(i, t) for i, t in pairs], gain)
@@ -249,7 +288,7 @@ def _rms(differences: Array) -> float:
 
 
 def _relative(rotations: Array, centres: Array, apart: int) -> tuple[Array, Array]:
-    """Turn [m, 3, 3] and way [m, 3] from each pose to the one `apart` later, in the earlier camera's axes."""
+    """Rotation [m, 3, 3] and translation [m, 3] from each pose to the one `apart` later, in the earlier camera."""
     back = rotations[:-apart].swapaxes(-1, -2)
     return back @ rotations[apart:], np.einsum("nij,nj->ni", back, centres[apart:] - centres[:-apart])
 
@@ -262,10 +301,10 @@ def _ate_unit(truth_centres: Array, centres: Array) -> float:
         return np.asarray(centred / max(float(np.linalg.norm(centred)), 1e-12))
 
     a, b = unit(centres[rows]), unit(truth_centres[rows])
-    return _rms(umeyama(a, b).points(a) - b)
+    return _rms(umeyama(source=a, target=b).points(a) - b)
 
 
 def _moved(pose: tuple[Array, Array], step: Array) -> tuple[Array, Array]:
-    """Turned by step[:3] and shifted by step[3:], both in the camera's own axes."""
+    """The pose rotated by step[:3] and translated by step[3:], both in camera axes."""
     rotation, centre = pose
     return rotation @ exp_so3(step[:3]), centre + rotation @ step[3:]

@@ -1,4 +1,4 @@
-"""How noisy a camera is: what a recording of a scene that stands still says about counts and about charge."""
+"""Measures the noise of a camera's counts and charges from a recording of a static scene."""
 
 from dataclasses import dataclass
 
@@ -10,13 +10,15 @@ from spiked.errors import RecordingError
 from spiked.recording import Recording
 from spiked.sensor import Sensor
 
+__all__ = ["NoiseReport", "WindowNoise", "measure_noise"]
+
 LENGTHS = (4, 8, 16, 32, 64)
 """Frames of the windows that are compared."""
 MARGIN = 32
-"""Frames looked at on both sides of a window for the spikes nearest to its edges."""
+"""Frames on both sides of a window that are searched for the spikes nearest to its edges."""
 LEAST_WINDOWS = 4
 LEAST_SPIKES = 8
-"""Pixels with fewer in all say nothing about their own spread."""
+"""Fewest intervals of a pixel for an estimate of its spread."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class WindowNoise:
     variance: float
     """Of the number of spikes of a pixel in a window, mean over the pixels."""
     binomial_variance: float
-    """What it would be if spikes came independently of each other."""
+    """The value for independent (Poisson) spikes."""
     counted: float
     """Relative standard deviation of spikes / frames."""
     charge: float
@@ -50,7 +52,7 @@ class NoiseReport:
 
 
 def measure_noise(recording: Recording, most_frames: int = 2048) -> NoiseReport:
-    """Noise in the first `most_frames` frames, in which nothing may move or change its brightness.
+    """Noise in the first `most_frames` frames, in which the scene must be static, with constant light.
 
     Raises RecordingError for recordings of less than 4 windows of the shortest length, and for dark ones.
     """

@@ -1,5 +1,6 @@
 """A scene of Gaussians, and the PLY file with the fields that 3D Gaussian splatting tools expect."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.errors import SceneError
+
+__all__ = ["Scene"]
 
 Array = NDArray[np.float32]
 
@@ -22,13 +25,21 @@ _KINDS = {
 
 @dataclass
 class Scene:
-    """Gaussians as float32 arrays, C-contiguous. Positions in the trajectory's length unit."""
+    """N Gaussians as float32 arrays, C-contiguous."""
 
-    means: Array  # [N, 3]
-    quats: Array  # [N, 4] wxyz, any length
-    log_scales: Array  # [N, 3] natural logarithm of the standard deviations
-    opacity_logits: Array  # [N]
-    colours: Array  # [N, C] radiance in expected spikes a frame, C = 1 (grey) or 3
+    means: Array
+    """World positions in the trajectory's length unit, [N, 3]."""
+    quats: Array
+    """Rotations, wxyz, of any length; a zero quaternion counts as no rotation. [N, 4]"""
+    log_scales: Array
+    """Natural logarithms of the standard deviations along the axes of each Gaussian, [N, 3]."""
+    opacity_logits: Array
+    """Opacity is 1 / (1 + exp(-logit)), [N]."""
+    colours: Array
+    """Radiance in expected spikes a frame, not clamped, [N, C] with C = 1 (grey) or 3."""
+    white: float | None = None
+    """Radiance that is shown as white. None: the colours are those of a display, 1 is white, and their radiance is not
+    known; so it is in a PLY that other programs wrote."""
 
     def __len__(self) -> int:
         return len(self.means)
@@ -37,7 +48,12 @@ class Scene:
     def empty(cls, channels: int) -> "Scene":
         """A scene without Gaussians."""
         shapes = ((0, 3), (0, 4), (0, 3), (0,), (0, channels))
-        return cls(*(np.zeros(shape, np.float32) for shape in shapes))
+        return _scene((np.zeros(shape, np.float32) for shape in shapes), None)
+
+    @property
+    def colour_of_white(self) -> float:
+        """The value of `colours` that is shown as white."""
+        return 1.0 if self.white is None else self.white
 
     def arrays(self) -> tuple[Array, Array, Array, Array, Array]:
         """The five arrays in the order of the fields."""
@@ -45,22 +61,25 @@ class Scene:
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "Scene":
         """The Gaussians at `rows`, copied."""
-        return Scene(*(np.ascontiguousarray(array[rows]) for array in self.arrays()))
+        return _scene((np.ascontiguousarray(array[rows]) for array in self.arrays()), self.white)
 
     def join(self, other: "Scene") -> "Scene":
         """These Gaussians followed by those of `other`."""
-        return Scene(*(np.concatenate(pair) for pair in zip(self.arrays(), other.arrays(), strict=True)))
+        pairs = zip(self.arrays(), other.arrays(), strict=True)
+        return _scene((np.concatenate(pair) for pair in pairs), self.white)
 
-    def write_ply(self, path: Path | str, white: float = 1.0) -> None:
-        """Write a binary PLY with the standard 3DGS fields; radiance `white` becomes colour 1."""
+    def write_ply(self, path: Path | str, white: float | None = None) -> None:
+        """Write a binary PLY with the standard 3DGS fields; see `ply`."""
         Path(path).write_bytes(self.ply(white))
 
-    def ply(self, white: float = 1.0) -> bytes:
-        """The bytes of the PLY file; radiance `white` becomes colour 1."""
-        rgb = np.broadcast_to(self.colours, (len(self), 3)) / white
+    def ply(self, white: float | None = None) -> bytes:
+        """The bytes of the PLY file; radiance `white`, the scene's own if None, becomes colour 1 and is noted in it."""
+        white = self.white if white is None else white
+        rgb = np.broadcast_to(self.colours, (len(self), 3)) / (white or 1)
         names = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
         names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-        head = ["ply", "format binary_little_endian 1.0", f"comment radiance {white!r} spikes per frame is colour 1"]
+        head = ["ply", "format binary_little_endian 1.0"]
+        head += [] if white is None else [f"comment radiance {white!r} spikes per frame is colour 1"]
         head += [f"element vertex {len(self)}", *(f"property float {name}" for name in names), "end_header\n"]
         quats = self.quats / np.maximum(np.linalg.norm(self.quats, axis=1, keepdims=True), 1e-12)
         columns = [self.means, np.zeros_like(self.means), (rgb - 0.5) / SH_C0, self.opacity_logits[:, None]]
@@ -77,8 +96,8 @@ class Scene:
 
     @classmethod
     def read_ply(cls, path: Path | str) -> "Scene":
-        """Read a 3DGS PLY. View-dependent colour (f_rest) is left out; a `radiance` comment written by us is undone;
-        equal red, green and blue read as one channel.
+        """Read a 3DGS PLY. View-dependent colour (f_rest) is left out; a `radiance` comment written by us is undone and
+        kept as `white`; equal red, green and blue read as one channel.
 
         Raises SceneError for anything that is not such a file.
         """
@@ -95,7 +114,7 @@ class Scene:
                 raise SceneError(f"{path} has no property {missing[0]!r}; it is not a 3D Gaussian scene")
             return np.stack([table[field] for field in fields], 1).astype(np.float32)
 
-        rgb = (0.5 + SH_C0 * pick("f_dc_0", "f_dc_1", "f_dc_2")) * np.float32(white)
+        rgb = (0.5 + SH_C0 * pick("f_dc_0", "f_dc_1", "f_dc_2")) * np.float32(white or 1)
         grey = len(rgb) == 0 or bool(np.all(rgb == rgb[:, :1]))
         scene = cls(
             pick("x", "y", "z"),
@@ -103,27 +122,34 @@ class Scene:
             pick("scale_0", "scale_1", "scale_2"),
             pick("opacity")[:, 0].copy(),
             np.ascontiguousarray(rgb[:, :1] if grey else rgb),
+            white,
         )
         if not all(np.isfinite(array).all() for array in scene.arrays()):
             raise SceneError(f"{path} holds values that are not finite")
         return scene
 
 
-def _parse_header(raw: bytes, path: Path | str) -> tuple[list[tuple[str, str]], int, float, int]:
-    """Property names with types, number of vertices, radiance of colour 1, and where the data begin."""
+def _scene(arrays: Iterable[Array], white: float | None) -> Scene:
+    means, quats, log_scales, opacity_logits, colours = arrays
+    return Scene(means, quats, log_scales, opacity_logits, colours, white)
+
+
+def _parse_header(raw: bytes, path: Path | str) -> tuple[list[tuple[str, str]], int, float | None, int]:
+    """Property names with types, number of vertices, radiance of colour 1 if stated, and where the data begin."""
     mark = b"end_header\n"
     end = raw.find(mark)
     if not raw.startswith(b"ply") or end < 0:
         raise SceneError(f"{path} is not a PLY file")
     names: list[tuple[str, str]] = []
-    count, white, element = 0, 1.0, ""
+    count, element = 0, ""
+    white: float | None = None
     for line in raw[:end].decode("latin-1").splitlines():
         words = line.split()
         match words:
             case ["format", kind, *_] if kind != "binary_little_endian":
                 raise SceneError(f"{path} is a PLY of format {kind}; only binary_little_endian is read")
             case ["comment", "radiance", value, *_]:
-                white = float(value)
+                white = _radiance(value, path)
             case ["element", element, number]:
                 count = int(number) if element == "vertex" else count
             case ["property", kind, name] if element == "vertex":
@@ -137,3 +163,13 @@ def _parse_header(raw: bytes, path: Path | str) -> tuple[list[tuple[str, str]], 
     if len(raw) - start < need:
         raise SceneError(f"{path} is cut short: {count} Gaussians need {need} bytes, {len(raw) - start} are there")
     return names, count, white, start
+
+
+def _radiance(text: str, path: Path | str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < np.inf:
+        raise SceneError(f"{path}: the radiance of colour 1 in its header is {text!r}; it must be a positive number")
+    return value

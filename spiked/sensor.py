@@ -8,14 +8,28 @@ from numpy.typing import NDArray
 
 from spiked.errors import ConfigurationError
 
+__all__ = ["BitOrder", "Intrinsics", "Layout", "Mosaic", "Sensor"]
+
+Image = NDArray[np.float32]
+"""Upright image [H, W] or [H, W, C] of rates, radiance or what is derived from them, float32."""
+
+LEAST_DEPTH = 1e-6
+"""Depth of a point in front of a camera, at least, in units of the scene."""
+
 
 class Layout(StrEnum):
     """How one frame's bits are stored."""
 
     COMPACT = "compact"
-    """Rows of width / 8 bytes, nothing else (flavours A, D and F)."""
+    """Rows of width / 8 bytes, nothing else (`Flavour` A, D and F in recording/geometry.py)."""
     ROW_TAGGED = "row_tagged"
-    """Each row of bits is followed by its u16 little-endian number (flavour B)."""
+    """Each row of bits is followed by its u16 little-endian number (`Flavour.B`)."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> "Layout | None":
+        """`row-tagged` is read as `row_tagged`."""
+        name = str(value).replace("-", "_")
+        return next((member for member in cls if member.value == name), None)
 
 
 class BitOrder(StrEnum):
@@ -60,6 +74,20 @@ class Intrinsics:
         """K, float64 [3, 3]."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
 
+    def scaled(self, factor: float) -> "Intrinsics":
+        """The intrinsics of the same image at `factor` times its size."""
+        return Intrinsics(self.fx * factor, self.fy * factor, self.cx * factor, self.cy * factor)
+
+    def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixels [..., 2] of points [..., 3] in camera axes; a depth below `LEAST_DEPTH` counts as that."""
+        slope = points[..., :2] / np.maximum(points[..., 2:], LEAST_DEPTH)
+        return np.asarray(slope * [self.fx, self.fy] + [self.cx, self.cy], np.float64)
+
+    def unproject(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Directions [..., 3] with z = 1, in camera axes, of pixels [..., 2]."""
+        slope = (pixels - [self.cx, self.cy]) / [self.fx, self.fy]
+        return np.concatenate([slope, np.ones((*slope.shape[:-1], 1))], -1)
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -81,8 +109,8 @@ class Sensor:
                 f"geometry {self.width}x{self.height} is not possible: sizes are positive and a row is whole bytes, "
                 "so the width must be a multiple of 8"
             )
-        if not self.frame_rate_hz > 0:
-            raise ConfigurationError(f"frame rate {self.frame_rate_hz:g} Hz is not positive")
+        if not 0 < self.frame_rate_hz < np.inf:
+            raise ConfigurationError(f"frame rate {self.frame_rate_hz:g} Hz is not a positive number")
 
     @property
     def row_bytes(self) -> int:

@@ -11,7 +11,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spiked.pose import Array, exp_so3, inverse_right_jacobian, log_so3, right_jacobian
+from spiked.pose import Array, exp_so3, log_so3
+
+__all__ = ["KnotTimeWarp", "Path", "Spline", "Waypoints", "interpolate_rotations"]
 
 _BASIS = {
     1: np.array([[1.0, -1.0], [0.0, 1.0]]),
@@ -21,18 +23,20 @@ _BASIS = {
 
 
 @dataclass(frozen=True)
-class Clock:
-    """Where knots lie closer or wider: ticks as a function of frames, straight between the given moments and one tick
-    a frame outside. `frames` and `ticks` [n] both increase."""
+class KnotTimeWarp:
+    """Time scale of the knots: ticks as a piecewise linear function of frames, one tick a frame outside.
+
+    `frames` and `ticks` [n] both increase.
+    """
 
     frames: Array
     ticks: Array
 
-    def ticked(self, times: ArrayLike) -> Array:
+    def to_knot(self, times: ArrayLike) -> Array:
         """Ticks at times in frames."""
         return _straight(np.asarray(times, float), self.frames, self.ticks)
 
-    def framed(self, ticks: ArrayLike) -> Array:
+    def to_frame(self, ticks: ArrayLike) -> Array:
         """Times in frames at ticks."""
         return _straight(np.asarray(ticks, float), self.ticks, self.frames)
 
@@ -42,7 +46,7 @@ def _straight(x: Array, a: Array, b: Array) -> Array:
 
 
 class Path(Protocol):
-    """Where a camera was at any time from `begin` to `end`, in frames."""
+    """Camera poses at any time from `begin` to `end`, in frames."""
 
     @property
     def begin(self) -> float:
@@ -82,7 +86,7 @@ class Waypoints:
 
 @dataclass
 class Spline:
-    """Knots at `first + k * spacing` frames, or ticks of a `clock` where there is one.
+    """Knots at `first + k * spacing` frames, or ticks of a `time_warp` where there is one.
 
     `rotations` [n, 3, 3] camera-to-world, `centres` [n, 3], changed in place by optimisers. Times are in frames; the
     pose of frame k is at k + 0.5.
@@ -93,7 +97,7 @@ class Spline:
     rotations: Array
     centres: Array
     degree: int = 3
-    clock: Clock | None = None
+    time_warp: KnotTimeWarp | None = None
 
     @classmethod
     def fit(
@@ -104,20 +108,22 @@ class Spline:
         spacing: float,
         degree: int = 3,
         span: tuple[float, float] | None = None,
-        clock: Clock | None = None,
+        time_warp: KnotTimeWarp | None = None,
     ) -> "Spline":
         """A spline through poses at increasing `times` [m] (frames), knots every `spacing` frames, defined over `span`
         (default: the given times); where no pose is near it continues at constant velocity. Least squares."""
         t = np.asarray(times, float)
         low, high = (t[0], t[-1]) if span is None else (min(span[0], t[0]), max(span[1], t[-1]))
         s = t
-        if clock is not None:
-            low, high, s = float(clock.ticked(low)), float(clock.ticked(high)), clock.ticked(t)
+        if time_warp is not None:
+            low, high, s = float(time_warp.to_knot(low)), float(time_warp.to_knot(high)), time_warp.to_knot(t)
         pad = (degree - 1) / 2
         count = int(np.ceil(max(high - low, 1e-6) / spacing)) + degree + 1
         first = low - pad * spacing - 1e-6
         knots = first + spacing * np.arange(count)
-        spline = cls(first, spacing, interpolate_rotations(s, rotations, knots), np.zeros((count, 3)), degree, clock)
+        spline = cls(
+            first, spacing, interpolate_rotations(s, rotations, knots), np.zeros((count, 3)), degree, time_warp
+        )
         basis = spline.basis_matrix(t)
         guess = _interpolate_linear(s, centres, knots)
         smooth = 1e-4 * np.diff(np.eye(count), 2, axis=0)
@@ -145,11 +151,11 @@ class Spline:
         return self.first + self.spacing * (self.degree - 1) / 2
 
     def _frames(self, tick: float) -> float:
-        return tick if self.clock is None else float(self.clock.framed(tick))
+        return tick if self.time_warp is None else float(self.time_warp.to_frame(tick))
 
     def locate(self, times: ArrayLike) -> tuple[NDArray[np.int64], Array]:
         """First knot i [m] and weights [m, degree + 1] of the knots i.. at `times` (clamped to the defined range)."""
-        ticks = np.asarray(times, float) if self.clock is None else self.clock.ticked(times)
+        ticks = np.asarray(times, float) if self.time_warp is None else self.time_warp.to_knot(times)
         s = (ticks - self._begin) / self.spacing
         last = len(self.centres) - self.degree - 1
         i = np.clip(np.floor(s).astype(np.int64), 0, last)
@@ -175,36 +181,6 @@ class Spline:
             delta = log_so3(knots[:, j - 1].swapaxes(-1, -2) @ knots[:, j])
             rotation = rotation @ exp_so3(cumulative[:, j, None] * delta)
         return rotation, centres
-
-    def rotation_jacobians(self, times: ArrayLike) -> tuple[NDArray[np.int64], Array]:
-        """Exact d(phi at t) / d(phi of knot), left perturbations: first knots [m] and Jacobians [m, degree+1, 3, 3]."""
-        i, weights = self.locate(times)
-        k = i[:, None] + np.arange(self.degree + 1)
-        cumulative = np.cumsum(weights[:, ::-1], 1)[:, ::-1]
-        knots = self.rotations[k]
-        jacobians = np.zeros((*k.shape, 3, 3))
-        jacobians[:, 0] = np.eye(3)
-        product = knots[:, 0]
-        for j in range(1, self.degree + 1):
-            delta = log_so3(knots[:, j - 1].swapaxes(-1, -2) @ knots[:, j])
-            lam = cumulative[:, j, None]
-            product = product @ exp_so3(lam * delta)
-            m = product @ (lam[..., None] * right_jacobian(lam * delta)) @ inverse_right_jacobian(delta)
-            m = m @ knots[:, j].swapaxes(-1, -2)
-            jacobians[:, j] += m
-            jacobians[:, j - 1] -= m
-        return i, jacobians
-
-    def knot_gradients(self, times: ArrayLike, rotation: Array, centre: Array) -> tuple[Array, Array]:
-        """Chain dL/dphi [m, 3] and dL/dcentre [m, 3] at `times` to the knots: two arrays [knots, 3], exact."""
-        i, jacobians = self.rotation_jacobians(times)
-        _, weights = self.locate(times)
-        k = i[:, None] + np.arange(self.degree + 1)
-        by_rotation = np.zeros_like(self.centres)
-        by_centre = np.zeros_like(self.centres)
-        np.add.at(by_rotation, k, np.einsum("mkij,mi->mkj", jacobians, rotation))
-        np.add.at(by_centre, k, weights[..., None] * centre[:, None])
-        return by_rotation, by_centre
 
     def move(self, rotation: Array, centre: Array) -> "Spline":
         """The spline with knots perturbed: R <- Exp(rotation) R, c <- c + centre; both [knots, 3]."""

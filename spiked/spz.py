@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from spiked.errors import SceneError
 from spiked.scene import SH_C0, Array, Scene
 
+__all__ = ["SpzVersion", "decode", "encode", "fractional_bits", "position_step"]
+
 Bytes = NDArray[np.uint8]
 
 _MAGIC = 0x5053474E

@@ -72,10 +72,11 @@ class CaptureChange(BaseModel):
 
 class CaptureState(StrEnum):
     """
-    Where a capture stands.
+    State of a capture.
     """
 
     starting = "starting"
+    waiting = "waiting"
     streaming = "streaming"
     finishing = "finishing"
     complete = "complete"
@@ -84,7 +85,7 @@ class CaptureState(StrEnum):
 
 class ClockPair(BaseModel):
     """
-    The host's clock when a frame arrived.
+    Host time at which a frame had arrived whole, Unix time in ns.
     """
 
     model_config = ConfigDict(
@@ -96,7 +97,7 @@ class ClockPair(BaseModel):
 
 class DeviceState(StrEnum):
     """
-    Where the camera of a capture stands: absent -> idle -> armed -> streaming -> lost -> absent.
+    State of a capture's camera: absent -> idle -> armed -> streaming -> lost -> absent.
     """
 
     absent = "absent"
@@ -116,6 +117,13 @@ class DiskOut(BaseModel):
     )
     free_bytes: int
     total_bytes: int
+    recording_s: Annotated[
+        float,
+        Field(
+            description="How long a recording there is room for, of the camera that runs at the rate that it states, or of a USB camera if none runs."
+        ),
+    ]
+    recording_of: Annotated[str, Field(description="That camera.")]
 
 
 class Gap(BaseModel):
@@ -146,7 +154,7 @@ class GapOut(BaseModel):
 
 class Grade(StrEnum):
     """
-    What a recording is good for, as `spiked verify` says it.
+    Quality of a recording, as `spiked verify` prints it.
     """
 
     good = "good"
@@ -195,7 +203,7 @@ class IntrinsicsOption(BaseModel):
 
 class JobState(StrEnum):
     """
-    Where a reconstruction stands.
+    State of a reconstruction.
     """
 
     queued = "queued"
@@ -232,6 +240,7 @@ class Origin(StrEnum):
 
     live = "live"
     upload = "upload"
+    recovered = "recovered"
 
 
 class Output(StrEnum):
@@ -270,7 +279,7 @@ class PictureKind(StrEnum):
 
 class Pinhole(BaseModel):
     """
-    Intrinsics as sidecars say them, in pixels.
+    Intrinsics in a sidecar, in pixels.
     """
 
     model_config = ConfigDict(
@@ -284,7 +293,7 @@ class Pinhole(BaseModel):
 
 class Policy(StrEnum):
     """
-    What a consumer that falls behind wants. The writer waits for none of them.
+    How a reader is treated when it falls behind. The writer waits for none.
     """
 
     lossless = "lossless"
@@ -300,12 +309,12 @@ class Problem(BaseModel):
     model_config = ConfigDict(
         extra="ignore",
     )
-    type: Annotated[str, Field(description="urn:spiked:problem: and the kind of problem.")]
+    type: Annotated[str, Field(description="urn:spiked:problem: followed by the kind of problem.")]
     title: str
     status: int
-    detail: Annotated[str, Field(description="What is wrong, in one sentence or a few.")]
+    detail: Annotated[str, Field(description="What is wrong, in one or more sentences.")]
     instance: Annotated[str | None, Field(description="Path of the request.")]
-    what_to_do: Annotated[str | None, Field(description="What will help, where something will.")]
+    what_to_do: Annotated[str | None, Field(description="How to correct it, if known.")]
 
 
 class RateHistogram(BaseModel):
@@ -328,11 +337,11 @@ class ReconstructionOptions(BaseModel):
     model_config = ConfigDict(
         extra="ignore",
     )
-    steps: Annotated[int, Field(description="Gradient steps of the refinement after the last frame.")] = 4000
+    steps: Annotated[int, Field(description="Gradient steps of the refinement after the last frame.")] = 2000
     seed: Annotated[int, Field(description="Same input, options and seed: same result.")] = 0
     window_frames: Annotated[
         int | None,
-        Field(description="Frames of a view; follows the motion (8 to 64) if not given."),
+        Field(description="Frames of a view; follows the motion (4 to 64) if not given."),
     ] = None
     threads: Annotated[
         int | None,
@@ -370,22 +379,29 @@ class RecordingOut(BaseModel):
     bytes: int
     frames: int
     first_frame: Annotated[int, Field(description="Index in the capture of the first frame recorded.")]
-    lost: Annotated[int, Field(description="Frames missing between its first and its last.")]
+    lost: Annotated[
+        int,
+        Field(description="Frames missing between its first and the end of the capture."),
+    ]
+    lost_by_cause: Annotated[
+        dict[str, int],
+        Field(description="By cause: device, usb, ring; disk, which took what had come too slowly or not at all."),
+    ]
     sha256: str | None
 
 
 class ReloadedOut(BaseModel):
     """
-    What has come of a reload.
+    Result of a reload.
     """
 
     model_config = ConfigDict(
         extra="ignore",
     )
-    changed: Annotated[list[str], Field(description="In effect now.")]
+    changed: Annotated[list[str], Field(description="Settings whose new value is in effect.")]
     needs_restart: Annotated[
         list[str],
-        Field(description="Different in file or environment, but in effect after a restart."),
+        Field(description="Settings whose new value takes effect after a restart."),
     ]
 
 
@@ -407,6 +423,16 @@ class SceneFormat(StrEnum):
 
     ply = "ply"
     spz = "spz"
+
+
+class Scope(StrEnum):
+    """
+    What a token may do; each includes those before it.
+    """
+
+    read = "read"
+    operate = "operate"
+    admin = "admin"
 
 
 class SensorOut(BaseModel):
@@ -467,9 +493,43 @@ class SettingsOut(BaseModel):
     items: list[SettingOut]
 
 
+class SourceKindOut(BaseModel):
+    """
+    A kind of source, and what can follow its question mark.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    name: str
+    usage: Annotated[str, Field(description="How a source of this kind is written.")]
+    summary: str
+    is_camera: Annotated[bool, Field(description="Hardware: frames that are not read in time are lost.")]
+    can_block: Annotated[
+        bool,
+        Field(description="With `pace=0` it waits for its consumers, so that no frame is lost."),
+    ]
+    takes_path: Annotated[bool, Field(description="A path on the service's machine follows the colon.")]
+    options: Annotated[
+        dict[str, Any],
+        Field(description="JSON Schema of its options: types, limits, defaults and meaning."),
+    ]
+
+
+class SourceKindsOut(BaseModel):
+    """
+    All kinds of sources.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    items: list[SourceKindOut]
+
+
 class Stage(StrEnum):
     """
-    What a reconstruction is at.
+    The phase of a reconstruction.
     """
 
     waiting = "waiting"
@@ -481,7 +541,7 @@ class Stage(StrEnum):
 
 class State(StrEnum):
     """
-    What the tracker knows.
+    State of the tracker.
     """
 
     boot = "boot"
@@ -537,7 +597,7 @@ class TimelineOut(BaseModel):
 
 class TokenOut(BaseModel):
     """
-    A token, without what would open anything.
+    A token, without its secret.
     """
 
     model_config = ConfigDict(
@@ -546,6 +606,10 @@ class TokenOut(BaseModel):
     name: str
     created_at: AwareDatetime
     expires_at: AwareDatetime | None
+    scope: Annotated[
+        Scope,
+        Field(description="read: look and download; operate: change captures, too; admin: set-up, too."),
+    ]
 
 
 class TokensOut(BaseModel):
@@ -611,7 +675,7 @@ class UploadOut(BaseModel):
 
 class UploadSidecar(BaseModel):
     """
-    A recording's sidecar, as `spiked record` writes it beside the `.dat`.
+    A recording's sidecar, as it stands beside the `.dat`.
     """
 
     model_config = ConfigDict(
@@ -757,7 +821,7 @@ class CaptureRequest(BaseModel):
     source: Annotated[
         str | None,
         Field(
-            description="usb0, pcie0, sim: or replay:FILE, with options after a question mark. A file or simulation without `pace` waits for its readers."
+            description="usb0, pcie:PATH, sim: or replay:FILE, with options after a question mark. A file or simulation without `pace` waits for its readers."
         ),
     ] = None
     device: Annotated[
@@ -832,7 +896,7 @@ class DeviceOut(BaseModel):
         extra="ignore",
     )
     id: Annotated[str, Field(description="Its name here; the same after a restart.")]
-    kind: Annotated[str, Field(description="usb, pcie, replay or sim.")]
+    kind: Annotated[str, Field(description="A name from `GET options/sources`.")]
     source: Annotated[str, Field(description="To be given as `source` of a capture.")]
     description: str
     state: DeviceState
@@ -863,7 +927,7 @@ class DevicesOut(BaseModel):
 
 class DoctorItemOut(BaseModel):
     """
-    One thing that was looked at.
+    Result of one check.
     """
 
     model_config = ConfigDict(
@@ -877,7 +941,7 @@ class DoctorItemOut(BaseModel):
 
 class DoctorOut(BaseModel):
     """
-    All that was looked at.
+    Results of all checks.
     """
 
     model_config = ConfigDict(
@@ -888,7 +952,7 @@ class DoctorOut(BaseModel):
 
 class FindingOut(BaseModel):
     """
-    What one check found.
+    Result of one check.
     """
 
     model_config = ConfigDict(
@@ -919,7 +983,7 @@ class GeometryModel(BaseModel):
 
 class HealthOut(BaseModel):
     """
-    How the service is.
+    Health of the service.
     """
 
     model_config = ConfigDict(
@@ -969,7 +1033,14 @@ class ReconstructionOut(BaseModel):
         float | None,
         Field(description="Radiance shown as white in that version, spikes a frame."),
     ]
-    eta_s: float | None
+    queue_place: Annotated[
+        int | None,
+        Field(description="1 is the next to begin; null unless it waits in the queue."),
+    ]
+    eta_s: Annotated[
+        float | None,
+        Field(description="Seconds to its end, those before its turn included; null where that is not known."),
+    ]
 
 
 class ReconstructionPage(BaseModel):
@@ -1011,6 +1082,10 @@ class SystemOut(BaseModel):
         Field(description="Clients of the events now, WebSocket and server-sent events."),
     ]
     zmq: Annotated[ZmqOut | None, Field(description="null where ZeroMQ is turned off.")]
+    scope: Annotated[
+        Scope,
+        Field(description="Scope of the token of this request; admin where no token is required."),
+    ]
 
 
 class UploadRequest(BaseModel):
@@ -1043,7 +1118,9 @@ class CaptureOut(BaseModel):
     keep: Annotated[bool, Field(description="Retention leaves it alone.")]
     origin: Annotated[
         Origin,
-        Field(description="live: captured here; upload: a recording from elsewhere."),
+        Field(
+            description="live: captured here; upload: a recording from elsewhere; recovered: found in the data folder, its row rebuilt from its files."
+        ),
     ]
     source: str
     state: CaptureState

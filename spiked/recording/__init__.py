@@ -1,7 +1,7 @@
-"""Recordings: raw `.dat` files read by memory map, the sidecars that say what they hold, writing and checking them."""
+"""Recordings: raw `.dat` files and their sidecars. Reading by memory map, writing, checking and recovering."""
 
 from spiked.recording.durability import LIVE, PLAIN, Durability, Sync
-from spiked.recording.geometry import Flavour, Origin, OriginKind
+from spiked.recording.geometry import Flavour, Origin, OriginKind, RecordingGeometry
 from spiked.recording.index import Index, index_path, read_index
 from spiked.recording.reader import Recording, open_recording
 from spiked.recording.recover import Recovered, recover
@@ -20,6 +20,7 @@ __all__ = [
     "Origin",
     "OriginKind",
     "Recording",
+    "RecordingGeometry",
     "RecordingWriter",
     "Recovered",
     "Sidecar",

@@ -1,6 +1,6 @@
-"""The growing end of a file of frames, written past the page cache.
+"""Appends frames to a file with direct writes, past the page cache.
 
-Through the page cache a megapixel camera costs more than a core, spent on copies that nobody reads again.
+Through the page cache, a megapixel camera costs more than one core, for copies that are not read again.
 """
 
 import errno
@@ -13,21 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 _PAGE = 4096
-"""What direct writes begin and end at: the block of most file systems, and a multiple of every disk's sector."""
+"""Alignment of direct writes, bytes: the block of most file systems, a multiple of every disk's sector."""
 _STAGED_BYTES = 4 << 20
+"""Size of the aligned buffer for direct writes."""
 _WORTHWHILE_BYTES = 64 << 10
-"""Shorter direct writes wait for the disk more than they save."""
+"""Least size of a direct write: shorter ones cost more in waiting for the disk than they save."""
 
 
 class Appender:
-    """Appends to a file; what was appended is the kernel's, whatever becomes of this process. Used by one thread.
+    """Appends to a file. Appended bytes are with the kernel and survive the death of this process. Used by one thread.
 
-    Whole pages go to the disk directly (O_DIRECT), if the file system can do that; what is left at both ends of an
-    append goes through the page cache. No page is written both ways, so that neither waits for the other.
+    Whole pages are written directly (O_DIRECT) if the file system supports it; the rest at both ends of an append goes
+    through the page cache. No page is written both ways, so that neither waits for the other.
     """
 
     def __init__(self, path: Path, *, resume: bool, direct: bool) -> None:
-        """A new file, or with `resume` behind the end of one that exists. Raises OSError."""
+        """Create a file, or with `resume` append to an existing one. Raises OSError."""
         self._file = os.open(path, os.O_RDWR | os.O_CLOEXEC | (0 if resume else os.O_CREAT | os.O_EXCL), 0o666)
         self._direct: int | None = None
         self._staged = np.empty(0, np.uint8)
@@ -37,11 +38,10 @@ class Appender:
                 self._staged = np.frombuffer(mmap.mmap(-1, _STAGED_BYTES), np.uint8)
         self.size = os.fstat(self._file).st_size
         self.direct_bytes = 0
-        """How many went past the page cache."""
+        """Bytes written past the page cache."""
 
     def append(self, data: NDArray[np.uint8], cached: bool = False) -> None:
-        """Bytes, uint8 [n]; all through the page cache if `cached`. Raises OSError; cut() takes back what was written
-        before."""
+        """Append bytes, uint8 [n]; through the page cache if `cached`. Raises OSError; `cut` then removes a part."""
         before = -self.size % _PAGE
         whole = max(len(data) - before, 0) // _PAGE * _PAGE
         if cached or whole < _WORTHWHILE_BYTES:
@@ -53,7 +53,7 @@ class Appender:
             self._staged[:piece] = data[before : before + piece]
             written = self._write_directly(self._direct, piece)
             before += written
-            if written < piece:  # a full disk, which the rest will tell, or none for direct writes
+            if written < piece:  # a full disk, which the next write reports, or no direct writes
                 break
         self._write(data[before:])
 
@@ -71,19 +71,19 @@ class Appender:
             if error.errno != errno.EINVAL:
                 raise
             os.close(file)
-            self._direct = None  # a file system that wants other pages
+            self._direct = None  # the file system needs another alignment
             return 0
         self.size += written
         self.direct_bytes += written
         return written
 
     def cut(self, size: int) -> None:
-        """Cut the file to that size; space taken in advance is given back, too. Raises OSError."""
+        """Truncate the file and release preallocated space. Raises OSError."""
         os.ftruncate(self._file, size)
         self.size = size
 
     def fileno(self) -> int:
-        """Descriptor, for syncing and for taking space."""
+        """Its descriptor, for syncing and preallocation."""
         return self._file
 
     def close(self) -> None:

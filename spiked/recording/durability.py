@@ -1,4 +1,4 @@
-"""How hard a recording is held on to: its index, when it is synced, and the space it takes in advance."""
+"""Durability of a recording: its index, syncing to disk, and preallocated space."""
 
 import ctypes
 import errno
@@ -9,46 +9,54 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
-_KEEP_SIZE = 1  # FALLOC_FL_KEEP_SIZE of <linux/falloc.h>: a killed writer leaves no zeros behind its last frame
-_BEGIN_WRITE = 2  # SYNC_FILE_RANGE_WRITE of <linux/fs.h>: does not wait, and takes no error from who asks later
-_EARLY_BYTES = 16 << 20
-_PERIOD_S = 1.0
+_KEEP_SIZE = 1  # FALLOC_FL_KEEP_SIZE of <linux/falloc.h>: no zeros follow the last frame of a killed writer
+_BEGIN_WRITE = 2  # SYNC_FILE_RANGE_WRITE of <linux/fs.h>: does not wait, and does not consume errors
+EARLY_BYTES = 16 << 20
+"""Written bytes after which writeback starts before the next sync."""
+SYNC_PERIOD_S = 1.0
+"""Time between syncs of `Sync.SECOND`, seconds."""
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
 class Sync(StrEnum):
-    """When written frames are forced from the kernel onto the disk. A kill loses nothing either way."""
+    """When written frames are synced from the kernel to the disk. A killed process loses none of them."""
 
     CLOSE = "close"
-    """At the end; a power cut may lose all that the kernel had not written by itself."""
+    """At the end. A power failure may lose all that the kernel had not written yet."""
     SECOND = "second"
-    """Every second, beside the writing; a power cut loses about that much."""
+    """Every second, in parallel with writing. A power failure loses about one second."""
     BLOCK = "block"
-    """After every write, which waits for it."""
+    """After every write, which waits for the sync."""
 
 
 @dataclass(frozen=True)
 class Durability:
-    """What a recording writer does beyond writing frames."""
+    """Options of a recording writer."""
 
     index: bool = False
     """Keep an index with checksums beside the frames."""
     sync: Sync = Sync.CLOSE
     preallocate_bytes: int = 0
-    """Space taken from the disk ahead of the frames, and given back at the end."""
+    """Step by which disk space is allocated ahead of the frames; the rest is released at the end."""
     reserve_bytes: int = 0
-    """Free space that is left to others: when there is less, the disk counts as full."""
+    """Free space kept for other programs: with less, the disk counts as full."""
     direct: bool = False
-    """Write past the page cache, at a fraction of the processor's time; an append then waits for the disk."""
+    """Write past the page cache, with a fraction of the CPU time; an append then waits for the disk."""
 
 
 PLAIN = Durability()
+"""For programs that can write a recording again."""
 LIVE = Durability(index=True, sync=Sync.SECOND, preallocate_bytes=64 << 20, reserve_bytes=64 << 20, direct=True)
-"""For cameras that do not wait."""
+"""For live cameras."""
+
+
+def kept_for_others(durability: Durability, total_bytes: int) -> int:
+    """Bytes that a writer leaves free on a disk of `total_bytes`."""
+    return min(durability.reserve_bytes, total_bytes // 20)
 
 
 class Allocator:
-    """Takes space ahead of a growing file, as far as the disk has it."""
+    """Allocates disk space ahead of a growing file, and keeps a reserve free."""
 
     def __init__(self, file: int, durability: Durability, size: int) -> None:
         self._file = file
@@ -58,18 +66,20 @@ class Allocator:
         self._possible = self._step > 0
 
     def before(self, end: int) -> None:
-        """To be called before the file grows to `end` bytes. Raises OSError ENOSPC when only the reserve is left."""
+        """Call before the file grows to `end` bytes. Raises OSError ENOSPC if only the reserve is left."""
         if self._reserve and end > self._checked:
             stat = os.fstatvfs(self._file)
             left = stat.f_bavail * stat.f_frsize - (end - self._allocated)
             if left < self._reserve:
-                raise OSError(errno.ENOSPC, f"the disk is full up to {self._reserve >> 20 or 1} MiB kept for others")
-            # Looked at again well before the rest could be used up.
+                raise OSError(
+                    errno.ENOSPC, f"the disk is full except for {self._reserve >> 20 or 1} MiB kept for other programs"
+                )
+            # The next check is well before the free space can be used up.
             self._checked = end + max((left - self._reserve) // 8, 1)
         if self._possible and end > self._allocated:
             size = max(self._step, end - self._allocated)
             if _libc.fallocate(self._file, _KEEP_SIZE, ctypes.c_int64(self._allocated), ctypes.c_int64(size)):
-                # Too little space for a whole step, or a file system without the means: writing itself will tell.
+                # Too little space for a step, or not supported by the file system: the write reports a full disk.
                 self._possible = ctypes.get_errno() == errno.EINTR
             else:
                 self._allocated += size
@@ -77,21 +87,26 @@ class Allocator:
 
 
 def _fitting(file: int, durability: Durability) -> tuple[int, int]:
-    """Step and reserve, made smaller on a small disk."""
+    """Step and reserve in bytes, reduced on a small disk."""
     stat = os.fstatvfs(file)
     total = stat.f_blocks * stat.f_frsize
-    return min(durability.preallocate_bytes, total // 32), min(durability.reserve_bytes, total // 20)
+    return min(durability.preallocate_bytes, total // 32), kept_for_others(durability, total)
+
+
+def begin_write(file: int, offset: int, size: int) -> None:
+    """Start writeback of a range of bytes of an open file to the disk, without waiting."""
+    _libc.sync_file_range(file, ctypes.c_int64(offset), ctypes.c_int64(size), _BEGIN_WRITE)
 
 
 class Syncer:
-    """Forces files onto the disk every second, on a thread of its own.
+    """Syncs files to the disk every second, on a thread of its own.
 
-    In between it has the kernel begin to write what has come: the disk works while frames are copied, and a sync, the
-    last one too, has little left to wait for.
+    In between it starts writeback of new bytes, so that the disk works while frames are copied and each sync has little
+    left to write.
     """
 
     def __init__(self, file: int, size: int, sync: Callable[[], None]) -> None:
-        """`file` is the descriptor of the file that grows, now of `size` bytes."""
+        """`file` is the descriptor of the growing file, `size` its present length in bytes."""
         self._file = file
         self._written = self._begun = size
         self._sync = sync
@@ -102,30 +117,30 @@ class Syncer:
         self._thread.start()
 
     def check(self) -> None:
-        """Raise the OSError that syncing met, if it did."""
+        """Raise the OSError of the sync thread, if there was one."""
         if self._error is not None:
             raise self._error
 
     def written(self, size: int) -> None:
-        """Tell how long the file is now."""
+        """State the present length of the file."""
         self._written = size
-        if size - self._begun >= _EARLY_BYTES:
+        if size - self._begun >= EARLY_BYTES:
             self._wake.set()
 
     def close(self) -> None:
-        """End the thread, after the sync that may be going on."""
+        """End the thread, after a running sync."""
         self._over.set()
         self._wake.set()
         self._thread.join()
 
     def _run(self) -> None:
-        due_s = time.monotonic() + _PERIOD_S
+        due_s = time.monotonic() + SYNC_PERIOD_S
         while True:
             self._wake.wait(max(0.0, due_s - time.monotonic()))
             self._wake.clear()
             if self._over.is_set():
                 return
-            self._begin()
+            self._start_writeback()
             if time.monotonic() < due_s:
                 continue
             try:
@@ -133,11 +148,11 @@ class Syncer:
             except OSError as error:
                 self._error = error
                 return
-            due_s = time.monotonic() + _PERIOD_S
+            due_s = time.monotonic() + SYNC_PERIOD_S
 
-    def _begin(self) -> None:
-        """Only begins to write, so errors are left for the sync, which is told of them as well."""
+    def _start_writeback(self) -> None:
+        """Start writeback. Its errors are reported by the next sync."""
         size = self._written - self._begun
         if size > 0:
-            _libc.sync_file_range(self._file, ctypes.c_int64(self._begun), ctypes.c_int64(size), _BEGIN_WRITE)
+            begin_write(self._file, self._begun, size)
             self._begun += size

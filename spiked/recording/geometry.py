@@ -1,19 +1,47 @@
-"""Which camera a file without a sidecar comes from: the known flavours of camera.md, and guessing among them."""
+"""Geometry of a recording: stated by a caller, or guessed from the file's size if there is no sidecar."""
 
 from dataclasses import dataclass
 from enum import Enum, StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spiked.errors import RecordingError
-from spiked.sensor import Layout
+from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic
 
 DEFAULT_RATE_HZ = 20_000.0
 
 
+@dataclass(frozen=True)
+class RecordingGeometry:
+    """Geometry stated by a caller. A stated field overrides the sidecar; None: not stated."""
+
+    width: int | None = None
+    """Pixels in a row."""
+    height: int | None = None
+    """Rows."""
+    frame_rate_hz: float | None = None
+    layout: Layout | None = None
+    bit_order: BitOrder | None = None
+    flipped: bool | None = None
+    """Rows are stored bottom-up."""
+    mosaic: Mosaic | None = None
+    """Colour filter pattern of the upright image."""
+    intrinsics: Intrinsics | None = None
+
+    def stated(self) -> dict[str, Any]:
+        """The stated fields by name: keyword arguments of `open_recording` and `verify`, fields of `Sensor`."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+    @property
+    def states_size(self) -> bool:
+        """Whether a field is stated that changes the bytes of a frame: width, height or layout."""
+        return any(value is not None for value in (self.width, self.height, self.layout))
+
+
 class OriginKind(StrEnum):
-    """Where a recording's geometry comes from."""
+    """Source of a recording's geometry."""
 
     GIVEN = "given"
     SIDECAR = "sidecar"
@@ -22,7 +50,7 @@ class OriginKind(StrEnum):
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a recording's geometry comes from, and how to say it."""
+    """Source of a recording's geometry, and a sentence that describes it."""
 
     kind: OriginKind
     sentence: str
@@ -30,18 +58,18 @@ class Origin:
 
 @dataclass(frozen=True)
 class Format:
-    """A size and layout that recordings are known to have."""
+    """A known size and layout of recordings."""
 
     width: int
     height: int
     frame_bytes: int
     layout: Layout | None
-    """None: known, but this library cannot read it."""
+    """None: known, but not readable by this library."""
     name: str
 
 
 class Flavour(Enum):
-    """The known flavours of frame data, by the letters of camera.md."""
+    """Known formats of frame data: A to C of the USB3 camera, D and E of the PCIe camera, F of simulated sets."""
 
     A = Format(400, 250, 12_500, Layout.COMPACT, "compact 400x250")
     B = Format(400, 250, 13_000, Layout.ROW_TAGGED, "row-tagged 400x250")
@@ -55,6 +83,7 @@ class Flavour(Enum):
 
 
 WIRE_MAGIC = bytes.fromhex("00636063")
+"""First bytes of a frame header of the USB3 camera."""
 
 
 def tags_agree(frames: NDArray[np.uint8], height: int, row_bytes: int) -> NDArray[np.bool_]:
@@ -66,10 +95,10 @@ def tags_agree(frames: NDArray[np.uint8], height: int, row_bytes: int) -> NDArra
 
 
 def guess(name: str, data: NDArray[np.uint8]) -> Format:
-    """The one known flavour whose frames fill `data` (the file's bytes) exactly; `name` is for messages.
+    """The one known format whose frames fill `data` (the file's bytes) exactly; `name` is for messages.
 
-    Row numbers tell flavour B from anything else; the others are told by size alone. Raises RecordingError when none
-    or several fit.
+    The row-tagged format is recognised by its row numbers, the others by size only. Raises RecordingError if none or
+    several fit.
     """
     tagged: Format = Flavour.B.value
     if data.size >= tagged.frame_bytes:

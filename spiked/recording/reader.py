@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from spiked.blocks import unpack
 from spiked.errors import ConfigurationError, RecordingError
-from spiked.recording.geometry import DEFAULT_RATE_HZ, Origin, OriginKind, guess, tags_agree
+from spiked.recording.geometry import DEFAULT_RATE_HZ, Origin, OriginKind, RecordingGeometry, guess, tags_agree
+from spiked.recording.host_time import host_times_ns
 from spiked.recording.sidecar import (
     ClockPair,
     Gap,
@@ -23,7 +24,7 @@ from spiked.recording.sidecar import (
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
 
 REVERSED_BITS = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)[:, ::-1], axis=1)[:, 0]
-"""Each byte with its bits in the other order, uint8 [256]."""
+"""Each byte with its bits reversed, uint8 [256]."""
 
 _MAGICS = {
     b"\x89PNG\r\n\x1a\n": "a PNG picture",
@@ -36,29 +37,31 @@ _MAGICS = {
 }
 
 TAGS_CHECKED = 512
-"""Frames whose row numbers are looked at when a file is opened, spread evenly; `verify` looks at all."""
+"""Frames whose row numbers are checked when a file is opened, spread evenly; `verify` checks all."""
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """An open recording. Frames stay on disk until they are looked at."""
+    """An open recording. Frames are read from disk when they are accessed."""
 
     path: Path
     sensor: Sensor
     frames: int
     """Whole frames in the file."""
     origin: Origin
-    """Where the geometry comes from."""
+    """Source of the geometry."""
     warnings: tuple[str, ...]
-    """What a user should know, one sentence each."""
+    """Warnings for the user, one sentence each."""
     contradictions: tuple[str, ...]
-    """What makes the file unusable; only `verify` lets such a recording be."""
+    """Errors that make the file unusable; empty except in the result of `verify`."""
+    overruled: tuple[str, ...]
+    """Fields in which the caller overrides the sidecar, one sentence each; also among the warnings."""
     trailing_bytes: int
     """Bytes of an unfinished last frame."""
     gaps: tuple[Gap, ...]
     clock: tuple[ClockPair, ...]
     label_types: tuple[float, ...]
-    """SpikeCV's numbers of the label types, when a config.yaml names them."""
+    """SpikeCV's ids of the label types, from a config.yaml."""
     data: NDArray[np.uint8]
     """The whole frames as stored, uint8 [frames, frame_bytes], a read-only memory map."""
 
@@ -78,7 +81,7 @@ class Recording:
     def compact(self, first: int, count: int) -> NDArray[np.uint8]:
         """Frames without row numbers and LSB first, in stored row order, uint8 [count, height * row_bytes].
 
-        A view where the file is stored so.
+        A view of the memory map if the file is stored in this format.
         """
         frames = self.read(first, count)
         if self.sensor.layout is Layout.ROW_TAGGED:
@@ -96,9 +99,18 @@ class Recording:
         return image
 
     def chunks(self, count: int = 256) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """All frames in order: (index of the first, stored frames uint8 [<= count, frame_bytes])."""
+        """All frames in order, as (index of the first, stored frames uint8 [<= count, frame_bytes])."""
         for first in range(0, self.frames, count):
             yield first, self.read(first, min(count, self.frames - first))
+
+    def unix_ns(self, frames: ArrayLike) -> NDArray[np.int64]:
+        """Host times at which frames had arrived whole, Unix time in ns, int64 of the shape of `frames`.
+
+        `frames` are indices in the capture, see `capture_index`. Raises RecordingError without clock pairs.
+        """
+        if not self.clock:
+            raise RecordingError(f"{self.path}: its sidecar has no clock pairs, so the times of its frames are unknown")
+        return host_times_ns(self.clock, frames, self.sensor.frame_rate_hz)
 
     def capture_index(self, k: int) -> int:
         """Index in the capture of stored frame k: k plus the frames lost before it."""
@@ -121,42 +133,19 @@ def open_recording(
     mosaic: Mosaic | None = None,
     intrinsics: Intrinsics | None = None,
 ) -> Recording:
-    """Open a `.dat` file. Arguments win over its sidecar or SpikeCV's config.yaml, these over a guess from its size.
+    """Open a `.dat` file. Geometry comes from the arguments, else the sidecar or SpikeCV's config.yaml, else the size.
 
-    Raises RecordingError with one line that says what is wrong with the file, its sidecar or the arguments.
+    Raises RecordingError with one line about the error in the file, its sidecar or the arguments.
     """
-    given = Given(width, height, frame_rate_hz, layout, bit_order, flipped, mosaic, intrinsics)
+    given = RecordingGeometry(width, height, frame_rate_hz, layout, bit_order, flipped, mosaic, intrinsics)
     recording = open_unchecked(Path(path), given)
     if recording.contradictions:
         raise RecordingError(f"{recording.path}: {recording.contradictions[0]}")
     return recording
 
 
-@dataclass(frozen=True)
-class Given:
-    """What the caller says about a recording; None: nothing."""
-
-    width: int | None = None
-    height: int | None = None
-    frame_rate_hz: float | None = None
-    layout: Layout | None = None
-    bit_order: BitOrder | None = None
-    flipped: bool | None = None
-    mosaic: Mosaic | None = None
-    intrinsics: Intrinsics | None = None
-
-    def fields(self) -> dict[str, object]:
-        """What is said, by the names of `Sensor`'s fields."""
-        return {name: value for name, value in vars(self).items() if value is not None}
-
-    @property
-    def geometry(self) -> bool:
-        """Whether it changes how bytes become frames."""
-        return any(value is not None for value in (self.width, self.height, self.layout))
-
-
-def open_unchecked(path: Path, given: Given) -> Recording:
-    """As `open_recording`, but contradictions are noted in the recording and not raised."""
+def open_unchecked(path: Path, given: RecordingGeometry) -> Recording:
+    """As `open_recording`, but contradictions are fields of the result and not raised."""
     data = _map(path)
     described = _describe(path, data, given)
     sensor = described.sensor
@@ -168,15 +157,15 @@ def open_unchecked(path: Path, given: Given) -> Recording:
         )
     warnings, contradictions = list(described.warnings), []
     if trailing:
-        warnings.append(f"the last frame is truncated to {trailing} of {sensor.frame_bytes} bytes and is left out")
+        warnings.append(f"the last frame is truncated to {trailing} of {sensor.frame_bytes} bytes and is ignored")
     sidecar = described.sidecar
     if sidecar is not None and sidecar.frames is None:
-        warnings.append("the recording was not finished: its sidecar names no number of frames")
-    # A file cut within its last frame is the common interruption; anything else is another file's sidecar.
-    elif sidecar is not None and not given.geometry and sidecar.frames not in (frames, frames + (trailing > 0)):
+        warnings.append("the recording was not finished: its sidecar has no number of frames")
+    # A file cut within its last frame is a common interruption; any other difference means another file's sidecar.
+    elif sidecar is not None and not given.states_size and sidecar.frames not in (frames, frames + (trailing > 0)):
         contradictions.append(
             f"its sidecar {sidecar_path(path).name} says {sidecar.frames} frames of {sensor.width}x{sensor.height}, "
-            f"but the file's {data.size} bytes hold {frames}; mend the sidecar or give the geometry"
+            f"but the file's {data.size} bytes hold {frames}; correct the sidecar or state the geometry"
         )
     whole = data[: frames * sensor.frame_bytes].reshape(frames, sensor.frame_bytes)
     if sensor.layout is Layout.ROW_TAGGED:
@@ -194,6 +183,7 @@ def open_unchecked(path: Path, given: Given) -> Recording:
         described.origin,
         tuple(warnings),
         tuple(contradictions),
+        described.overruled,
         trailing,
         sidecar.gaps if sidecar else (),
         sidecar.clock if sidecar else (),
@@ -224,23 +214,31 @@ class _Description:
     sensor: Sensor
     origin: Origin
     warnings: tuple[str, ...] = ()
+    overruled: tuple[str, ...] = ()
     sidecar: Sidecar | None = None
     label_types: tuple[float, ...] = ()
 
 
-def _describe(path: Path, data: NDArray[np.uint8], given: Given) -> _Description:
+def _describe(path: Path, data: NDArray[np.uint8], given: RecordingGeometry) -> _Description:
     described = _from_sidecar(path) or _from_spikecv(path, given) or _from_size(path, data, given)
-    fields = given.fields()
+    fields = given.stated()
     if not fields or described.origin.kind is not OriginKind.SIDECAR:
         return described
     sensor = _replaced(path, described.sensor, fields)
     changed = [name for name in fields if getattr(sensor, name) != getattr(described.sensor, name)]
     if not changed:
         return described
-    told = ", ".join(f"{name} {getattr(sensor, name)} (not {getattr(described.sensor, name)})" for name in changed)
-    origin = Origin(OriginKind.GIVEN, f"{told} as given, the rest {described.origin.sentence}")
-    warnings = (*described.warnings, f"what was given contradicts the sidecar: {told}")
-    return replace(described, sensor=sensor, origin=origin, warnings=warnings)
+    overrides = ", ".join(f"{name} {getattr(sensor, name)} (not {getattr(described.sensor, name)})" for name in changed)
+    origin = Origin(OriginKind.GIVEN, f"{overrides} as given, the rest {described.origin.sentence}")
+    overruled = f"stated geometry contradicts the sidecar: {overrides}"
+    warnings = (*described.warnings, overruled)
+    if {"width", "height"} & set(changed) and sensor.intrinsics is not None and given.intrinsics is None:
+        of = described.sensor
+        sensor = replace(sensor, intrinsics=None)
+        warnings += (
+            f"the sidecar's optics are for {of.width}x{of.height} and are ignored; give --fov or --intrinsics",
+        )
+    return replace(described, sensor=sensor, origin=origin, warnings=warnings, overruled=(overruled,))
 
 
 def _replaced(path: Path, sensor: Sensor, fields: dict[str, object]) -> Sensor:
@@ -260,7 +258,7 @@ def _from_sidecar(path: Path) -> _Description | None:
     )
 
 
-def _from_spikecv(path: Path, given: Given) -> _Description | None:
+def _from_spikecv(path: Path, given: RecordingGeometry) -> _Description | None:
     if given.width is not None and given.height is not None:
         return None
     beside = find_spikecv_config(path)
@@ -272,22 +270,22 @@ def _from_spikecv(path: Path, given: Given) -> _Description | None:
     return _Description(sensor, Origin(OriginKind.SIDECAR, sentence), label_types=config.labeled_data_type)
 
 
-def _from_size(path: Path, data: NDArray[np.uint8], given: Given) -> _Description:
+def _from_size(path: Path, data: NDArray[np.uint8], given: RecordingGeometry) -> _Description:
     if (given.width is None) != (given.height is None):
         raise RecordingError(f"{path}: give both width and height, or neither")
     if given.width is not None:
-        sensor = _replaced(path, Sensor(8, 1, DEFAULT_RATE_HZ), given.fields())
+        sensor = _replaced(path, Sensor(8, 1, DEFAULT_RATE_HZ), given.stated())
         return _Description(
             sensor, Origin(OriginKind.GIVEN, f"{sensor.width}x{sensor.height} as given; {_assumed(given)}")
         )
     flavour = guess(str(path), data)
-    fields = {"width": flavour.width, "height": flavour.height, "layout": flavour.layout, **given.fields()}
+    fields = {"width": flavour.width, "height": flavour.height, "layout": flavour.layout, **given.stated()}
     sensor = _replaced(path, Sensor(8, 1, DEFAULT_RATE_HZ), fields)
     sentence = f"{flavour.name}, the only known flavour that fits the file; {_assumed(given)}"
     return _Description(sensor, Origin(OriginKind.GUESSED, sentence))
 
 
-def _assumed(given: Given) -> str:
+def _assumed(given: RecordingGeometry) -> str:
     rate = f"{DEFAULT_RATE_HZ:g} Hz" if given.frame_rate_hz is None else ""
     rows = "rows bottom-up" if given.flipped is None else ""
     bits = "least significant bit first" if given.bit_order is None else ""

@@ -1,4 +1,4 @@
-"""Making an unfinished recording whole again: what its writer had finished stays, the rest is cut off."""
+"""Recovers an unfinished recording: keeps its complete blocks and cuts off the rest."""
 
 import os
 from dataclasses import dataclass
@@ -13,22 +13,22 @@ from spiked.recording.sidecar import Gap, Sidecar, read_sidecar, sidecar_path, w
 
 @dataclass(frozen=True)
 class Recovered:
-    """A recording up to its last whole block."""
+    """Result of recovering a recording."""
 
     sidecar: Sidecar
-    """With the losses and clock pairs that the index knows."""
+    """The sidecar, with the gaps and clock pairs of the index."""
     frames: int
     dropped_bytes: int
-    """What was cut off behind them."""
+    """Bytes cut off after them."""
     was_finished: bool
-    """Its writer had closed it; nothing was changed."""
+    """The recording was finished; nothing was changed."""
 
 
 def recover(path: Path, *, finish: bool = False) -> Recovered:
-    """Cut a recording whose writer has died behind its last whole block; with `finish`, complete its sidecar.
+    """Cut the recording of a dead writer after its last complete block; with `finish`, complete its sidecar.
 
-    Blocks that were not synced yet are compared with their checksums. Without an index, whole frames count. Must not be
-    called while a writer lives. Raises RecordingError for a file without a sidecar, or if it cannot be changed.
+    Blocks that were not synced are compared with their checksums. Without an index, whole frames are kept. Must not be
+    called while a writer is alive. Raises RecordingError for a file without a sidecar, or if it cannot be changed.
     """
     sidecar = read_sidecar(sidecar_path(path))
     frame_bytes = sidecar.sensor().frame_bytes
@@ -47,12 +47,12 @@ def recover(path: Path, *, finish: bool = False) -> Recovered:
             sidecar = sidecar.model_copy(update={"frames": frames})
             write_sidecar(sidecar_path(path), sidecar)
     except OSError as error:
-        raise RecordingError(f"{path}: the recording cannot be made whole: {error.strerror}") from error
+        raise RecordingError(f"{path}: the recording cannot be recovered: {error.strerror}") from error
     return Recovered(sidecar, frames, size - frames * frame_bytes, was_finished=False)
 
 
 def damaged_blocks(path: Path, blocks: Index) -> list[Gap]:
-    """Blocks of the index whose frames are not what was written, as ranges of frames, cause disk."""
+    """Blocks whose frames differ from their checksums, as gaps of cause disk."""
     with path.open("rb") as file:
         return [
             Gap(first=int(entry["first"]), count=int(entry["count"]), cause="disk")

@@ -1,4 +1,4 @@
-"""The JSON file beside a recording, `NAME.json` beside `NAME.dat`, and the `config.yaml` of SpikeCV's data sets."""
+"""The sidecar of a recording, `NAME.json` beside `NAME.dat`, and the `config.yaml` of SpikeCV's data sets."""
 
 import os
 from pathlib import Path
@@ -11,7 +11,7 @@ from spiked.errors import ConfigurationError, RecordingError
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
 
 RESERVED_BYTES = 256 << 10
-"""Enough for some thousand losses."""
+"""Disk space reserved for the final sidecar: enough for some thousand gaps."""
 
 
 class _Strict(BaseModel):
@@ -25,18 +25,18 @@ class Gap(_Strict):
     """Index in the capture, counted from the recording's first frame."""
     count: StrictInt = Field(gt=0)
     cause: str
-    """Where they were lost: device, usb, ring or disk."""
+    """Cause of the loss: device, usb, ring or disk."""
 
 
 class ClockPair(_Strict):
-    """The host's clock when a frame arrived."""
+    """Host time at which a frame had arrived whole, Unix time in ns."""
 
     frame: StrictInt = Field(ge=0)
     unix_ns: StrictInt
 
 
 class Pinhole(_Strict):
-    """Intrinsics as sidecars say them, in pixels."""
+    """Intrinsics in a sidecar, in pixels."""
 
     fx: StrictFloat = Field(gt=0)
     fy: StrictFloat = Field(gt=0)
@@ -45,7 +45,7 @@ class Pinhole(_Strict):
 
 
 class Sidecar(BaseModel):
-    """What a sidecar says. Fields that this version does not know are kept by `read_sidecar` and written back."""
+    """Content of a sidecar. Unknown fields are kept by `read_sidecar` and written back."""
 
     model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
 
@@ -53,9 +53,9 @@ class Sidecar(BaseModel):
     width: StrictInt = Field(gt=0)
     height: StrictInt = Field(gt=0)
     frame_rate: StrictFloat = Field(gt=0)
-    """Frames a second."""
+    """Frames per second."""
     frames: StrictInt | None = Field(ge=0)
-    """Whole frames in the file; null while the recording runs, and so after a crash."""
+    """Whole frames in the file; null while the recording runs, and after a crash."""
     bit_order: BitOrder
     flipped: StrictBool
     """Rows are stored bottom-up."""
@@ -63,7 +63,7 @@ class Sidecar(BaseModel):
     """Colour pattern of the upright image."""
     intrinsics: Pinhole | None = None
     pixel_centre: StrictFloat = Field(0.5, ge=0, le=0.5)
-    """Where the intrinsics put the centre of the first pixel."""
+    """Coordinate of the first pixel's centre in the convention of the intrinsics."""
     note: str = ""
     first_frame: StrictInt = Field(default=0, ge=0)
     """Index in the capture of the file's first frame."""
@@ -72,7 +72,7 @@ class Sidecar(BaseModel):
     calibration: str | None = None
     """Calibration file, relative to the sidecar."""
     device: dict[str, Any] | None = None
-    """What the camera said about itself."""
+    """Properties that the camera reported."""
 
     @classmethod
     def of(cls, sensor: Sensor, frames: int | None, **more: Any) -> "Sidecar":
@@ -92,7 +92,7 @@ class Sidecar(BaseModel):
         )
 
     def sensor(self) -> Sensor:
-        """The camera it describes. Raises ConfigurationError for a geometry that cannot be."""
+        """The sensor it describes. Raises ConfigurationError for an invalid geometry."""
         k = self.intrinsics
         shift = 0.5 - self.pixel_centre
         return Sensor(
@@ -108,21 +108,21 @@ class Sidecar(BaseModel):
 
 
 def sidecar_path(recording: Path) -> Path:
-    """Where the sidecar of a recording is."""
+    """Path of a recording's sidecar."""
     return recording.with_suffix(".json")
 
 
 def read_sidecar(path: Path) -> Sidecar:
-    """Read and check a sidecar. Raises RecordingError in one line that names the field."""
+    """Read and check a sidecar. Raises RecordingError with one line that names the field."""
     try:
         sidecar = Sidecar.model_validate_json(path.read_bytes())
         sidecar.sensor()
     except OSError as error:
         raise RecordingError(f"{path}: the sidecar cannot be read: {error.strerror}") from error
     except ValidationError as error:
-        raise RecordingError(f"{path}: {_first_problem(error)}; mend the sidecar") from error
+        raise RecordingError(f"{path}: {_first_problem(error)}; correct the sidecar") from error
     except ConfigurationError as error:
-        raise RecordingError(f"{path}: {error}; mend the sidecar") from error
+        raise RecordingError(f"{path}: {error}; correct the sidecar") from error
     return sidecar
 
 
@@ -137,10 +137,10 @@ def _first_problem(error: ValidationError) -> str:
 
 
 def write_sidecar(path: Path, sidecar: Sidecar) -> None:
-    """Write a sidecar so that after a crash there is the old one or the new one, whole. Raises OSError."""
+    """Write a sidecar atomically: after a crash there is the old one or the new one. Raises OSError."""
     temporary = _temporary(path)
     content = sidecar.model_dump_json(indent=1).encode()
-    # Into the reserved space if there is some: opening it anew would give that back first.
+    # Write into the reserved space, if any: opening the file with "wb" would release it first.
     with temporary.open("r+b" if temporary.exists() else "wb") as file:
         file.write(content)
         file.truncate()
@@ -150,7 +150,7 @@ def write_sidecar(path: Path, sidecar: Sidecar) -> None:
 
 
 def reserve_sidecar(path: Path) -> None:
-    """Take the space that the next `write_sidecar` needs, so that it succeeds on a full disk. Raises OSError."""
+    """Reserve the disk space of the next `write_sidecar`, so that it succeeds on a full disk. Raises OSError."""
     with _temporary(path).open("wb") as file:
         os.posix_fallocate(file.fileno(), 0, RESERVED_BYTES)
 
@@ -160,7 +160,7 @@ def _temporary(path: Path) -> Path:
 
 
 class SpikeCvConfig(BaseModel):
-    """`config.yaml` of a SpikeCV data set: it knows sizes and labels, but neither rate nor orientation."""
+    """`config.yaml` of a SpikeCV data set. It has sizes and labels, but no rate or orientation."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -181,7 +181,7 @@ def find_spikecv_config(recording: Path) -> Path | None:
 
 
 def read_spikecv_config(path: Path) -> SpikeCvConfig | None:
-    """Read a SpikeCV configuration; None when the file is somebody else's (it has neither size field)."""
+    """Read a SpikeCV configuration; None if the file has neither size field and so is of another program."""
     try:
         content = yaml.safe_load(path.read_bytes())
         if not isinstance(content, dict) or not content.keys() & {"spike_w", "spike_h"}:
@@ -192,4 +192,4 @@ def read_spikecv_config(path: Path) -> SpikeCvConfig | None:
     except yaml.YAMLError as error:
         raise RecordingError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
     except ValidationError as error:
-        raise RecordingError(f"{path}: {_first_problem(error)}; mend it or give the geometry yourself") from error
+        raise RecordingError(f"{path}: {_first_problem(error)}; correct it or state the geometry") from error

@@ -1,4 +1,4 @@
-"""Whether a recording can be trusted: one pass over all its frames."""
+"""Checks a recording in one pass over all its frames."""
 
 import os
 from dataclasses import dataclass
@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.errors import RecordingError
-from spiked.recording.geometry import tags_agree
+from spiked.recording.geometry import RecordingGeometry, tags_agree
 from spiked.recording.index import index_path, read_index
-from spiked.recording.reader import Given, Recording, open_unchecked
+from spiked.recording.reader import Recording, open_unchecked
 from spiked.recording.recover import damaged_blocks
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic
 
@@ -19,32 +19,32 @@ _CHUNK_BYTES = 4 << 20
 
 
 class Verdict(StrEnum):
-    """What a recording is good for."""
+    """Grade of a recording."""
 
     GOOD = "good"
     DEGRADED = "degraded"
-    """Usable, with something missing or broken."""
+    """Usable, with missing or damaged parts."""
     BAD = "bad"
-    """Not what it says it is, or empty of information."""
+    """Contradicts its sidecar, or has no information."""
 
 
 @dataclass(frozen=True)
 class Verification:
-    """What `verify` found."""
+    """Result of `verify`."""
 
     recording: Recording
     verdict: Verdict
     reasons: tuple[str, ...]
-    """Why it is not good, one sentence each, the worst first."""
+    """Why the grade is not good, one sentence each, the worst first."""
     spikes: int
     spike_rate: float
-    """Mean spikes a pixel and frame."""
+    """Mean spikes per pixel and frame."""
     wrong_tags: int | None
-    """Frames with wrong row numbers; None where the layout has none."""
+    """Frames with wrong row numbers; None if the layout has none."""
     dead_rows: tuple[int, ...]
-    """Upright rows in which no pixel ever fires."""
+    """Rows of the upright image in which no pixel ever fires."""
     stuck_rows: tuple[int, ...]
-    """Upright rows in which every pixel fires in every frame."""
+    """Rows of the upright image in which every pixel fires in every frame."""
 
 
 def verify(
@@ -59,12 +59,12 @@ def verify(
     mosaic: Mosaic | None = None,
     intrinsics: Intrinsics | None = None,
 ) -> Verification:
-    """Look at every frame of a recording; the arguments are those of `open_recording`.
+    """Check every frame of a recording. The arguments are those of `open_recording`.
 
-    A file that contradicts its sidecar or has wrong row numbers is judged bad; one that cannot be read as a recording
-    at all raises RecordingError.
+    A file that contradicts its sidecar or has wrong row numbers is bad. Raises RecordingError for a file that cannot be
+    read as a recording at all.
     """
-    given = Given(width, height, frame_rate_hz, layout, bit_order, flipped, mosaic, intrinsics)
+    given = RecordingGeometry(width, height, frame_rate_hz, layout, bit_order, flipped, mosaic, intrinsics)
     recording = open_unchecked(Path(path), given)
     scan = _scan(recording)
     sensor = recording.sensor
@@ -95,7 +95,7 @@ def verify(
 
 
 def _index_problems(recording: Recording) -> list[str]:
-    """What the checksums say, where the recording has an index."""
+    """Errors found with the checksums, if the recording has an index."""
     if not index_path(recording.path).exists():
         return []
     try:
@@ -106,11 +106,11 @@ def _index_problems(recording: Recording) -> list[str]:
     problems = []
     if damaged:
         lost = sum(block.count for block in damaged)
-        problems.append(f"{lost} frames are not as they were written, the first at frame {damaged[0].first}")
+        problems.append(f"{lost} frames differ from what was written, the first at frame {damaged[0].first}")
     if index.damaged_bytes:
         problems.append(f"the last {index.damaged_bytes} bytes of its index are damaged")
     if index.frames != recording.frames:
-        problems.append(f"its index knows {index.frames} frames, the file has {recording.frames}")
+        problems.append(f"its index has {index.frames} frames, the file {recording.frames}")
     return problems
 
 

@@ -1,7 +1,7 @@
-"""Writing recordings that survive being killed at any byte."""
+"""Writes recordings that stay valid if the writer is killed at any byte."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,9 +33,8 @@ class _Files:
 class RecordingWriter:
     """Appends frames to a new `.dat` file.
 
-    A sidecar without a number of frames stands beside it from the start and is replaced by the final one on `close`,
-    so whatever happens in between, the file can be read up to its last whole frame. Existing files are never
-    overwritten. Used by one thread.
+    It has a sidecar without a number of frames from the start, which `close` replaces by the final one. The file can
+    therefore be read up to its last whole frame at any time. Existing files are never overwritten. Used by one thread.
     """
 
     def __init__(
@@ -65,7 +64,7 @@ class RecordingWriter:
 
     @classmethod
     def resume(cls, path: str | os.PathLike[str], *, durability: Durability = PLAIN) -> Self:
-        """Go on with an unfinished recording whose writer has died, behind its last whole block.
+        """Continue the unfinished recording of a dead writer after its last complete block.
 
         Raises RecordingError if there is none, or it cannot be read.
         """
@@ -112,8 +111,13 @@ class RecordingWriter:
 
     @property
     def bytes(self) -> int:
-        """Size of the frames in the file."""
+        """Bytes of the frames in the file."""
         return self.frames * self.sensor.frame_bytes
+
+    @property
+    def direct_bytes(self) -> int:
+        """Bytes written past the page cache."""
+        return self._files.frames.direct_bytes
 
     @property
     def next_frame(self) -> int:
@@ -122,14 +126,19 @@ class RecordingWriter:
 
     @property
     def gaps(self) -> tuple[Gap, ...]:
-        """The losses so far."""
+        """The gaps so far."""
         return tuple(self._gaps)
+
+    @property
+    def clock(self) -> Sequence[ClockPair]:
+        """The clock pairs so far."""
+        return self._clock
 
     def append(self, frames: NDArray[np.uint8], *, cached: bool = False) -> None:
         """Append compact frames, uint8 [n, height * row_bytes], LSB first, in the sensor's row order.
 
-        They are stored in the sensor's layout and bit order. With `cached`, the kernel may keep them in memory for a
-        disk that is behind. Raises RecordingError when the disk does not take them; the frames before remain valid.
+        They are stored in the sensor's layout and bit order. With `cached`, they go through the page cache, for a slow
+        disk. Raises RecordingError if they cannot be written; the frames before remain valid.
         """
         compact = self.sensor.compact().frame_bytes
         if frames.ndim != 2 or frames.shape[1] != compact or frames.dtype != np.uint8:
@@ -147,7 +156,7 @@ class RecordingWriter:
             if self._durability.sync is Sync.BLOCK:
                 self._sync(files)
         except OSError as error:
-            with suppress(OSError):  # on a disk gone read-only the unfinished block stays, and is not counted
+            with suppress(OSError):  # on a read-only disk the unfinished block stays and is not counted
                 files.frames.cut(offset)
                 if files.index is not None:
                     files.index.retract(entries)
@@ -171,20 +180,24 @@ class RecordingWriter:
         return stored.reshape(len(frames), self.sensor.frame_bytes)
 
     def gap(self, first: int, count: int, cause: str) -> None:
-        """Note that `count` frames of the capture from `first` on (from the recording's first frame) are lost.
+        """Add a gap of `count` frames from `first` on, counted from the recording's first frame.
 
-        With an index, gaps come in order with the frames. Raises RecordingError when the disk does not take it.
+        With an index, gaps must be in order with the frames. Raises RecordingError if it cannot be written.
         """
         if self._files.index is not None and first != self._next:
-            raise ValueError(f"a gap from frame {first} was told when frame {self._next} was next")
-        self._gaps.append(Gap(first=first, count=count, cause=cause))
+            raise ValueError(f"a gap from frame {first} was reported when frame {self._next} was next")
+        before = self._gaps[-1] if self._gaps else None
+        if before is not None and before.cause == cause and before.first + before.count == first:
+            self._gaps[-1] = before.model_copy(update={"count": before.count + count})
+        else:
+            self._gaps.append(Gap(first=first, count=count, cause=cause))
         self._next += count
-        self._note(lambda index: index.gap(first, count, cause))
+        self._append_entry(lambda index: index.gap(first, count, cause))
 
     def clock_pair(self, frame: int, unix_ns: int) -> None:
-        """Note the host's clock when a frame arrived. Raises RecordingError when the disk does not take it."""
+        """Add a clock pair. Raises RecordingError if it cannot be written."""
         self._clock.append(ClockPair(frame=frame, unix_ns=unix_ns))
-        self._note(lambda index: index.clock(frame, unix_ns))
+        self._append_entry(lambda index: index.clock(frame, unix_ns))
 
     def close(self) -> None:
         """Finish the file and its sidecar; a second call does nothing. Raises RecordingError."""
@@ -195,7 +208,7 @@ class RecordingWriter:
         if files.syncer is not None:
             files.syncer.close()
         try:
-            files.frames.cut(self.bytes)  # gives back what was taken in advance
+            files.frames.cut(self.bytes)  # releases preallocated space
             self._sync(files)
         except OSError as error:
             raise RecordingError(f"{self.path}: cannot be finished: {error.strerror}") from error
@@ -205,25 +218,25 @@ class RecordingWriter:
                 files.index.close()
         self._write_sidecar(self.frames)
 
-    def _note(self, tell: Callable[[IndexWriter], None]) -> None:
+    def _append_entry(self, write: Callable[[IndexWriter], None]) -> None:
         if self._files.index is None:
             return
         try:
-            tell(self._files.index)
+            write(self._files.index)
         except OSError as error:
             raise RecordingError(f"{index_path(self.path)}: cannot be written: {error.strerror}") from error
 
     def _sync(self, files: _Files) -> None:
-        """What the index tells of before the sync begins is on the disk after it."""
-        told = files.index.entries if files.index is not None else 0
+        """Sync the frames, then the index; note in it the entries that existed before."""
+        synced = files.index.entries if files.index is not None else 0
         os.fdatasync(files.frames.fileno())
         if files.index is not None:
             os.fdatasync(files.index.fileno())
-            files.index.synced(told)
+            files.index.synced(synced)
 
     def _reserve(self) -> None:
         if self._durability.reserve_bytes:
-            with suppress(OSError):  # the disk may be full already, which the first frames will tell
+            with suppress(OSError):  # the disk may be full already; the first frames will report it
                 reserve_sidecar(sidecar_path(self.path))
 
     def _write_sidecar(self, frames: int | None) -> None:

@@ -5,6 +5,19 @@
 from spiked.render.camera import Camera
 from spiked.render.choice import AnyRasteriser, rasteriser_for
 from spiked.render.cpu import Rasteriser
-from spiked.render.splats import Gradients, Image, SplatArrays, Splats
+from spiked.render.splats import Gradients, RenderedImage
+from spiked.scene import Scene
 
-__all__ = ["AnyRasteriser", "Camera", "Gradients", "Image", "Rasteriser", "SplatArrays", "Splats", "rasteriser_for"]
+# Names of earlier releases, deprecated: use `spiked.scene.Scene`. They go with the next release.
+Splats = SplatArrays = Scene
+
+__all__ = [
+    "AnyRasteriser",
+    "Camera",
+    "Gradients",
+    "Rasteriser",
+    "RenderedImage",
+    "SplatArrays",
+    "Splats",
+    "rasteriser_for",
+]

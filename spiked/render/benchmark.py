@@ -3,44 +3,27 @@
 Times are minima over repetitions, for machines that do other work as well; the spread says how far they differed.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.native._raster import multiply_adds
+from spiked.measurement import Measurement, Timing, peak_per_second, repeated
 from spiked.pose import exp_so3
 from spiked.render.camera import Camera
-from spiked.render.charge import CELL_PX, ChargeLoss
+from spiked.render.charge import WARP_CELL_PX, ChargeLoss
 from spiked.render.cpu import Rasteriser, usable_cores
-from spiked.render.loss import dssim, robust
+from spiked.render.loss import dssim
 from spiked.render.optimiser import Adam
-from spiked.render.splats import Floats, Splats
+from spiked.render.splats import Floats
+from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
 
 FORWARD_OPERATIONS, BACKWARD_OPERATIONS = 18, 34
 """Vector arithmetic instructions that a splat costs a pixel, for one colour."""
 MOTION_PX = 2.0
 CHARGE_FRAMES = 24
-
-
-@dataclass(frozen=True)
-class Row:
-    """One measurement."""
-
-    name: str
-    value: float
-    unit: str
-    ratio: float | None = None
-    """A number that can be compared between machines; `against` says what the value was divided by."""
-    against: str = ""
-    target: str = ""
-    """What was agreed that it should reach."""
-    spread: float | None = None
-    """Half the distance between the quartiles over the median of the repetitions."""
-    threads: int = 1
 
 
 @dataclass(frozen=True)
@@ -55,10 +38,10 @@ class Size:
 SIZES = (Size(20_000, 400, 250), Size(50_000, 1000, 1000))
 
 
-def measure(sizes: tuple[Size, ...] = SIZES, repetitions: int = 10) -> list[Row]:
+def measure(sizes: tuple[Size, ...] = SIZES, repetitions: int = 10) -> list[Measurement]:
     """All rows: peak, steps of each size on one thread and on all cores, losses and Adam."""
     peak = peak_per_second()
-    rows = [Row("fused multiply-adds, one core", peak * 1e-9, "10^9/s")]
+    rows = [Measurement("multiply-adds of a float32 matrix product, one core", peak * 1e-9, "10^9/s")]
     for size in sizes:
         rows += _steps(size, repetitions, peak)
     rows += _accumulation(sizes[0], repetitions)
@@ -68,7 +51,7 @@ def measure(sizes: tuple[Size, ...] = SIZES, repetitions: int = 10) -> list[Row]
     return rows
 
 
-def scene(size: Size, colours: int = 1, seed: int = 0) -> tuple[Camera, Splats]:
+def scene(size: Size, colours: int = 1, seed: int = 0) -> tuple[Camera, Scene]:
     """A view filled evenly with splats of random shapes, about 60 of which contribute to a pixel."""
     rng = np.random.default_rng(seed)
     n, width, height = size.splats, size.width, size.height
@@ -79,46 +62,13 @@ def scene(size: Size, colours: int = 1, seed: int = 0) -> tuple[Camera, Splats]:
     # 28.5 and 2.2 were found by counting contributions, for these distributions of shape and opacity.
     radius_px = np.sqrt(28.5 * width * height / n / np.pi) / 2.2
     log_scales = np.log(radius_px * z / focal)[:, None] + rng.normal(0, 0.5, (n, 3))
-    return Camera(Intrinsics(focal, focal, width / 2, height / 2), width, height), Splats(
+    return Camera(Intrinsics(focal, focal, width / 2, height / 2), width, height), Scene(
         np.stack([x, y, z], 1).astype(np.float32),
         rng.normal(size=(n, 4)).astype(np.float32),
         log_scales.astype(np.float32),
         rng.normal(-1.5, 1, n).astype(np.float32),
         rng.uniform(0, 1, (n, colours)).astype(np.float32),
     )
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Seconds of a few repetitions."""
-
-    best_s: float
-    median_s: float
-    spread: float
-
-
-def repeated(work: Callable[[], object], repetitions: int) -> Timing:
-    """Timing of so many runs, after one to warm up."""
-    work()
-    times = []
-    for _ in range(max(1, repetitions)):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    low, middle, high = np.quantile(times, (0.25, 0.5, 0.75))
-    return Timing(min(times), float(middle), float((high - low) / 2 / middle))
-
-
-def peak_per_second() -> float:
-    """Fused multiply-adds a second of one core, all vector lanes counted."""
-    done = 0.0
-
-    def work() -> None:
-        nonlocal done
-        done = multiply_adds(1_000_000)
-
-    seconds = repeated(work, 5).best_s
-    return done / seconds
 
 
 TARGETS = {
@@ -129,7 +79,7 @@ TARGETS = {
 }
 
 
-def _steps(size: Size, repetitions: int, peak: float) -> list[Row]:
+def _steps(size: Size, repetitions: int, peak: float) -> list[Measurement]:
     camera, splats = scene(size)
     rotation, centre = np.eye(3)[None], np.zeros((1, 3))
     d_values = np.random.default_rng(1).normal(size=(size.height, size.width)).astype(np.float32)
@@ -151,7 +101,7 @@ def _steps(size: Size, repetitions: int, peak: float) -> list[Row]:
             timing = repeated(work, repetitions)
             share = rasteriser.block_evaluations * 16 * operations / peak / threads / timing.best_s
             label = f"{name}, {size.splats // 1000}k splats, {size.width}x{size.height}, {rasteriser.instructions}"
-            rows.append(Row(label, timing.best_s * 1e3, "ms", share, "of peak", target, timing.spread, threads))
+            rows.append(Measurement(label, timing.best_s * 1e3, "ms", share, "of peak", target, timing.spread, threads))
     return rows
 
 
@@ -167,7 +117,7 @@ def passing(
     )
 
 
-def _accumulation(size: Size, repetitions: int) -> list[Row]:
+def _accumulation(size: Size, repetitions: int) -> list[Measurement]:
     """A camera that moves two pixels while it looks, each pixel over its own window, beside one still render."""
     camera, splats = scene(size)
     rng = np.random.default_rng(1)
@@ -208,23 +158,25 @@ def _accumulation(size: Size, repetitions: int) -> list[Row]:
         against = f"of a still step; error {error:.2g} % of contrast"
         target = "<= 3" if sub_frames <= 2 else ""
         name = f"moving step, {sub_frames} sub-frame(s), {where}"
-        rows.append(Row(name, timing.best_s * 1e3, "ms", timing.best_s / still.best_s, against, target, timing.spread))
+        rows.append(
+            Measurement(name, timing.best_s * 1e3, "ms", timing.best_s / still.best_s, against, target, timing.spread)
+        )
     timing = step(lambda: exactly(8))
     error = 100 * float(np.std(exactly(8) - truth) / np.std(truth))
     against = f"of a still step; error {error:.2g} % of contrast"
     name = f"8 exact sub-poses, {where}"
-    rows.append(Row(name, timing.best_s * 1e3, "ms", timing.best_s / still.best_s, against, "", timing.spread))
+    rows.append(Measurement(name, timing.best_s * 1e3, "ms", timing.best_s / still.best_s, against, "", timing.spread))
     return rows
 
 
-def _by_charge(size: Size, repetitions: int) -> Row:
+def _by_charge(size: Size, repetitions: int) -> Measurement:
     """A step on all spikes of some frames: one render, carried along its motion, beside that render alone."""
     camera, splats = scene(size)
     width = size.width // 8 * 8
     sensor = Sensor(width, size.height, 20_000.0)
     frames = np.random.default_rng(1).integers(0, 256, (CHARGE_FRAMES, sensor.frame_bytes), np.uint8)
     frames &= np.random.default_rng(2).integers(0, 256, frames.shape, np.uint8)  # a quarter of the pixels fire
-    rows, columns = -(-size.height // CELL_PX) + 1, -(-width // CELL_PX) + 1
+    rows, columns = -(-size.height // WARP_CELL_PX) + 1, -(-width // WARP_CELL_PX) + 1
     moved = np.zeros((CHARGE_FRAMES, rows, columns, 2), np.float32)
     moved[...] = (np.arange(CHARGE_FRAMES, dtype=np.float32) - CHARGE_FRAMES / 2)[:, None, None, None]
     gain = np.ones((size.height, width), np.float32)
@@ -241,7 +193,7 @@ def _by_charge(size: Size, repetitions: int) -> Row:
     one, all_frames = repeated(still, repetitions), repeated(step, repetitions)
     name = f"step by the charge of {CHARGE_FRAMES} frames, {size.splats // 1000}k splats, {size.width}x{size.height}"
     share = all_frames.best_s / one.best_s
-    return Row(name, all_frames.best_s * 1e3, "ms", share, "of a still step", "<= 3", all_frames.spread)
+    return Measurement(name, all_frames.best_s * 1e3, "ms", share, "of a still step", "<= 3", all_frames.spread)
 
 
 @dataclass(frozen=True)
@@ -296,17 +248,19 @@ def scaling(repetitions: int = 3) -> list[Scaling]:
     ]
 
 
-def _against_naive(repetitions: int) -> Row:
+def _against_naive(repetitions: int) -> Measurement:
     size = Size(400, 160, 100)
     camera, splats = scene(size)
     rasteriser = Rasteriser(camera, 1)
     rotation, centre = np.eye(3)[None], np.zeros((1, 3))
     fast = repeated(lambda: rasteriser.forward(splats, rotation, centre), repetitions).best_s
     slow = repeated(lambda: naive_image(camera, splats), 1).best_s
-    return Row("forward, 400 splats, 160x100, 1 thread", fast * 1e3, "ms", slow / fast, "times as fast as NumPy")
+    return Measurement(
+        "forward, 400 splats, 160x100, 1 thread", fast * 1e3, "ms", slow / fast, "times as fast as NumPy"
+    )
 
 
-def naive_image(camera: Camera, splats: Splats) -> NDArray[np.float64]:
+def naive_image(camera: Camera, splats: Scene) -> NDArray[np.float64]:
     """The image [H, W] of one-coloured splats from the origin: each splat at every pixel, in NumPy."""
     k = camera.intrinsics
     columns, rows = np.arange(camera.width) + 0.5, (np.arange(camera.height) + 0.5)[:, None]
@@ -336,11 +290,10 @@ def naive_image(camera: Camera, splats: Splats) -> NDArray[np.float64]:
     return image
 
 
-def _fused(size: Size, repetitions: int) -> list[Row]:
+def _fused(size: Size, repetitions: int) -> list[Measurement]:
     rng = np.random.default_rng(2)
     shape = (size.height, size.width)
     rendered, target = rng.uniform(size=(2, *shape)).astype(np.float32)
-    weight = np.ones(shape, np.float32)
     arrays: list[Floats] = [
         rng.normal(size=rest).astype(np.float32)
         for rest in ((size.splats, 3), (size.splats, 4), (size.splats, 3), (size.splats,), (size.splats, 1))
@@ -348,8 +301,7 @@ def _fused(size: Size, repetitions: int) -> list[Row]:
     adam = Adam(arrays)
     where = f"{size.width}x{size.height}"
     timed: tuple[tuple[str, Callable[[], object]], ...] = (
-        (f"robust loss, {where}", lambda: robust(rendered, target, weight, 0.1)),
-        (f"D-SSIM, {where}", lambda: dssim(rendered, target)),
+        (f"D-SSIM, {where}", lambda: dssim(rendered, target=target)),
         (f"Adam, {size.splats // 1000}k splats", lambda: adam.step(arrays, arrays, [1e-6] * 5)),
     )
-    return [Row(name, repeated(work, repetitions).best_s * 1e3, "ms") for name, work in timed]
+    return [Measurement(name, repeated(work, repetitions).best_s * 1e3, "ms") for name, work in timed]

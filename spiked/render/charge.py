@@ -1,4 +1,4 @@
-"""What frames of spikes say of an image that moved past the sensor: the loss of the charge between spikes.
+"""Charge loss: compares a rendered image, moved along the image motion, with the spikes of many frames.
 
 A pixel fires whenever it has gathered the charge of one spike. Between two of its spikes, then, the light that it saw
 of the image, as that moved past, adds up to one, whatever the motion and however long it took. An image rendered at
@@ -7,36 +7,48 @@ price of one render and without the smear of a long window.
 """
 
 from dataclasses import dataclass
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spiked.errors import ConfigurationError
-from spiked.native._raster import ChargeLoss as _ChargeLoss
+from spiked.native._charge import ChargeLoss as _ChargeLoss
 from spiked.render.cpu import MAX_THREADS, usable_cores
 from spiked.render.splats import Floats
 from spiked.sensor import BitOrder, Sensor
 
-CELL_PX = 8
-"""Spacing of the nodes at which displacements are given."""
+WARP_CELL_PX = 8
+"""Spacing in px of the nodes at which displacements are given."""
 
 
 @dataclass(frozen=True)
 class Charge:
-    """What the frames say of an image."""
+    """Result of the charge loss."""
 
     loss: float
     """Mean over the pixels of weight * squared error, (spikes a frame)^2."""
     slope: Floats
-    """Its derivative by the image, of the image's shape."""
+    """Gradient with respect to the image, of its shape."""
     chi2: float
     """Mean squared residual of an interval in units of its variance; 0 without any interval."""
     brightness: float
     """Spikes counted over spikes expected, by the pixels that roughly agree; 1 without any."""
 
 
+class _Layout(TypedDict):
+    """How the kernel reads the bits of a stored frame; tile [4] has the colours of a mosaic's 2x2 sites."""
+
+    width: int
+    height: int
+    row_stride: int
+    flipped: bool
+    msb: bool
+    tile: NDArray[np.uint8]
+
+
 class ChargeLoss:
-    """Compares images with frames. One object serves one thread at a time; the number of threads changes no bit."""
+    """Compares images with frames. Not thread-safe; the result does not depend on the number of threads."""
 
     def __init__(self, sensor: Sensor, threads: int | None = None) -> None:
         """Threads default to the cores this process may use."""
@@ -46,7 +58,14 @@ class ChargeLoss:
         self.sensor = sensor
         self._native = _ChargeLoss(threads)
         mosaic = None if sensor.mosaic is None else sensor.mosaic.channels(2, 2).ravel()
-        self._tile = np.zeros(4, np.uint8) if mosaic is None else np.ascontiguousarray(mosaic)
+        self._layout: _Layout = {
+            "width": sensor.width,
+            "height": sensor.height,
+            "row_stride": sensor.row_stride,
+            "flipped": sensor.flipped,
+            "msb": sensor.bit_order is BitOrder.MSB,
+            "tile": np.zeros(4, np.uint8) if mosaic is None else np.ascontiguousarray(mosaic),
+        }
 
     def __call__(
         self,
@@ -66,30 +85,24 @@ class ChargeLoss:
 
         image [h, w], or [h, w, 3] for a mosaic, shows the sensor's field at one moment, its pixels `pixel` times as
         large as the sensor's. frames [n, frame_bytes] as stored, at most 64 of them; displacements float32
-        [n, rows, columns, 2] lead, in px, from nodes `CELL_PX` apart (the first at the sensor's corner) in each frame
-        to where the same things are in the image. gain [H, W] multiplies the light (0: a pixel that does not count),
+        [n, rows, columns, 2] lead, in px, from nodes `WARP_CELL_PX` apart (first: the sensor's corner) in each frame to
+        where the same things are in the image. gain [H, W] multiplies the light (0: a pixel that does not count),
         dark [H, W] is added to it, in spikes a frame. Of `every` pairs of the sensor's rows, the one of number `phase`
-        is looked at.
+        is used.
 
         The variance of an interval's charge is rate^2 / 6 (spikes are only known to the frame) plus jitter^2; that
         before the first and after the last spike is 1 / 6. A pixel's residuals are weighted so that an error e of its
         rate costs e^2 floor^2 / (deviation^2 + floor^2). Raises ConfigurationError for shapes that do not fit.
         """
-        sensor = self.sensor
         planes = np.ascontiguousarray(image, np.float32)
         planes = planes[..., None] if planes.ndim == 2 else planes
         slope = np.empty_like(planes)
         try:
             loss, pixels, chi2, intervals, expected, counted = self._native.run(
+                **self._layout,
                 frames=np.ascontiguousarray(frames),
-                width=sensor.width,
-                height=sensor.height,
-                row_stride=sensor.row_stride,
-                flipped=sensor.flipped,
-                msb=sensor.bit_order is BitOrder.MSB,
-                tile=self._tile,
                 grids=np.ascontiguousarray(displacements, np.float32),
-                cell=CELL_PX,
+                cell=WARP_CELL_PX,
                 image=planes,
                 pixel=pixel,
                 every=every,

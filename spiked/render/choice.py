@@ -1,9 +1,12 @@
-"""Which rasteriser does the work: the GPU's where there is one, else the CPU's."""
+"""Chooses the rasteriser: the GPU's if one can be used, else the CPU's."""
 
+import logging
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,60 +14,103 @@ from numpy.typing import ArrayLike, NDArray
 from spiked.errors import ConfigurationError
 from spiked.render.camera import Camera
 from spiked.render.cpu import Rasteriser
-from spiked.render.splats import Floats, Gradients, Image, SplatArrays
+from spiked.render.splats import Floats, Gradients, RenderedImage
+from spiked.scene import Scene
+
+DRIVER = Path("/proc/driver/nvidia/version")
+"""Exists while an NVIDIA driver is loaded."""
+_log = logging.getLogger("spiked.render")
 
 
 class AnyRasteriser(Protocol):
-    """What both rasterisers do; `cpu.Rasteriser` says how."""
+    """Interface of both rasterisers; documented at `cpu.Rasteriser`."""
 
     camera: Camera
 
     @property
-    def instructions(self) -> str: ...
+    def instructions(self) -> str:
+        """See `cpu.Rasteriser.instructions`."""
 
     def forward(
         self,
-        splats: SplatArrays,
+        splats: Scene,
         rotations: ArrayLike,
         centres: ArrayLike,
         *,
         weights: Floats | None = None,
         channels: NDArray[np.uint8] | None = None,
         background: float | Sequence[float] = 0.0,
-    ) -> Image: ...
+    ) -> RenderedImage:
+        """See `cpu.Rasteriser.forward`."""
 
     def forward_moving(
         self,
-        splats: SplatArrays,
+        splats: Scene,
         rotations: ArrayLike,
         centres: ArrayLike,
         windows: Floats,
         *,
         channels: NDArray[np.uint8] | None = None,
         background: float | Sequence[float] = 0.0,
-    ) -> Image: ...
+    ) -> RenderedImage:
+        """See `cpu.Rasteriser.forward_moving`."""
 
-    def backward(self, d_values: Floats) -> Gradients: ...
+    def backward(self, d_values: Floats) -> Gradients:
+        """See `cpu.Rasteriser.backward`."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The chosen renderer and the reason."""
+
+    renderer: Literal["cpu", "cuda"]
+    reason: str
+    unused: bool = False
+    """A GPU is there, and cannot be rendered with."""
+
+    def __str__(self) -> str:
+        return f"{self.renderer} ({self.reason})"
+
+
+def chosen() -> Choice:
+    """The renderer that SPIKED_RENDER names, cpu or cuda; without it the GPU's if it can render here.
+
+    torch is not even imported where no NVIDIA driver is loaded. Where one is, a GPU that cannot be used is said in the
+    log, once a process. Raises ConfigurationError where cuda is wanted and cannot be had.
+    """
+    return choice_for(os.environ.get("SPIKED_RENDER", ""))
+
+
+@cache
+def choice_for(wanted: str) -> Choice:
+    """The renderer for a value of SPIKED_RENDER (cpu, cuda or empty), found once. Raises ConfigurationError."""
+    if wanted not in ("", "cpu", "cuda"):
+        raise ConfigurationError(f"SPIKED_RENDER={wanted} is no renderer: use cpu or cuda, or unset it")
+    if wanted == "cpu":
+        return Choice("cpu", "SPIKED_RENDER asks for it")
+    if wanted == "" and not DRIVER.exists():
+        return Choice("cpu", "no NVIDIA driver is loaded")
+    reason = _missing()
+    if reason is None:
+        return Choice("cuda", "the GPU renders" if wanted == "" else "SPIKED_RENDER asks for it")
+    if wanted == "cuda":
+        raise ConfigurationError(f"cannot render on a GPU: {reason}")
+    _log.warning("the GPU is not used: %s", reason)
+    return Choice("cpu", reason, unused=True)
 
 
 def rasteriser_for(camera: Camera, threads: int | None = None) -> AnyRasteriser:
-    """The rasteriser that SPIKED_RENDER names, cpu or cuda; without it that of a GPU if one can be used.
+    """A rasteriser of the kind that is `chosen`; threads are the CPU's. Raises ConfigurationError as that does."""
+    if chosen().renderer == "cpu":
+        return Rasteriser(camera, threads)
+    from spiked.render import cuda
 
-    threads are the CPU's. torch is not even imported where no NVIDIA driver is loaded. Raises ConfigurationError where
-    cuda is wanted and cannot be had.
-    """
-    wanted = os.environ.get("SPIKED_RENDER", "")
-    if wanted not in ("", "cpu", "cuda"):
-        raise ConfigurationError(f"SPIKED_RENDER={wanted} is no renderer: use cpu or cuda, or unset it")
-    if wanted == "cuda":
+    return cuda.CudaRasteriser(camera)
+
+
+def _missing() -> str | None:
+    try:
         from spiked.render import cuda
-
-        return cuda.CudaRasteriser(camera)
-    if wanted == "" and Path("/proc/driver/nvidia/version").exists():
-        try:
-            from spiked.render import cuda
-        except ImportError:
-            return Rasteriser(camera, threads)
-        if cuda.missing() is None:
-            return cuda.CudaRasteriser(camera)
-    return Rasteriser(camera, threads)
+    except (ImportError, OSError) as error:  # OSError: a library that torch was built for
+        return f"torch cannot be imported ({error}): pip install 'spiked[cuda]'"
+    return cuda.missing()

@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from spiked.errors import ConfigurationError
 from spiked.native._raster import Renderer
 from spiked.render.camera import Camera
-from spiked.render.splats import Floats, Gradients, Image, SplatArrays
+from spiked.render.splats import Floats, Gradients, RenderedImage
+from spiked.scene import Scene
 
 MAX_THREADS = 256
 
@@ -69,14 +70,14 @@ class Rasteriser:
 
     def forward(
         self,
-        splats: SplatArrays,
+        splats: Scene,
         rotations: ArrayLike,
         centres: ArrayLike,
         *,
         weights: Floats | None = None,
         channels: NDArray[np.uint8] | None = None,
         background: float | Sequence[float] = 0.0,
-    ) -> Image:
+    ) -> RenderedImage:
         """Render sum_s weights_s C_s.
 
         rotations [S, 3, 3] camera to world and centres [S, 3] are the S sub-poses. weights [S, H, W], float32, not
@@ -93,14 +94,14 @@ class Rasteriser:
 
     def forward_moving(
         self,
-        splats: SplatArrays,
+        splats: Scene,
         rotations: ArrayLike,
         centres: ArrayLike,
         windows: Floats,
         *,
         channels: NDArray[np.uint8] | None = None,
         background: float | Sequence[float] = 0.0,
-    ) -> Image:
+    ) -> RenderedImage:
         """Render what each pixel sees on average over its own time while the camera moves.
 
         The camera is at pose s, rotations [S + 1, 3, 3] camera to world and centres [S + 1, 3], at time s, and moves
@@ -126,14 +127,14 @@ class Rasteriser:
 
     def _forward(
         self,
-        splats: SplatArrays,
+        splats: Scene,
         rotations: ArrayLike,
         centres: ArrayLike,
         weights: Floats | None,
         windows: Floats | None,
         channels: NDArray[np.uint8] | None,
         background: float | Sequence[float],
-    ) -> Image:
+    ) -> RenderedImage:
         rotations = np.ascontiguousarray(rotations, np.float64)
         centres = np.ascontiguousarray(centres, np.float64)
         arrays = _checked_splats(splats)
@@ -162,7 +163,7 @@ class Rasteriser:
         self._inputs = (*arrays, weights, windows, channels)
         self._shapes = (count, colours, len(rotations))
         self._values_shape = values.shape
-        return Image(values, alpha, depth)
+        return RenderedImage(values, alpha, depth)
 
     def backward(self, d_values: Floats) -> Gradients:
         """Gradients of sum(d_values * values) for the last forward(); d_values has the shape of its values.
@@ -186,26 +187,12 @@ class Rasteriser:
             contribution=np.empty(n, np.float32),
             radius_px=np.empty(n, np.float32),
         )
-        self._native.backward(
-            d_values,
-            out.means,
-            out.quats,
-            out.log_scales,
-            out.opacity_logits,
-            out.colours,
-            out.rotation,
-            out.centre,
-            out.contribution,
-            out.radius_px,
-        )
+        self._native.backward(d_values, *out.arrays(), out.rotation, out.centre, out.contribution, out.radius_px)
         return out
 
 
-def _checked_splats(splats: SplatArrays) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    arrays = tuple(
-        np.ascontiguousarray(array, np.float32)
-        for array in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.colours)
-    )
+def _checked_splats(splats: Scene) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    arrays = tuple(np.ascontiguousarray(array, np.float32) for array in splats.arrays())
     means, quats, log_scales, opacity_logits, colours = arrays
     n = len(means)
     if (

@@ -6,6 +6,7 @@ of pixels, when it lets less than 1e-4 of the light through. Splats below both c
 
 import importlib.util
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,12 @@ from torch import Tensor
 from spiked.errors import ConfigurationError
 from spiked.pose import exp_so3, log_so3
 from spiked.render.camera import Camera
-from spiked.render.splats import Floats, Gradients, Image, SplatArrays
+from spiked.render.splats import Floats, Gradients, RenderedImage
+from spiked.scene import Scene
+from spiked.sensor import Intrinsics
 
+DEVICE = "cuda"
+"""Where torch computes."""
 INSTANTS = 4
 """Renders for each sub-frame of a moving camera; all of them are one batch."""
 
@@ -30,7 +35,37 @@ def missing() -> str | None:
     if importlib.util.find_spec("gsplat") is None:
         return "gsplat is not installed: pip install 'spiked[cuda]'"
     if not torch.cuda.is_available():
-        return "torch sees no CUDA device"
+        return "torch sees no CUDA device: look with nvidia-smi, and install a torch built for CUDA"
+    return trial()
+
+
+@cache
+def trial() -> str | None:
+    """What goes wrong when one splat is rendered and differentiated.
+
+    Without the CUDA toolkit gsplat imports all the same, and fails only here.
+    """
+    camera = Camera(Intrinsics(8, 8, 4, 4), 8, 8)
+    splat = Scene(
+        np.array([[0, 0, 1]], np.float32),
+        np.array([[1, 0, 0, 0]], np.float32),
+        np.full((1, 3), -1, np.float32),
+        np.full(1, 2, np.float32),
+        np.ones((1, 1), np.float32),
+    )
+    try:
+        import gsplat
+
+        rasteriser = CudaRasteriser(camera, rasterisation=gsplat.rasterization)
+        values = rasteriser.forward(splat, np.eye(3)[None], np.zeros((1, 3))).values
+        slope = rasteriser.backward(np.ones_like(values)).colours
+    except Exception as error:  # whatever a foreign library fails with, the CPU can do the work
+        return (
+            f"gsplat cannot render here ({type(error).__name__}: {error}): install the CUDA toolkit, "
+            "with whose nvcc gsplat compiles its kernels"
+        )
+    if not (values[4, 4] > 0.1 and slope[0, 0] > 0):
+        return "gsplat renders nothing here: install the build of torch and gsplat for this GPU"
     return None
 
 
@@ -46,7 +81,7 @@ class CudaRasteriser:
         camera: Camera,
         near: float = 0.01,
         *,
-        device: str = "cuda",
+        device: str | None = None,
         rasterisation: Rasterisation | None = None,
     ) -> None:
         """Raises ConfigurationError where there is no GPU or no gsplat; `rasterisation` replaces the latter."""
@@ -61,7 +96,7 @@ class CudaRasteriser:
             raise ConfigurationError(f"the near plane is at {near:g}: it must be positive")
         self.camera = camera
         self._near = near
-        self._device = torch.device(device)
+        self._device = torch.device(device or DEVICE)
         self._rasterisation = rasterisation
         k = camera.intrinsics
         self._intrinsics = torch.tensor(
@@ -76,14 +111,14 @@ class CudaRasteriser:
 
     def forward(
         self,
-        splats: SplatArrays,
+        splats: Scene,
         rotations: ArrayLike,
         centres: ArrayLike,
         *,
         weights: Floats | None = None,
         channels: NDArray[np.uint8] | None = None,
         background: float | Sequence[float] = 0.0,
-    ) -> Image:
+    ) -> RenderedImage:
         """As `cpu.Rasteriser.forward`."""
         turned, places = self._poses(rotations, centres, 1)
         size = (self.camera.height, self.camera.width)
@@ -95,14 +130,14 @@ class CudaRasteriser:
 
     def forward_moving(
         self,
-        splats: SplatArrays,
+        splats: Scene,
         rotations: ArrayLike,
         centres: ArrayLike,
         windows: Floats,
         *,
         channels: NDArray[np.uint8] | None = None,
         background: float | Sequence[float] = 0.0,
-    ) -> Image:
+    ) -> RenderedImage:
         """As `cpu.Rasteriser.forward_moving`."""
         turned, places = self._poses(rotations, centres, 2)
         size = (self.camera.height, self.camera.width)
@@ -177,14 +212,14 @@ class CudaRasteriser:
 
     def _render(
         self,
-        splats: SplatArrays,
+        splats: Scene,
         rotations: NDArray[np.float64],
         centres: NDArray[np.float64],
         blend: NDArray[np.float64],
         weights: Floats,
         channels: NDArray[np.uint8] | None,
         background: float | Sequence[float],
-    ) -> Image:
+    ) -> RenderedImage:
         """blend [renders, poses] says how each render's pose follows the given ones; weights [renders, H, W]."""
         arrays = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.colours)
         colours = arrays[4].shape[1]
@@ -232,7 +267,7 @@ class CudaRasteriser:
         self._last = _Pass((*leaves, turns, places), shares, values, rendered[..., colours], _largest(info["radii"]))
         alpha = torch.where(total > 0, opaque / total.clamp(min=1e-30), 0)
         depth = torch.where(opaque > 0, distance / opaque.clamp(min=1e-30), 0)
-        return Image(*(tensor.detach().cpu().numpy() for tensor in (values, alpha, depth)))
+        return RenderedImage(*(tensor.detach().cpu().numpy() for tensor in (values, alpha, depth)))
 
     def _tensor(self, array: ArrayLike) -> Tensor:
         return torch.tensor(np.asarray(array), dtype=torch.float32, device=self._device)

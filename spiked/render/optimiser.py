@@ -1,4 +1,4 @@
-"""Adam over the arrays of a scene, for the splats that an image saw only.
+"""Adam over the arrays of a scene, for visible splats only.
 
 D. Kingma, J. Ba, "Adam: a method for stochastic optimization", 2015.
 """
@@ -53,7 +53,7 @@ class Adam:
         self._taken = self._taken[rows]
 
     def reset(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> None:
-        """Let splats start afresh, for instance after they have been moved elsewhere."""
+        """Reset the moments of splats, for instance after they were relocated."""
         for first, second in self._moments:
             first[rows] = 0
             second[rows] = 0

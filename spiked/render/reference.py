@@ -15,17 +15,22 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from spiked.render.camera import Camera
-from spiked.render.splats import SplatArrays
+from spiked.scene import Scene
 
 DILATION_PX2 = 0.3
+"""Added to the diagonal of a projected covariance, px^2. This and the next three are the values of the code of 3D
+Gaussian splatting (Kerbl et al. 2023)."""
 ALPHA_CAP = 0.99
+"""Upper bound of a splat's alpha at a pixel."""
 ALPHA_CUT = 1 / 255
+"""A splat is not blended at pixels where its alpha is lower."""
 SLOPE_LIMIT = 1.3
+"""The projection's Jacobian is taken at x/z and y/z clamped to this multiple of the half field of view."""
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """Leaves of the differentiation, float64 with gradients; shapes as in `Splats`, S sub-poses."""
+    """Leaves of the differentiation, float64 with gradients; shapes as in `Scene`, S sub-poses."""
 
     means: Tensor
     quats: Tensor
@@ -38,7 +43,7 @@ class Parameters:
     """[S, 3]"""
 
     @classmethod
-    def of(cls, splats: SplatArrays, centres: ArrayLike) -> "Parameters":
+    def of(cls, splats: Scene, centres: ArrayLike) -> "Parameters":
         """The splats and camera centres as leaves."""
 
         def leaf(array: ArrayLike) -> Tensor:
@@ -66,7 +71,7 @@ def render(
     background: float = 0.0,
     near: float = 0.01,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Values, alpha and depth as in `spiked.render.Image`, differentiable in the parameters."""
+    """Values, alpha and depth as in `spiked.render.RenderedImage`, differentiable in the parameters."""
     turns = torch.tensor(np.asarray(rotations, np.float64))
     count = len(turns)
     shape = (count, camera.height, camera.width)
@@ -78,7 +83,7 @@ def render(
     depth = torch.zeros(shape[1:], dtype=torch.float64)
     for s in range(count):
         rotation = torch.linalg.matrix_exp(_cross(parameters.turns[s])) @ turns[s]
-        one_values, one_alpha, one_depth = _render_one(
+        one_values, one_alpha, one_depth = render_pose(
             parameters, camera, (rotation, parameters.centres[s]), background, near
         )
         values = values + weight[s, :, :, None] * one_values
@@ -172,9 +177,13 @@ def _project(parameters: Parameters, camera: Camera, pose: tuple[Tensor, Tensor]
     return _Projection(torch.stack([k.fx * x / z + k.cx, k.fy * y / z + k.cy], 1), jacobian @ rotation.T @ spread, z)
 
 
-def _render_one(
+def render_pose(
     parameters: Parameters, camera: Camera, pose: tuple[Tensor, Tensor], background: float, near: float
 ) -> tuple[Tensor, Tensor, Tensor]:
+    """Values [H, W, C], alpha [H, W] and depth sum [H, W] from one camera-to-world pose.
+
+    The pose is rotation [3, 3] and centre [3]; splats nearer than `near` are left out.
+    """
     seen = _project(parameters, camera, pose)
     order = torch.argsort(seen.z.detach(), stable=True)
     order = order[seen.z[order].detach() >= near]

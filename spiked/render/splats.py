@@ -1,7 +1,6 @@
-"""The arrays that go into a renderer and come out of it."""
+"""What comes out of a renderer: images and gradients. What goes in is a `spiked.scene.Scene`."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,39 +8,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 
 
-class SplatArrays(Protocol):
-    """Anything with the five parameter arrays of N Gaussians, such as `Splats`."""
-
-    @property
-    def means(self) -> Floats: ...
-    @property
-    def quats(self) -> Floats: ...
-    @property
-    def log_scales(self) -> Floats: ...
-    @property
-    def opacity_logits(self) -> Floats: ...
-    @property
-    def colours(self) -> Floats: ...
-
-
-@dataclass
-class Splats:
-    """N Gaussians. Arrays are float32 and C-contiguous."""
-
-    means: Floats
-    """World positions, [N, 3]."""
-    quats: Floats
-    """Rotations, wxyz, of any length but zero (a zero quaternion counts as no rotation), [N, 4]."""
-    log_scales: Floats
-    """Natural logarithms of the standard deviations along the splat's axes, [N, 3]."""
-    opacity_logits: Floats
-    """Opacity is 1 / (1 + exp(-logit)), [N]."""
-    colours: Floats
-    """Radiance in expected spikes a frame, not clamped, [N, C] with C = 1 or 3."""
-
-
 @dataclass(frozen=True)
-class Image:
+class RenderedImage:
     """A rendered image of H rows and W columns; with sub-poses, sums or means over them."""
 
     values: Floats
@@ -55,7 +23,7 @@ class Image:
 
 @dataclass(frozen=True)
 class Gradients:
-    """Gradients of sum(d_values * values), and what a mapper wants to know of each splat. Shapes as in `Splats`."""
+    """Gradients of sum(d_values * values), and the visibility of each splat. Shapes as in `Scene`."""
 
     means: Floats
     quats: Floats
@@ -71,3 +39,7 @@ class Gradients:
     radius_px: Floats
     """Largest half axis of the projected ellipse where alpha falls to 1/255, over the sub-poses; 0 for a splat that no
     sub-pose sees. [N]"""
+
+    def arrays(self) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+        """The gradients by the five arrays of `Scene.arrays`, in their order."""
+        return self.means, self.quats, self.log_scales, self.opacity_logits, self.colours

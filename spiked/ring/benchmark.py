@@ -1,4 +1,4 @@
-"""How fast a ring moves blocks from one process to another, next to plain copying of the same blocks in one process."""
+"""Throughput of a ring between two processes, compared with copying the same blocks in one process."""
 
 import multiprocessing
 import time
@@ -13,6 +13,7 @@ from spiked.ring.writer import RingWriter
 from spiked.sensor import Sensor
 
 _START_S = 30.0
+"""Time for the reading process to attach, seconds."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class BenchmarkResult:
     memcpy_bytes_a_second: float
     """The same copies, in and out, in one process without a ring."""
     camera_bytes_a_second: float
-    """What the sensor delivers."""
+    """Data rate of the sensor."""
 
     @property
     def ratio(self) -> float:
@@ -32,7 +33,7 @@ class BenchmarkResult:
 
 
 def benchmark(sensor: Sensor, *, blocks: int = 4000, block_frames: int = 8) -> BenchmarkResult:
-    """Move so many blocks of the sensor's frames through a ring. Raises RingError if the reader does not come."""
+    """Move `blocks` blocks of the sensor's frames through a ring. Raises RingError if the reader does not attach."""
     compact = sensor.compact()
     block = np.random.default_rng(0).integers(0, 256, (block_frames, compact.frame_bytes), np.uint8)
     total_bytes = blocks * block.nbytes
@@ -72,7 +73,7 @@ def _copy_out(name: str) -> None:
 
 
 def _memcpy_seconds(block: NDArray[np.uint8], blocks: int, slots: int) -> float:
-    """Copy in and out of as many slots as the ring had, which no cache holds either."""
+    """Copy in and out of as many slots as the ring has: more than the caches hold."""
     memory = np.zeros((slots, *block.shape), np.uint8)
     target = np.zeros_like(block)
     start_s = time.perf_counter()

@@ -1,4 +1,4 @@
-"""What travels through a ring: losses, ends, states, and the policies by which consumers take them."""
+"""Items of a ring (gaps, ends, device states, clock pairs) and the policies of its readers."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -8,48 +8,48 @@ from spiked.errors import SpikedError
 
 
 class RingError(SpikedError):
-    """A ring cannot be created, attached to or used as asked."""
+    """A ring cannot be created, attached to or used as requested."""
 
 
-class Cause(StrEnum):
+class LossCause(StrEnum):
     """Where frames were lost."""
 
     DEVICE = "device"
     """The camera did not send them, or was away."""
     USB = "usb"
-    """They were lost between the camera and this process."""
+    """The host lost them between the camera and the acquisition process."""
     RING = "ring"
-    """They were overwritten before this consumer took them, or it chose to skip them."""
+    """They were overwritten before this reader took them, or its policy skipped them."""
     DISK = "disk"
-    """They could not be written, or not be read back."""
+    """They could not be written to disk, or not be read back."""
 
 
 class Policy(StrEnum):
-    """What a consumer that falls behind wants. The writer waits for none of them."""
+    """How a reader is treated when it falls behind. The writer waits for none."""
 
     LOSSLESS = "lossless"
-    """Every frame while it stays within half of the ring; then a gap, and it is marked lagging."""
+    """Every frame while it stays within half of the ring; beyond, a gap, and the reader is marked lagging."""
     PRIORITY = "priority"
-    """As lossless, with seven eighths of the ring: for the recorder."""
+    """As lossless, within seven eighths of the ring. For the recorder."""
     LATEST = "latest"
-    """The newest block, told how many frames were skipped."""
+    """The newest block, with a gap for the frames skipped."""
 
 
 class EndReason(StrEnum):
     """Why a capture ended."""
 
     FINISHED = "finished"
-    """The source has no more frames, or as many as asked for were taken."""
+    """The source has no more frames, or the requested number was captured."""
     STOPPED = "stopped"
-    """Somebody asked for it."""
+    """It was stopped on request."""
     FAILED = "failed"
-    """The source or the acquisition failed; the device condition says how."""
+    """The source or the acquisition failed; the device status has the reason."""
     WRITER_DIED = "writer_died"
-    """The acquisition process ended without a word."""
+    """The acquisition process died without ending the capture."""
 
 
 class DeviceState(StrEnum):
-    """Where the camera of a capture stands: absent -> idle -> armed -> streaming -> lost -> absent."""
+    """State of a capture's camera: absent -> idle -> armed -> streaming -> lost -> absent."""
 
     ABSENT = "absent"
     IDLE = "idle"
@@ -59,8 +59,8 @@ class DeviceState(StrEnum):
 
 
 @dataclass(frozen=True)
-class Condition:
-    """A device state and, in a few words, why it is so."""
+class DeviceStatus:
+    """A device state and its reason."""
 
     state: DeviceState
     reason: str = ""
@@ -72,7 +72,7 @@ class Gap:
 
     first: int
     count: int
-    cause: Cause
+    cause: LossCause
 
     def __post_init__(self) -> None:
         if self.first < 0 or self.count <= 0:
@@ -81,20 +81,28 @@ class Gap:
 
 @dataclass(frozen=True)
 class End:
-    """The capture is over after `frames` frames, received and lost together."""
+    """The capture has ended after `frames` frames, received and lost together."""
 
     frames: int
     reason: EndReason
+
+
+@dataclass(frozen=True)
+class ClockPair:
+    """Host time at which a frame had arrived whole."""
+
+    frame: int
+    unix_ns: int
 
 
 _Code = TypeVar("_Code", bound=StrEnum)
 
 
 def encode(value: StrEnum) -> int:
-    """The number by which shared memory knows a member of an enum: 1 for the first; 0 stays free for "none"."""
+    """Code of an enum member in shared memory: 1 for the first; 0 means "none"."""
     return list(type(value)).index(value) + 1
 
 
 def decode(kind: type[_Code], code: int) -> _Code:
-    """The member that `encode` gave this number."""
+    """The member with this code; the inverse of `encode`."""
     return list(kind)[code - 1]

@@ -1,16 +1,16 @@
-"""Processes named so that a reused process id is never taken for the old process."""
+"""Identities of processes that differ even if the kernel reuses a process id."""
 
 import os
 from pathlib import Path
 
-_PID_BITS = 22  # the kernel's limit on process ids, PID_MAX_LIMIT, is 2^22
+_PID_BITS = 22  # PID_MAX_LIMIT of the kernel is 2^22
 
 
 def identity(pid: int) -> int | None:
     """Process id and start time (clock ticks since boot) in one uint64; None if there is no such living process.
 
-    A zombie counts as dead: it will do nothing more. Process ids are those of the caller's pid namespace, so the
-    processes of one ring must share theirs.
+    A zombie counts as dead. Process ids are those of the caller's pid namespace, so all processes of a ring must share
+    one.
     """
     try:
         stat = Path(f"/proc/{pid}/stat").read_text()

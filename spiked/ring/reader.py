@@ -1,7 +1,8 @@
-"""The reading end of a ring: one consumer in one process, which nobody waits for."""
+"""The reading end of a ring: one consumer in one process."""
 
 import time
 from bisect import bisect_left, bisect_right
+from collections import deque
 from types import TracebackType
 from typing import Self
 
@@ -9,22 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.native._ring import READER_PLACES, Control, Entry, ReaderCounters, ReaderPlace, WriterCounters
-from spiked.ring.items import Cause, End, EndReason, Gap, Policy, RingError, decode, encode
+from spiked.ring.items import ClockPair, End, EndReason, Gap, LossCause, Policy, RingError, decode, encode
 from spiked.ring.process import is_alive, own_identity
-from spiked.ring.segment import Geometry, Segment, attach_segment
+from spiked.ring.segment import RingLayout, Segment, attach_segment
 from spiked.ring.status import RingStatus, read_status
 
+_CLOCK_PAIRS = 1024
+"""Clock pairs kept for `clock_pairs`; older ones are dropped."""
 _LOOK_AGAIN_S = 0.1
-"""A writer that was killed does not ring the bell: readers look after it this often while nothing comes."""
-_MOURNING_S = 0.5
-"""For somebody to hold the ring of a writer that has died for its successor."""
+"""Interval at which a waiting reader checks that the writer lives, seconds: a killed writer wakes nobody."""
+_TAKEOVER_GRACE_S = 0.5
+"""Time for a restarted writer to take over, seconds."""
 
 
 class Frames:
-    """Frames `first` to `first + count - 1`, lying in the ring itself.
+    """Frames `first` to `first + count - 1`, in place in the ring: `data`, uint8 [count, frame_bytes].
 
-    The writer does not wait, so what was computed from `data` counts only if `release` says afterwards that the frames
-    were whole all the time. As a context manager it yields `data` and releases at the end; ask `valid` then.
+    The writer does not wait: results computed from `data` are valid only if `release` returns true afterwards. As a
+    context manager it yields `data` and releases at the end; call `valid` then.
     """
 
     def __init__(self, reader: "RingReader", first: int, data: NDArray[np.uint8], slot: int) -> None:
@@ -41,12 +44,12 @@ class Frames:
         return self._reader._holds(self._slot) if self._intact is None else self._intact
 
     def release(self) -> bool:
-        """Give the slot back; true if the frames were intact until now, and then they count as received.
+        """Return the slot. True if the frames were intact until now; they then count as received.
 
-        Otherwise they count as lost and the next item is a gap that tells so. Taking the next item releases too.
+        Otherwise they count as lost and the next item is their gap. Taking the next item releases, too.
         """
         if self._intact is None:
-            self._intact = self._reader._settle(self)
+            self._intact = self._reader._check_released(self)
         return self._intact
 
     def __enter__(self) -> NDArray[np.uint8]:
@@ -62,9 +65,9 @@ Item = Frames | Gap | End
 
 
 class RingReader:
-    """Takes frames, gaps and the end in order: every frame of the capture comes once, in `Frames` or in a `Gap`.
+    """Returns frames, gaps and the end in order. Every frame of the capture comes once, in `Frames` or in a `Gap`.
 
-    Frames from before it attached that the ring no longer holds come as a gap too. Used by one thread.
+    Earlier frames that the ring no longer holds when the reader attaches come as a gap, too. Used by one thread.
     """
 
     def __init__(self, segment: Segment, policy: Policy, consumer: str, start_frame: int | None = None) -> None:
@@ -73,8 +76,9 @@ class RingReader:
         self._policy = policy
         self._lease_slots = _lease(policy, segment.geometry.slots)
         self._counters = ReaderCounters()
-        self._jumped = False  # the entry at the position was told of by a gap, so it is taken even if it is late again
+        self._jumped = False  # a gap up to this entry was returned: take it even if it is late again
         self._held: Frames | None = None
+        self._clock_pairs: deque[ClockPair] = deque(maxlen=_CLOCK_PAIRS)
         self._end: End | None = None
         self._orphaned_s: float | None = None
         self._look_s = 0.0
@@ -83,7 +87,7 @@ class RingReader:
             self._position_to_take(writer) if start_frame is None else self._position_of(start_frame, writer)
         )
         self._counters.next_slot = self._slot_of(self._counters.next_entry, writer)
-        self._start = self._counters.next_entry  # what lies before was missed by joining late, not by being slow
+        self._start = self._counters.next_entry  # earlier frames were missed by attaching late and are no overrun
         self._owner = own_identity()
         self._place = self._claim_place(consumer)
 
@@ -91,36 +95,42 @@ class RingReader:
     def attach(cls, name: str, policy: Policy, consumer: str, start_frame: int | None = None) -> Self:
         """Read the ring of that name; `consumer` is shown in the ring's status.
 
-        With `start_frame` the first frames are those of the block that holds it, if the ring still has them and the
-        policy lets a reader lag so far; without, those that are a good distance from being overwritten.
-        Raises RingError if there is no such ring or no place for another reader.
+        Starts at the block that holds `start_frame`, if the ring still has it and the policy allows that lag. Without
+        `start_frame`, starts half the allowed lag behind the newest block. Raises RingError if there is no such ring or
+        no place for another reader.
         """
         return cls(attach_segment(name), policy, consumer, start_frame)
 
     def another(self, policy: Policy, consumer: str, start_frame: int) -> "RingReader":
-        """One more reader of the same ring, whose name may be gone meanwhile; see `attach`."""
+        """One more reader of the same ring, whose name may have been removed meanwhile; see `attach`."""
         return RingReader(self._segment, policy, consumer, start_frame)
 
     @property
-    def geometry(self) -> Geometry:
-        """Sensor, number of slots, and frames a slot."""
+    def geometry(self) -> RingLayout:
+        """Sensor, number of slots, and frames per slot."""
         return self._segment.geometry
 
     @property
     def newest_frame(self) -> int:
-        """One past the last frame that the writer has published, lost ones included; quicker than the whole status."""
+        """One past the last published frame, lost ones included; cheaper than `status`."""
         return int(self._control.writer().next_frame)
 
     @property
     def overruns(self) -> int:
-        """How often it fell behind and lost frames that the writer had published."""
+        """Number of times that it fell behind and lost published frames."""
         return int(self._counters.overruns)
 
-    def next(self, timeout_s: float) -> Item | None:
-        """The next item, or None if none comes in time. After the end, the end again.
+    def clock_pairs(self) -> list[ClockPair]:
+        """Clock pairs that came between the items so far, each once; at most the newest 1,024."""
+        pairs = list(self._clock_pairs)
+        self._clock_pairs.clear()
+        return pairs
 
-        A writer that dies ends the capture with EndReason.WRITER_DIED, after all that it had published and half a
-        second in which another process may hold the ring for a successor.
+    def next(self, timeout_s: float) -> Item | None:
+        """The next item; None after the timeout. After the end, returns the end again.
+
+        If the writer dies, the capture ends with EndReason.WRITER_DIED, after all published items and half a second in
+        which another process may claim the ring for a successor.
         """
         if self._held is not None:
             self._held.release()
@@ -139,7 +149,7 @@ class RingReader:
                 return None
 
     def _has_died(self) -> bool:
-        """Whether nobody writes, nor will; looked at now and then only, as it costs what a block does."""
+        """Whether the writer is dead and has no successor. Checked every 0.1 s: a check costs as much as a block."""
         now_s = time.monotonic()
         if now_s < self._look_s:
             return False
@@ -149,7 +159,7 @@ class RingReader:
             self._orphaned_s = None
             return False
         self._orphaned_s = self._orphaned_s or now_s
-        return not owner or now_s - self._orphaned_s > _MOURNING_S
+        return not owner or now_s - self._orphaned_s > _TAKEOVER_GRACE_S
 
     def status(self) -> RingStatus:
         """Counters of the writer and of every reader."""
@@ -181,7 +191,12 @@ class RingReader:
             entry = self._control.read_entry(position)
             if entry is None or (entry.cause == 0 and not self._holds(entry.slot)):
                 self._jumped = False
-                continue  # overwritten between choosing and reading: choose again, from newer ones
+                continue  # overwritten meanwhile: choose a newer one
+            if _is_clock_pair(entry):
+                self._counters.next_entry = position + 1
+                self._start += position == self._start
+                self._clock_pairs.append(ClockPair(entry.first + entry.cause, entry.count))
+                continue
             if entry.first > self._counters.next_frame:
                 return self._jump(position, entry)
             return self._accept(position, entry, newest=position + 1 == writer.entries)
@@ -192,37 +207,37 @@ class RingReader:
             self._counters.lagging = 0
         self._counters.next_entry = position + 1
         if entry.cause:
-            return self._lose(entry.count, decode(Cause, entry.cause))
+            return self._lose(entry.count, decode(LossCause, entry.cause))
         data = self._segment.slot(entry.slot, entry.count)
         data.flags.writeable = False
         self._held = Frames(self, entry.first, data, entry.slot)
         return self._held
 
     def _jump(self, position: int, entry: Entry) -> Gap:
-        """Tell of all that lies between the last item and this entry, which is the one to come next."""
+        """The gap between the last item and this entry, which is returned next."""
         self._jumped = True
         self._counters.next_entry = position
         self._counters.next_slot = entry.slot
         if self._policy is not Policy.LATEST and position != self._start:
             self._counters.lagging = 1
             self._counters.overruns += 1
-        return self._lose(entry.first - self._counters.next_frame, Cause.RING)
+        return self._lose(entry.first - self._counters.next_frame, LossCause.RING)
 
     def _finish(self, writer: WriterCounters, reason: EndReason) -> Gap | End:
         missing = writer.next_frame - self._counters.next_frame
         if missing:
-            return self._lose(missing, Cause.RING)
+            return self._lose(missing, LossCause.RING)
         self._end = End(writer.next_frame, reason)
         return self._end
 
-    def _lose(self, count: int, cause: Cause) -> Gap:
+    def _lose(self, count: int, cause: LossCause) -> Gap:
         gap = Gap(self._counters.next_frame, count, cause)
         self._counters.lost += count
         self._counters.next_frame += count
         self._publish()
         return gap
 
-    def _settle(self, frames: Frames) -> bool:
+    def _check_released(self, frames: Frames) -> bool:
         self._held = None
         intact = self._holds(frames._slot)
         if intact:
@@ -233,27 +248,35 @@ class RingReader:
         return intact
 
     def _holds(self, slot: int) -> bool:
-        """Whether the ring still has this slot; to be asked after reading it."""
+        """Whether the ring still holds this slot. Call it after reading the slot."""
         return bool(self._control.reserved() <= slot + self.geometry.slots)
 
     def _position_to_take(self, writer: WriterCounters) -> int:
-        """The next position in the log, or a later one if the policy has the reader skip."""
+        """The next position in the log, or a later one if the policy skips."""
         position: int = self._counters.next_entry
         if position >= writer.entries:
             return position
         if self._policy is Policy.LATEST:
-            return int(writer.entries) - 1
+            return self._newest(position, writer)
         if writer.slots - self._slot_of(position, writer) <= self._lease_slots:
             return position
-        # Half a lease behind the newest: far enough from the edge not to be overrun by the next block.
+        # Half a lease behind the newest block, so that the next block does not overrun it again.
         oldest = max(position, writer.entries - self.geometry.log_places // 2)
         target_slot = writer.slots - max(1, self._lease_slots // 2)
         candidates = range(oldest, writer.entries)
         index = bisect_left(candidates, target_slot, key=lambda p: self._slot_of(p, writer))
         return candidates[min(index, len(candidates) - 1)]
 
+    def _newest(self, position: int, writer: WriterCounters) -> int:
+        """The last entry from a position on that is no clock pair; if all are, the position."""
+        for newest in range(writer.entries - 1, position, -1):
+            entry = self._control.read_entry(newest)
+            if entry is None or not _is_clock_pair(entry):
+                return newest
+        return position
+
     def _position_of(self, frame: int, writer: WriterCounters) -> int:
-        """Position of the newest entry that begins at or before a frame, or of the oldest that the ring still holds."""
+        """Position of the newest entry that starts at or before a frame, or of the oldest that the ring still holds."""
         candidates = range(max(0, writer.entries - self.geometry.log_places // 2), writer.entries)
 
         def first(position: int) -> int:
@@ -286,13 +309,18 @@ class RingReader:
             place.describe(encode(self._policy), self._lease_slots, consumer)
             self._control.progress.ring()
             return place
-        raise RingError(f"ring {self._segment.name} has {READER_PLACES} readers, no more fit: end one of them")
+        raise RingError(f"ring {self._segment.name} has {READER_PLACES} readers, which is the limit: end one of them")
 
     def _publish(self) -> None:
         self._place.publish(self._counters)
         self._control.progress.ring()
 
 
+def _is_clock_pair(entry: Entry) -> bool:
+    """Whether an entry is a clock pair: `count` is a Unix time in ns, `cause` the frame minus `first`, below 0."""
+    return bool(entry.cause < 0)
+
+
 def _lease(policy: Policy, slots: int) -> int:
-    """Slots a reader may lag; the rest of the ring is the time for which a view stays whole once handed out."""
+    """Slots that a reader may lag. The rest of the ring is the time for which a returned view stays intact."""
     return slots - slots // 8 if policy is Policy.PRIORITY else slots // 2

@@ -1,8 +1,11 @@
-"""The file in /dev/shm behind a ring: layout, creation, attaching, and the cleaning up after dead creators.
+"""The file in /dev/shm of a ring: layout, creation, attaching, and removal after its processes died.
 
-A plain file and `mmap`, not `multiprocessing.shared_memory`, whose resource tracker unlinks segments that other
-processes still use. The file is made without a name, filled, and only then linked to `spiked-<id>`: under that name
-there is a whole ring or nothing, and a creator killed before leaves nothing behind.
+A plain file and `mmap` are used, not `multiprocessing.shared_memory`, whose resource tracker unlinks segments that
+other processes still use. The file is created without a name, filled, and then linked to `spiked-<id>`: the name always
+refers to a complete ring, and a creator that is killed before leaves no file.
+
+The header names two processes. The owner writes; readers check that it lives. The keeper, if any, starts the readers:
+while it lives, only the keeper removes the name, so that a reader can attach after the last frame.
 """
 
 import errno
@@ -27,27 +30,28 @@ from spiked.sensor import Sensor
 FOLDER = Path("/dev/shm")
 PREFIX = "spiked-"
 MIN_SLOTS = 8
+"""Least number of slots: an eighth of them may be acquired ahead."""
 
-_HEADER = struct.Struct("<8sQI")  # magic with the layout's version, identity of the creator, bytes of JSON that follow
-_MAGIC = b"spkring1"
-_OWNER_OFFSET = len(_MAGIC)
+_HEADER = struct.Struct("<8sQQQI")  # magic and version, owner, keeper, forgone, length of the JSON that follows
+_MAGIC = b"spkring2"
+_WORDS = slice(8, 32)
 _CONTROL_OFFSET = mmap.PAGESIZE
 _ENTRIES_A_SLOT = 4
 
 
 @dataclass(frozen=True)
-class Geometry:
-    """What a ring holds, kept as JSON in its header so that a name is enough to attach."""
+class RingLayout:
+    """Sensor and sizes of a ring, stored as JSON in its header, so that its name is enough to attach."""
 
     sensor: Sensor
-    """The camera; frames are compact."""
+    """The sensor; frames are compact."""
     slots: int
     block_frames: int
     """Frames in a full slot."""
 
     @property
     def log_places(self) -> int:
-        """Entries (blocks and losses) that the log keeps: enough for a loss before and after every block."""
+        """Entries (blocks, losses, clock pairs) that the log keeps: enough for a loss before and after every block."""
         return _ENTRIES_A_SLOT * self.slots
 
     @property
@@ -57,7 +61,7 @@ class Geometry:
 
     @property
     def slot_stride(self) -> int:
-        """Bytes from slot to slot: whole pages, as USB transfers like them."""
+        """Bytes from slot to slot: whole pages, for transfers into slots."""
         return -(-self.slot_bytes // mmap.PAGESIZE) * mmap.PAGESIZE
 
     @property
@@ -71,16 +75,16 @@ class Geometry:
         return self.data_offset + self.slots * self.slot_stride
 
 
-_GEOMETRY = TypeAdapter(Geometry)
+_LAYOUT = TypeAdapter(RingLayout)
 
 
 class Segment:
-    """The mapped memory of a ring. It stays mapped while any view of it lives, also after the file is unlinked."""
+    """The mapped memory of a ring. It stays mapped while a view of it exists, also after the file is unlinked."""
 
-    def __init__(self, name: str, geometry: Geometry, memory: NDArray[np.uint8]) -> None:
+    def __init__(self, name: str, geometry: RingLayout, memory: NDArray[np.uint8]) -> None:
         self.name = name
         self.geometry = geometry
-        self._owner = memory[_OWNER_OFFSET : _OWNER_OFFSET + 8].view("<u8")  # aligned: written and read in one piece
+        self._words = memory[_WORDS].view("<u8")  # aligned: each word is written and read atomically
         control_bytes = Control.bytes(geometry.log_places)
         self.control = Control(memory[_CONTROL_OFFSET : _CONTROL_OFFSET + control_bytes], geometry.log_places)
         slots = memory[geometry.data_offset :].reshape(geometry.slots, geometry.slot_stride)
@@ -92,31 +96,45 @@ class Segment:
 
     @property
     def owner(self) -> int:
-        """Identity of the process that writes, or holds the ring for the one that is to go on writing; 0: nobody."""
-        return int(self._owner[0])
+        """Identity of the process that writes, or has claimed the ring for a successor; 0: none."""
+        return int(self._words[0])
 
     @owner.setter
     def owner(self, identity: int) -> None:
-        self._owner[0] = identity
+        self._words[0] = identity
+
+    @property
+    def keeper(self) -> int:
+        """Identity of the process that removes the name; 0: the writer does."""
+        return int(self._words[1])
+
+    @property
+    def forgone(self) -> int:
+        """Number of awaited readers that will not attach."""
+        return int(self._words[2])
+
+    @forgone.setter
+    def forgone(self, count: int) -> None:
+        self._words[2] = count
 
     def unlink(self) -> None:
-        """Remove the name; processes that are attached keep the memory. Fine if it is gone already."""
+        """Remove the name; attached processes keep the memory. A removed name is no error."""
         (FOLDER / self.name).unlink(missing_ok=True)
 
 
-def create_segment(geometry: Geometry, ring_id: str | None) -> Segment:
-    """A new, zeroed ring named `spiked-<id>`, the id random unless given.
+def create_segment(geometry: RingLayout, ring_id: str | None, keeper: int = 0) -> Segment:
+    """A new, zeroed ring named `spiked-<id>`; the id is random unless stated.
 
-    Raises RingError if the name is taken or the memory is not there.
+    Raises RingError if the name is taken or there is too little shared memory.
     """
     name = PREFIX + (ring_id if ring_id is not None else secrets.token_hex(4))
     owner = own_identity()
-    text = _GEOMETRY.dump_json(geometry)
+    text = _LAYOUT.dump_json(geometry)
     folder = os.open(FOLDER, os.O_DIRECTORY | os.O_PATH)
     file = os.open(FOLDER, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
     try:
         _reserve_memory(file, geometry.total_bytes, name)
-        os.pwrite(file, _HEADER.pack(_MAGIC, owner, len(text)) + text, 0)
+        os.pwrite(file, _HEADER.pack(_MAGIC, owner, keeper, 0, len(text)) + text, 0)
         os.link(f"/proc/self/fd/{file}", name, dst_dir_fd=folder, follow_symlinks=True)
         return Segment(name, geometry, _map(file, geometry))
     except FileExistsError as error:
@@ -131,23 +149,28 @@ def create_segment(geometry: Geometry, ring_id: str | None) -> Segment:
 def attach_segment(name: str) -> Segment:
     """The ring of that name. Raises RingError if there is none, or if the file is not a ring of this version."""
     with _opened(FOLDER / name) as file:
-        _, geometry = _read_header(file, name)
+        *_, geometry = _read_header(file, name)
         return Segment(name, geometry, _map(file, geometry))
 
 
 def clean_stale() -> list[str]:
-    """Unlink the rings whose creator is dead, and return their names. Rings of other users are left to them."""
+    """Remove rings whose owner and keeper are dead; returns their names. Rings of other users are not touched."""
     removed = []
     for path in sorted(FOLDER.glob(PREFIX + "*")):
         try:
             with _opened(path) as file:
-                owner, _ = _read_header(file, path.name)
+                owner, keeper, _ = _read_header(file, path.name)
         except RingError:
-            continue  # vanished meanwhile, of another user, or only named like a ring
-        if not is_alive(owner):
+            continue  # removed meanwhile, of another user, or another file of such a name
+        if not is_alive(owner) and not is_alive(keeper):
             path.unlink(missing_ok=True)
             removed.append(path.name)
     return removed
+
+
+def remove_ring(ring_id: str) -> None:
+    """Remove the name of a ring that this process keeps. A removed name is no error."""
+    (FOLDER / (PREFIX + ring_id)).unlink(missing_ok=True)
 
 
 @contextmanager
@@ -155,7 +178,7 @@ def _opened(path: Path) -> Iterator[int]:
     try:
         file = os.open(path, os.O_RDWR | os.O_CLOEXEC)
     except FileNotFoundError as error:
-        raise RingError(f"there is no ring {path.name} in {FOLDER}: is its capture over?") from error
+        raise RingError(f"there is no ring {path.name} in {FOLDER}") from error
     except OSError as error:
         raise RingError(f"ring {path.name} cannot be opened: {error.strerror}") from error
     try:
@@ -164,22 +187,22 @@ def _opened(path: Path) -> Iterator[int]:
         os.close(file)
 
 
-def _read_header(file: int, name: str) -> tuple[int, Geometry]:
+def _read_header(file: int, name: str) -> tuple[int, int, RingLayout]:
     head = os.pread(file, _CONTROL_OFFSET, 0)
     try:
-        magic, owner, length = _HEADER.unpack_from(head)
+        magic, owner, keeper, _, length = _HEADER.unpack_from(head)
         if magic != _MAGIC:
             raise RingError(f"{FOLDER / name} is not a ring of this version of spiked")
-        geometry = _GEOMETRY.validate_json(head[_HEADER.size : _HEADER.size + length])
+        geometry = _LAYOUT.validate_json(head[_HEADER.size : _HEADER.size + length])
     except (struct.error, ValidationError) as error:
         raise RingError(f"{FOLDER / name} has no readable ring header") from error
     if os.fstat(file).st_size != geometry.total_bytes:
-        raise RingError(f"{FOLDER / name} is not as long as its header says")
-    return owner, geometry
+        raise RingError(f"{FOLDER / name} has another length than its header states")
+    return owner, keeper, geometry
 
 
 def _reserve_memory(file: int, size: int, name: str) -> None:
-    """Allocate now: a sparse file would end in SIGBUS in the middle of a capture when /dev/shm is full."""
+    """Allocate the file's memory: with a sparse file, a full /dev/shm would cause SIGBUS during the capture."""
     try:
         os.posix_fallocate(file, 0, size)
     except OSError as error:
@@ -189,11 +212,11 @@ def _reserve_memory(file: int, size: int, name: str) -> None:
         free = stat.f_bavail * stat.f_frsize
         raise RingError(
             f"ring {name} needs {size / 2**20:.0f} MiB in {FOLDER} and {free / 2**20:.0f} MiB are free: "
-            "take fewer slots, or enlarge it (a container has an option for its shared memory)"
+            "use fewer slots, or enlarge it (a container has an option for its shared memory)"
         ) from error
 
 
-def _map(file: int, geometry: Geometry) -> NDArray[np.uint8]:
-    """The whole file, its pages present from the start: page faults would slow the first lap of a capture."""
+def _map(file: int, geometry: RingLayout) -> NDArray[np.uint8]:
+    """Map the whole file with all pages present: page faults would slow the first lap of a capture."""
     flags = mmap.MAP_SHARED | mmap.MAP_POPULATE
     return np.frombuffer(mmap.mmap(file, geometry.total_bytes, flags=flags), np.uint8)

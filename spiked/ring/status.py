@@ -1,47 +1,49 @@
-"""What any process can know of a ring: the counters of its writer and of each reader."""
+"""Status of a ring for any process: the counters of its writer and of each reader."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Self
 
+from spiked.deprecation import renamed_attributes
 from spiked.native._ring import READER_PLACES, ReaderCounters
-from spiked.ring.items import Cause, Condition, DeviceState, EndReason, Policy, decode, encode
+from spiked.ring.items import DeviceState, DeviceStatus, EndReason, LossCause, Policy, decode, encode
 from spiked.ring.process import is_alive, own_identity, pid_of
-from spiked.ring.segment import Geometry, Segment, attach_segment
+from spiked.ring.segment import RingLayout, Segment, attach_segment
 
 
 @dataclass(frozen=True)
 class ReaderStatus:
-    """How far one reader is; `received + lost == next_frame` always."""
+    """Progress of one reader; `received + lost == next_frame` always."""
 
     consumer: str
     policy: Policy
     pid: int
     alive: bool
     received: int
-    """Frames it took and released intact."""
+    """Frames that it released intact."""
     lost: int
-    """Frames it was told are lost, for whatever cause."""
+    """Frames of the gaps that it got, of any cause."""
     next_frame: int
     lag_frames: int
-    """Frames committed or lost that it has not come to."""
+    """Published frames that it has not reached."""
     fill: float
-    """Its lag as a part of the slots it may lag: at 1 it loses frames."""
+    """Its lag divided by the slots that it may lag: at 1 it loses frames."""
     lagging: bool
-    """It was overrun and has not caught up since."""
+    """It was overrun and has not reached the newest block since."""
     overruns: int
 
 
+@renamed_attributes(condition="device_status")
 @dataclass(frozen=True)
 class WriterStatus:
-    """What the writer published; `committed + sum(lost.values()) == next_frame` always."""
+    """Counters of the writer; `committed + sum(lost.values()) == next_frame` always."""
 
     pid: int
     alive: bool
-    condition: Condition
+    device_status: DeviceStatus
     committed: int
     """Frames."""
-    lost: Mapping[Cause, int]
+    lost: Mapping[LossCause, int]
     """Frames, by cause."""
     next_frame: int
     end: EndReason | None
@@ -50,17 +52,17 @@ class WriterStatus:
 
 @dataclass(frozen=True)
 class RingStatus:
-    """A ring at one moment."""
+    """Snapshot of a ring."""
 
     name: str
-    geometry: Geometry
+    geometry: RingLayout
     writer: WriterStatus
     readers: tuple[ReaderStatus, ...]
 
 
 @dataclass(frozen=True)
 class ReaderPlace:
-    """A reader's record as it lies in shared memory."""
+    """A reader's record in shared memory."""
 
     owner: int
     consumer: str
@@ -69,8 +71,9 @@ class ReaderPlace:
     counters: ReaderCounters
 
 
+@renamed_attributes(hold="claim_for_successor", give_up="abandon", bury="remove_dead_readers")
 class Ring:
-    """A ring looked at from outside, taking no frames; it stays readable after the ring is unlinked."""
+    """A ring seen from outside, without taking frames. It stays readable after the ring's name is removed."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -86,18 +89,18 @@ class Ring:
         return self._segment.name
 
     @property
-    def geometry(self) -> Geometry:
-        """Sensor, number of slots, and frames a slot."""
+    def geometry(self) -> RingLayout:
+        """Sensor, number of slots, and frames per slot."""
         return self._segment.geometry
 
     def status(self) -> RingStatus:
         """Counters of the writer and of every reader."""
         return read_status(self._segment)
 
-    def hold(self, reason: str) -> bool:
-        """Hold the ring of a writer that has died for its successor: readers wait, and nobody cleans it up.
+    def claim_for_successor(self, reason: str) -> bool:
+        """Take ownership of a dead writer's ring until a successor starts: readers wait, the ring is not removed.
 
-        False if there is nothing to go on with, as the capture has ended.
+        False if the capture has ended, so that no successor can continue it.
         """
         if self._segment.control.writer().end:
             return False
@@ -105,13 +108,14 @@ class Ring:
         self._segment.control.publish_condition(encode(DeviceState.LOST), reason)
         return True
 
-    def give_up(self) -> None:
-        """There will be no successor: readers are told that the writer has died."""
+    def abandon(self) -> None:
+        """Give up ownership without a successor: readers get the end WRITER_DIED."""
         self._segment.owner = 0
         self._segment.control.committed.ring()
 
-    def bury(self, consumer: str) -> None:
-        """Take dead readers of that name off the list, so that no writer holds frames for a successor."""
+    def remove_dead_readers(self, consumer: str) -> None:
+        """Free the places of dead readers of this name and stop waiting for one to attach."""
+        self._segment.forgone += 1
         for index in range(READER_PLACES):
             place = self._segment.control.place(index)
             owner = place.owner()
@@ -121,7 +125,7 @@ class Ring:
 
 
 def read_places(segment: Segment) -> Iterator[ReaderPlace]:
-    """The readers that attached and did not detach, dead ones too until another takes their place."""
+    """The attached readers, and dead ones until another reader takes their place."""
     for index in range(READER_PLACES):
         place = segment.control.place(index)
         owner = place.owner()
@@ -135,16 +139,16 @@ def read_places(segment: Segment) -> Iterator[ReaderPlace]:
 
 
 def read_status(segment: Segment) -> RingStatus:
-    """A snapshot; each record in it is whole, records of different processes may be a moment apart."""
+    """A snapshot. Each record is consistent; records of different processes may differ slightly in time."""
     places = list(read_places(segment))
     counters = segment.control.writer()
     code, reason = segment.control.condition()
     writer = WriterStatus(
         pid_of(segment.owner),
         is_alive(segment.owner),
-        Condition(decode(DeviceState, code), reason.decode(errors="ignore")),
+        DeviceStatus(decode(DeviceState, code), reason.decode(errors="ignore")),
         counters.committed,
-        {cause: counters.lost[encode(cause) - 1] for cause in Cause},
+        {cause: counters.lost[encode(cause) - 1] for cause in LossCause},
         counters.next_frame,
         decode(EndReason, counters.end) if counters.end else None,
     )

@@ -1,4 +1,4 @@
-"""A spike camera without hardware: a sensor with every noise term, a furnished room, camera paths, and the truth."""
+"""A simulated spike camera: sensor with noise terms, furnished room, camera paths, and ground truth."""
 
 from spiked.simulate.camera import SimulatedCamera
 from spiked.simulate.motion import Motion, MotionKind, Stage, look_at, make_motion

@@ -40,7 +40,7 @@ class Stage:
     centre: Array
     """Start of the path [3]."""
     target: Array
-    """The point [3] that the camera looks at from there; its distance is the depth that flow is reckoned at."""
+    """The point [3] that the camera looks at from there; its distance is the depth of the stated flow."""
     up: Array
     """Upward direction [3]."""
     focal_px: float

@@ -1,7 +1,7 @@
 """Write what a simulated camera sees as a recording with its truth: the folder that `evaluate` scores against."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -14,15 +14,23 @@ from spiked.pose import exp_so3
 from spiked.recording import RecordingWriter
 from spiked.scene import Scene
 from spiked.sensor import BitOrder, Layout, Sensor
-from spiked.simulate.camera import SimulatedCamera
+from spiked.simulate.camera import DEFAULT_GAIN, SimulatedCamera
 from spiked.simulate.motion import Recorded
 from spiked.simulate.sensor import SensorNoise
 from spiked.simulate.splats import SplatScene
-from spiked.trajectory import Trajectory
+from spiked.trajectory import Trajectory, tum_lines
 
 Array = NDArray[np.float64]
 
 _CHUNK = 64
+_POSES = 16_384
+"""Poses of the ground truth in memory at a time."""
+
+_COVERAGE_STRIDE = 64
+"""Frames between the poses that the coverage of a view is computed from."""
+
+_PAIRS = 100_000
+"""Points times poses that are projected at a time."""
 
 
 def camera_of_files(
@@ -32,19 +40,25 @@ def camera_of_files(
     *,
     seed: int = 0,
     noise: SensorNoise | None = None,
-    gain: float = 0.35,
+    gain: float | None = None,
+    step_px: float | None = None,
     threads: int = 1,
 ) -> SimulatedCamera:
     """A camera that looks at the Gaussians of a PLY along the path of a TUM file (camera-to-world, times in seconds).
 
+    gain: spikes a frame of white. If None, it is what the PLY says of its white, so that the camera sees the scene's
+    own radiance, or 0.35 if the PLY does not say it.
+    step_px: see `SimulatedCamera`.
     Between poses the path is even; before the first and after the last pose the camera stands still. Raises SceneError
     for files that cannot be read, and ConfigurationError for a path of fewer than two poses.
     """
     path = Trajectory.read_tum(tum)
     motion = Recorded(path.times_s * sensor.frame_rate_hz, path.rotations, path.centres)
-    return SimulatedCamera(
-        sensor, seed, motion, SplatScene(Scene.read_ply(ply), threads), noise, gain=gain, threads=threads
-    )
+    scene = Scene.read_ply(ply)
+    if gain is None:
+        gain = scene.white or DEFAULT_GAIN
+    splats = SplatScene(scene, threads)
+    return SimulatedCamera(sensor, seed, motion, splats, noise, gain=gain, step_px=step_px, threads=threads)
 
 
 def simulate(
@@ -60,10 +74,12 @@ def simulate(
     """Record `frames` frames into `folder`, with the truth, and return the path of the recording.
 
     The folder, which must be new or empty, then holds NAME.dat, its sidecar NAME.json, groundtruth.tum (a pose for the
-    middle of each frame), and `views` held-out noise-free pictures in views/ with their poses in views.json; every
-    other one lies beside the path, drawn by `seed`. `progress` is told the number of frames written. Raises
-    RecordingError if the folder cannot be written or holds something, and ConfigurationError for a sensor whose frames
-    are not compact and LSB first.
+    middle of each frame), and `views` held-out noise-free pictures in views/ with their poses in views.json, evenly
+    spread over time; every other one lies beside the path, drawn by `seed`. If the camera interpolates between exact
+    pictures, `simulation.interpolation` of the sidecar is the error of that, measured as in `InterpolationError`.
+    Memory does not grow with `frames`. `progress` is called with the number of frames written. Raises RecordingError
+    if the folder cannot be written or holds something, and ConfigurationError for a sensor whose frames are not compact
+    and LSB first.
     """
     folder, sensor = Path(folder), camera.sensor
     if sensor.layout is not Layout.COMPACT or sensor.bit_order is not BitOrder.LSB:
@@ -77,6 +93,9 @@ def simulate(
         data = folder / f"{name}.dat"
         described = replace(sensor, intrinsics=camera.intrinsics)
         simulation = {"seed": camera.spikes.seed, "gain": camera.gain, "noise": asdict(camera.spikes.noise)}
+        error = camera.interpolation_error(frames)
+        if error is not None:
+            simulation["interpolation"] = asdict(error)
         with RecordingWriter(
             data, described, note="simulated; cfa is of the upright image", simulation=simulation
         ) as out:
@@ -85,28 +104,34 @@ def simulate(
                 out.append(camera.next_frames(count))
                 if progress is not None:
                     progress(begin + count)
-        rotations, centres = camera.truth(np.arange(frames))
-        times = (np.arange(frames, dtype=np.float64) + 0.5) / sensor.frame_rate_hz
-        Trajectory(times, rotations, centres).write_tum(folder / "groundtruth.tum")
-        _write_views(camera, folder, rotations, centres, views=views, seed=seed)
+        with (folder / "groundtruth.tum").open("w", encoding="utf-8") as file:
+            file.writelines(tum_lines(_truth(camera, frames)))
+        _write_views(camera, folder, frames, views=views, seed=seed)
     except OSError as error:
         raise RecordingError(f"cannot write the simulated recording in {folder}: {error.strerror}") from error
     return data
 
 
-def _write_views(
-    camera: SimulatedCamera, folder: Path, rotations: Array, centres: Array, *, views: int, seed: int
-) -> None:
+def _truth(camera: SimulatedCamera, frames: int) -> Iterator[Trajectory]:
+    for begin in range(0, frames, _POSES):
+        numbers = np.arange(begin, min(begin + _POSES, frames))
+        times = (numbers.astype(np.float64) + 0.5) / camera.sensor.frame_rate_hz
+        yield Trajectory(times, *camera.truth(numbers))
+
+
+def _write_views(camera: SimulatedCamera, folder: Path, frames: int, *, views: int, seed: int) -> None:
     rng = np.random.default_rng(np.random.SeedSequence([seed, 0x71E3]))
     (folder / "views").mkdir()
-    chosen = np.linspace(0, len(centres) - 1, views + 2)[1:-1].round().astype(int)
-    middle = len(centres) // 2
-    median_depth = float(np.median(_finite(camera.depth(rotations[middle], centres[middle]))))
+    chosen = np.linspace(0, frames - 1, views + 2)[1:-1].round().astype(int)
+    rotations, centres = camera.truth(chosen)
+    path = camera.truth(np.arange(0, frames, _COVERAGE_STRIDE))
+    middle_rotations, middle_centres = camera.truth([frames // 2])
+    median_depth = float(np.median(_finite(camera.depth(middle_rotations[0], middle_centres[0]))))
     entries = []
     for number, frame in enumerate(chosen):
         on_path = number % 2 == 0
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotations[frame], centres[frame]
+        pose[:3, :3], pose[:3, 3] = rotations[number], centres[number]
         if not on_path:
             pose[:3, 3] += 0.015 * median_depth * rng.standard_normal(3)
             pose[:3, :3] = pose[:3, :3] @ exp_so3(0.015 * rng.standard_normal(3))
@@ -122,7 +147,7 @@ def _write_views(
                 "on_trajectory": on_path,
                 "timestamp": (int(frame) + 0.5) / camera.sensor.frame_rate_hz,
                 "c2w": pose.tolist(),
-                "coverage": _coverage(camera, pose, rotations[::64], centres[::64]),
+                "coverage": _coverage(camera, pose, path, int(frame) // _COVERAGE_STRIDE),
             }
         )
     table = {
@@ -139,18 +164,25 @@ def _finite(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     return depth[np.isfinite(depth)]
 
 
-def _coverage(camera: SimulatedCamera, pose: Array, rotations: Array, centres: Array) -> float:
-    """The share of a view's points that lie within the picture of some pose of the path; occlusion is not looked at."""
+def _coverage(camera: SimulatedCamera, pose: Array, path: tuple[Array, Array], nearest: int) -> float:
+    """The share of a view's points that lie within the picture of some pose of the path; occlusion is ignored.
+
+    path: rotations [n, 3, 3] and centres [n, 3]. nearest: the pose of the path that is tried first, then those around
+    it; what they see, nearly all of the view, is not tried on the rest of a long path.
+    """
+    rotations, centres = path
     sensor, k = camera.sensor, camera.intrinsics
     depth = camera.depth(pose[:3, :3], pose[:3, 3])[::5, ::5].astype(np.float64)
     y, x = (np.mgrid[0 : sensor.height : 5, 0 : sensor.width : 5] + 0.5).reshape(2, *depth.shape)
     seen = np.isfinite(depth)
-    rays = np.stack([(x - k.cx) / k.fx, (y - k.cy) / k.fy, np.ones_like(x)], -1)[seen]
+    rays = k.unproject(np.stack([x, y], -1))[seen]
     points = pose[:3, 3] + (rays * depth[seen][:, None]) @ pose[:3, :3].T
-    covered = np.zeros(len(points), bool)
-    for rotation, centre in zip(rotations, centres, strict=True):
-        local = (points - centre) @ rotation
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = k.fx * local[:, 0] / local[:, 2] + k.cx, k.fy * local[:, 1] / local[:, 2] + k.cy
-        covered |= (local[:, 2] > 0) & (u >= 0) & (u < sensor.width) & (v >= 0) & (v < sensor.height)
-    return float(covered.mean()) if len(covered) else 0.0
+    unseen, order = points, np.argsort(np.abs(np.arange(len(centres)) - nearest), kind="stable")
+    while len(unseen) and len(order):
+        count = max(_PAIRS // len(unseen), 1)
+        poses, order = order[:count], order[count:]
+        local = (unseen - centres[poses, None]) @ rotations[poses]
+        u, v = np.moveaxis(k.project(local), -1, 0)
+        inside = (local[..., 2] > 0) & (u >= 0) & (u < sensor.width) & (v >= 0) & (v < sensor.height)
+        unseen = unseen[~inside.any(0)]
+    return (len(points) - len(unseen)) / len(points) if len(points) else 0.0

@@ -82,7 +82,7 @@ _SHELL_COLOURS = (_WHITE, _GREEN, _WHITE, _RED, _OAK, _WHITE)
 
 
 class Room:
-    """The room, ready to be looked at. The seed changes what is painted on its surfaces, not the furniture."""
+    """The room as a scene. The seed changes the textures, not the furniture."""
 
     def __init__(self, colour: bool = False, seed: int = 0, texel_m: float = 0.006, threads: int = 1) -> None:
         """colour: three channels instead of one. texel_m: edge of a texture's finest cell in metres."""

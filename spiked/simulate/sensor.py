@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 
 import spiked.native._simulate as _simulate
 from spiked.errors import ConfigurationError
-from spiked.sensor import BitOrder, Layout, Sensor
-
-Image = NDArray[np.float32]
+from spiked.sensor import BitOrder, Image, Layout, Sensor
 
 _BOLTZMANN_J_PER_K = 1.380649e-23
 _ELEMENTARY_CHARGE_C = 1.602176634e-19
@@ -37,9 +35,9 @@ class SensorNoise:
     electrons_a_spike: float = 4000.0
     """Photo-electrons that make up one nominal threshold; the shot noise of one spike is 1 / sqrt of it."""
     reset_noise: float = thermal_reset_noise(4000.0)
-    """Thermal (kTC) noise of a reset: standard deviation as a share of the threshold, drawn anew at each spike."""
+    """Thermal (kTC) noise of a reset: standard deviation as a share of the threshold, drawn at each spike."""
     threshold_jitter: float = 0.00967
-    """Comparator noise: standard deviation as a share of the threshold, drawn anew at each spike."""
+    """Comparator noise: standard deviation as a share of the threshold, drawn at each spike."""
     dark: float = 0.002
     """Mean dark current in spikes a frame."""
     dark_spread: float = 0.0002

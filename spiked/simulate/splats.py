@@ -1,4 +1,4 @@
-"""A scene of Gaussians as something that the simulated camera can look at."""
+"""A scene of Gaussians for the simulated camera."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from spiked.simulate.view import View
 
 
 class SplatScene:
-    """Gaussians drawn by the CPU rasteriser; colour 1 of the scene is intensity 1."""
+    """Gaussians drawn by the CPU rasteriser; the scene's white is intensity 1."""
 
     def __init__(self, scene: Scene, threads: int = 1) -> None:
         self._scene = scene
@@ -31,5 +31,5 @@ class SplatScene:
         if self._rasteriser is None or self._rasteriser.camera != camera:
             self._rasteriser = Rasteriser(camera, self._threads)
         image = self._rasteriser.forward(self._scene, rotation[None], centre[None])
-        values = image.values.reshape(height, width, -1)
+        values = image.values.reshape(height, width, -1) / np.float32(self._scene.colour_of_white)
         return View(values, np.where(image.depth > 0, image.depth, np.inf).astype(np.float32))

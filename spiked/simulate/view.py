@@ -1,4 +1,4 @@
-"""What the simulator asks of a scene: a picture and its depth from any pose."""
+"""Interface of a scene to the simulator: image and depth from any pose."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -24,7 +24,7 @@ class View:
 
 
 class ViewableScene(Protocol):
-    """A scene that can be looked at."""
+    """A scene that can be rendered."""
 
     def look(
         self,

@@ -1,0 +1,1 @@
+"""From spikes to tracks: windows of frames, rates, features."""

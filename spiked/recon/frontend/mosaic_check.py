@@ -1,0 +1,105 @@
+"""Checks the stated colour mosaic against the pixels of a recording."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from spiked.sensor import Image, Mosaic
+
+CLEAR = 1.25
+"""Factor by which one diagonal must agree better than the other to be green."""
+SEEN = 0.03
+"""Relative difference of the sites' mean rates below which the sensor or the scene is grey."""
+
+_ON_MAIN_DIAGONAL = (Mosaic.GRBG, Mosaic.GBRG)
+_MIRRORED = {
+    Mosaic.BGGR: Mosaic.GRBG,
+    Mosaic.GRBG: Mosaic.BGGR,
+    Mosaic.RGGB: Mosaic.GBRG,
+    Mosaic.GBRG: Mosaic.RGGB,
+}
+"""The same sensor read from the other end of its columns."""
+
+
+@dataclass(frozen=True)
+class Green:
+    """Where the two green sites of each 2x2 tile are."""
+
+    main: bool
+    """On (0,0) and (1,1), not on (0,1) and (1,0)."""
+    ratio: float
+    """Disagreement of the other diagonal over that of this one."""
+
+    @property
+    def clear(self) -> bool:
+        """Whether the evidence suffices."""
+        return self.ratio > CLEAR
+
+
+def find_green(rate: Image) -> Green | None:
+    """From an upright rate image [H, W]; None where the four sites look alike, as of a grey sensor.
+
+    Two sites of one colour differ by the scene's detail only, two of different colours by its colours too.
+    """
+    height, width = rate.shape[0] // 2 * 2, rate.shape[1] // 2 * 2
+    even = rate[:height, :width]
+    # Each site's plane at the tile's middle, so that an edge does not look like a colour.
+    moved = [_towards_middle(even[r::2, c::2], r, c) for r in (0, 1) for c in (0, 1)]
+    means = np.array([float(plane.mean()) for plane in moved])
+    main, other = _disagreement(moved[0], moved[3]), _disagreement(moved[1], moved[2])
+    ratio = max(main, other) / max(min(main, other), 1e-9)
+    if ratio < CLEAR and np.ptp(means) < SEEN * max(float(means.mean()), 1e-9):
+        return None
+    return Green(main < other, ratio)
+
+
+def contradicts(mosaic: Mosaic, rate: Image) -> Mosaic | None:
+    """The likelier mosaic if the image clearly contradicts the stated one, else None."""
+    green = find_green(rate)
+    if green is None or not green.clear or green.main == (mosaic in _ON_MAIN_DIAGONAL):
+        return None
+    return _MIRRORED[mosaic]
+
+
+def detect(rate: Image, said: Mosaic | None) -> Mosaic | None:
+    """The mosaic estimated from the image, or the stated one if the evidence is weak.
+
+    Red and blue cannot be distinguished: they stay as stated, or as of a sensor that is read as BGGR bottom up.
+    """
+    green = find_green(rate)
+    if green is None:
+        return said
+    guess = said or Mosaic.BGGR
+    if not green.clear:
+        return guess
+    return guess if green.main == (guess in _ON_MAIN_DIAGONAL) else _MIRRORED[guess]
+
+
+def _towards_middle(plane: Image, row: int, column: int) -> Image:
+    """Shifted by a quarter of its own spacing towards the middle of the tile."""
+    shift = np.array([[1, 0, 0.25 * (1 - 2 * column)], [0, 1, 0.25 * (1 - 2 * row)]], np.float32)
+    moved = cv2.warpAffine(
+        np.ascontiguousarray(plane),
+        shift,
+        plane.shape[::-1],
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return np.asarray(cv2.GaussianBlur(moved, (0, 0), 1.0), np.float32)
+
+
+def _disagreement(a: Image, b: Image) -> float:
+    """Median difference relative to the brightness."""
+    return float(np.mean(np.abs(a - b)) / max(float(np.mean(a + b)), 1e-9))
+
+
+def mosaic_warning(stated: Mosaic | None, rate: Image) -> str | None:
+    """A warning where the pixels [H, W] contradict the stated mosaic."""
+    likelier = None if stated is None else contradicts(stated, rate)
+    if likelier is None:
+        return None
+    return (
+        f"the colour mosaic is said to be {stated}, but by the pixels green is where {likelier} has it: "
+        "colours and fine detail will be wrong; give --mosaic auto, or correct the sidecar's cfa"
+    )

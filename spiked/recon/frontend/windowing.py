@@ -1,0 +1,269 @@
+"""From frames as they arrive to views: spike-aligned rate images of short windows, with the noise of each pixel."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.blocks import Window, aligned_window
+from spiked.calibration import Calibration
+from spiked.recon.frontend.motion_compensation import MotionCompensator, drift, speed
+from spiked.recon.frontend.spike_intervals import SpikeIntervals
+from spiked.sensor import Image, Mosaic, Sensor
+
+LATE_PERCENT = 10.0
+"""Percentile of exposure starts and ends that bound the rendered span: the darkest pixels gather charge for too long to
+render their whole exposure in straight sub-frames."""
+LEAST_INSIDE = 0.7
+"""Share of a pixel's exposure that has to lie in that span."""
+MARGIN = 24
+"""Frames on both sides of a window that are searched for the spikes nearest to its edges."""
+STORE = 4
+"""Capacity of the frame buffer over the number of waiting frames."""
+PROBE = 16
+"""Frames of the first motion estimate."""
+WINDOWS = (4, 8, 16, 32, 64)
+"""Lengths of a view in frames."""
+WARP_FRAMES = 12
+"""Frames on either side of a view's middle that the map is fitted to where the motion is fast."""
+FIRST_WINDOW = 16
+"""Length of the first views in frames."""
+WINDOW_MOTION_PX = (0.12, 0.6)
+"""The next view is twice as long below the first motion in a view, half as long above twice the second."""
+STARTS_PX = 1.0
+"""Motion in a view longer than `FIRST_WINDOW` that shortens this view at once."""
+FAST_PX = (0.35, 0.5)
+"""Motion a frame: compensation starts above the second and ends below the first. Below it 8-frame windows give better
+tracks in spite of their blur: charge between spikes is far less noisy than warped spikes."""
+FASTEST_PX = (0.45, 0.6)
+"""Motion a frame: views of 4 instead of 8 frames start above the second and end below the first."""
+
+
+@dataclass(frozen=True)
+class View:
+    """The frames [begin, end) as a rate image with its noise; images are upright [H, W]."""
+
+    begin: int
+    end: int
+    intervals: SpikeIntervals
+    """The spikes between which each pixel's charge was measured."""
+    spikes_a_pixel: float
+    """Mean spike count of a pixel in the window."""
+    calibration: Calibration | None = None
+    """If given, rates are calibrated to light."""
+    after_gap: bool = False
+    """Frames are missing between the view before and this one."""
+    sharp: Image | None = None
+    """Motion-compensated spikes a frame at the middle of the window, all colours mixed; None for slow or unknown
+    motion."""
+    first: int = 0
+    """Absolute index of the first of `frames`."""
+    frames: NDArray[np.uint8] | None = None
+    """Stored frames [n, frame_bytes] around the middle, if `sharp` is set; the map is fitted to all of them."""
+
+    @property
+    def time(self) -> float:
+        """The middle of the window in frames."""
+        return 0.5 * (self.begin + self.end)
+
+    @cached_property
+    def light(self) -> tuple[Image, Image]:
+        """Rate and deviation, computed at the first access and cached."""
+        measured = self.intervals.rate(), self.intervals.deviation()
+        return measured if self.calibration is None else self.calibration.apply(*measured)
+
+    @property
+    def rate(self) -> Image:
+        """Spikes a frame; where no whole interval was seen, half of the rate's upper bound."""
+        return self.light[0]
+
+    @property
+    def deviation(self) -> Image:
+        """Standard deviation of `rate`."""
+        return self.light[1]
+
+    def preview_rate(self, room: Image) -> Image:
+        """`rate` without caching; written to `room` if there is no calibration."""
+        return self.rate if self.calibration is not None else self.intervals.rate(room)
+
+    def exposure(self, parts: int) -> tuple[NDArray[np.float64], Image, NDArray[np.bool_]]:
+        """When each pixel gathered its charge, for `Rasteriser.forward_moving` with `parts` sub-frames.
+
+        Returns the times [parts + 1] in frames of the poses, evenly spaced over the exposure of most pixels, the
+        pixels' exposures [2, H, W] in units of sub-frames, and a mask [H, W], False for much longer exposures.
+        """
+        start, stop = self.intervals.times()
+        first = float(np.percentile(start[::4, ::4], LATE_PERCENT))
+        last = float(np.percentile(stop[::4, ::4], 100 - LATE_PERCENT))
+        scale = np.float32(parts / max(last - first, 1e-3))
+        windows = np.stack([(start - np.float32(first)) * scale, (stop - np.float32(first)) * scale])
+        whole = windows[1] - windows[0]
+        np.clip(windows[0], 0, parts - 0.02, out=windows[0])
+        np.clip(windows[1], windows[0] + 0.02, parts, out=windows[1])
+        seen = windows[1] - windows[0] >= LEAST_INSIDE * whole
+        return self.time + np.linspace(first, last, parts + 1), windows.astype(np.float32), seen
+
+
+def make_view(
+    window: Window,
+    after_gap: bool,
+    calibration: Calibration | None = None,
+    sharp: Image | None = None,
+    first: int = 0,
+    frames: NDArray[np.uint8] | None = None,
+) -> View:
+    """The view of a spike-aligned window, in light instead of spikes where the camera is calibrated."""
+    intervals, count = SpikeIntervals.of(window), float(cv2.mean(window.count)[0])
+    return View(window.begin, window.end, intervals, count, calibration, after_gap, sharp, first, frames)
+
+
+class Windows:
+    """Cuts a stream of frames into consecutive views of `length` frames; a window never spans a gap.
+
+    Without a `length` it follows the motion, see `follow`. Fast motion is compensated in each view's `sharp` image.
+    """
+
+    def __init__(self, sensor: Sensor, length: int | None, calibration: Calibration | None = None) -> None:
+        """Raises CalibrationError when the calibration is of another sensor."""
+        self.sensor, self.length, self.sharpen = sensor, length or FIRST_WINDOW, False
+        self._follows, self._probed = length is None, length is not None
+        self._calibration = calibration
+        if calibration is not None:
+            calibration.check(sensor)
+        self._store = np.zeros((0, sensor.frame_bytes), np.uint8)
+        self._shared = False
+        """Views reference the buffer, so that it must not be overwritten."""
+        self._frames = self._store
+        """Frames not yet consumed, the end of the filled part of the buffer."""
+        self._filled = 0
+        self._first = 0
+        self._next = 0
+        self._gap = False
+        self._compensator: MotionCompensator | None = None
+        self._window: Window | None = None
+
+    def feed(self, first_frame: int, frames: NDArray[np.uint8]) -> Iterator[View]:
+        """Add frames uint8 [n, frame_bytes] in stored layout and yield the completed views."""
+        expected = self._first + len(self._frames)
+        if first_frame != expected:
+            yield from self._cut(final=True)
+            self._gap = self._gap or expected > 0
+            self._frames, self._first, self._next = self._frames[:0], first_frame, first_frame
+            self._compensator = None
+        self._append(frames)
+        yield from self._cut(final=False)
+
+    def _append(self, frames: NDArray[np.uint8]) -> None:
+        """Append frames; a full buffer is compacted or replaced."""
+        waiting, count = len(self._frames), len(self._frames) + len(frames)
+        begin = self._filled - waiting
+        if begin + count > len(self._store):
+            if self._shared or 2 * count > len(self._store):
+                self._store, self._shared = np.empty((STORE * count, self.sensor.frame_bytes), np.uint8), False
+            self._store[:waiting] = self._frames
+            begin = 0
+        self._store[begin + waiting : begin + count] = frames
+        self._filled = begin + count
+        self._frames = self._store[begin : self._filled]
+
+    @property
+    def latest_frames(self) -> int:
+        """Number of frames that `latest_view` needs."""
+        return self.length + 2 * MARGIN
+
+    def latest_view(self, first_frame: int, frames: NDArray[np.uint8]) -> View:
+        """One view in the middle of frames uint8 [n, frame_bytes]; waiting frames are dropped."""
+        stop = first_frame + len(frames)
+        length = min(self.length, len(frames))
+        begin = first_frame + (len(frames) - length) // 2
+        window = aligned_window(frames, self.sensor, first_frame, begin, begin + length)
+        view = make_view(window, self._gap, self._calibration)
+        self._frames, self._first, self._next, self._gap = self._store[:0], stop, stop, False
+        self._probed, self._compensator = True, None
+        return view
+
+    def flush(self) -> Iterator[View]:
+        """The last views, without a margin after them."""
+        yield from self._cut(final=True)
+
+    def follow(self, motion_px: float, frames: float) -> None:
+        """Set the length of the next views from an image motion of `motion_px` in `frames`: long views are less noisy,
+        short ones less blurred."""
+        if not self._follows or motion_px == 0:
+            return
+        speed_px = motion_px / frames
+        self.sharpen = speed_px > FAST_PX[not self.sharpen]
+        if self.sharpen:
+            self.length = WINDOWS[0] if speed_px > FASTEST_PX[self.length > WINDOWS[0]] else WINDOWS[1]
+            return
+        index = max(WINDOWS.index(self.length), 1)
+        in_window = speed_px * self.length
+        if in_window > 2 * WINDOW_MOTION_PX[1]:
+            index = max(index - 1, 1)
+        elif in_window < WINDOW_MOTION_PX[0]:
+            index = min(index + 1, len(WINDOWS) - 1)
+        self.length = WINDOWS[index]
+
+    def _probe(self) -> None:
+        """Estimate the motion of the first frames; only fast motion changes the view length."""
+        speed_px = speed(self._frames[:PROBE], self.sensor)
+        if speed_px > FAST_PX[1]:
+            self.follow(speed_px, 1.0)
+        self._probed = True
+
+    def _shorten(self) -> None:
+        """Shorten a long view in which the camera starts to move: it would be blurred."""
+        while self._follows and not self.sharpen and self.length > FIRST_WINDOW:
+            begin = self._next - self._first
+            if drift(self._frames[begin : begin + self.length], self.sensor) < STARTS_PX:
+                return
+            self.length = WINDOWS[WINDOWS.index(self.length) - 1]
+
+    def _cut(self, final: bool) -> Iterator[View]:
+        stop = self._first + len(self._frames)
+        if not self._probed and (len(self._frames) >= PROBE or final):
+            self._probe()
+        if not self._probed:
+            return
+        while self._next + self.length + (0 if final else MARGIN) <= stop:
+            self._shorten()
+            begin, end = self._next, self._next + self.length
+            low = max(self._first, begin - MARGIN)
+            high = min(stop, end + MARGIN)
+            part = self._frames[low - self._first : high - self._first]
+            self._window = window = aligned_window(part, self.sensor, low, begin, end, out=self._window)
+            sharp = self._sharp(0.5 * (begin + end), high)
+            self._next = end
+            if sharp is None and self.sharpen and final:
+                continue  # the motion after the last frame is unknown, and a blurred view is worse than none
+            first, frames = self._around((begin + end) // 2, stop) if sharp is not None else (0, None)
+            yield make_view(window, self._gap, self._calibration, sharp, first, frames)
+            self._gap = False
+        keep = max(self._first, min(self._next - MARGIN, stop))
+        self._frames, self._first = self._frames[keep - self._first :], keep
+
+    def _around(self, middle: int, stop: int) -> tuple[int, NDArray[np.uint8]]:
+        """The frames around a time; views share their memory."""
+        first, last = max(self._first, middle - WARP_FRAMES), min(stop, middle + WARP_FRAMES)
+        self._shared = True
+        return first, self._frames[first - self._first : last - self._first]
+
+    def _sharp(self, time: float, stop: int) -> Image | None:
+        if not self.sharpen:
+            self._compensator = None
+            return None
+        if self._compensator is None or self._compensator.interval != self.length:
+            self._compensator = MotionCompensator(self.sensor, self.length)
+        self._compensator.look(self._frames[: stop - self._first], self._first, time)
+        return self._compensator.sharp(self._frames, self._first, time)
+
+
+def luminance(rate: Image, mosaic: Mosaic | None) -> Image:
+    """A grey image of raw sites: a 3x3 binomial mean sees every colour in the same proportion at every pixel."""
+    if mosaic is None:
+        return rate
+    row = np.array([0.25, 0.5, 0.25], np.float32)
+    return np.asarray(cv2.sepFilter2D(rate, cv2.CV_32F, row, row, borderType=cv2.BORDER_REFLECT_101), np.float32)

@@ -1,0 +1,213 @@
+"""The map: Gaussian splats fitted to views by gradient descent."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.calibration import Calibration
+from spiked.pose import Array
+from spiked.recon.frontend.demosaic import fill_mosaic
+from spiked.recon.frontend.windowing import View
+from spiked.recon.mapping.loss import RateLoss, WarpedChargeLoss
+from spiked.recon.mapping.options import MapOptions
+from spiked.recon.mapping.photometric import Nuisances
+from spiked.recon.mapping.pyramid import Level, levels
+from spiked.recon.mapping.render_requests import RenderRequest
+from spiked.recon.mapping.seeding import SweptView, isotropic_splats
+from spiked.render import Camera
+from spiked.render.charge import ChargeLoss
+from spiked.render.optimiser import Adam
+from spiked.scene import Scene
+from spiked.sensor import Image, Sensor
+
+LARGE_PIXELS = 130_000
+"""Images of more pixels are aligned at half their size."""
+BETAS = 0.9, 0.99
+"""Adam's decay rates, counted in the steps in which a splat is visible: many splats see few."""
+NUISANCES_FROM = 50
+"""Steps before view brightness is estimated: the map has to converge roughly first."""
+GAINS_FROM = 800
+"""Steps before pixel gains are estimated: earlier they absorb errors of the geometry."""
+NUISANCE_STEPS = 200
+"""Steps between estimates of the pixel gains."""
+
+
+class Mapper:
+    """Holds the scene and fits it, one view a step. Views are known by their ids."""
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        camera: Camera,
+        options: MapOptions,
+        seed: int,
+        threads: int | None = None,
+        calibration: Calibration | None = None,
+    ) -> None:
+        self.options = options
+        self.camera = camera
+        self.sensor = sensor
+        self.colours = 1 if sensor.mosaic is None else 3
+        self.levels = levels(sensor, camera, threads)
+        self.channels = self.levels[0].channels
+        self.scene = Scene.empty(self.colours)
+        self.white = 1.0
+        """The radiance (spikes a frame) that is shown as white: the 99.5th percentile of the first seeded view."""
+        self.depth = 1.0
+        """Typical depth of the scene; the learning rate of the means is relative to it."""
+        self.rasteriser = self.levels[0].rasteriser
+        self.adam = Adam(self.scene.arrays(), *BETAS, threads=threads)
+        self.nuisances = Nuisances(sensor.height, sensor.width)
+        self.rate_loss = RateLoss(options.ssim, options.floor)
+        kernel = ChargeLoss(sensor, threads)
+        self.charge_loss = WarpedChargeLoss(kernel, camera, calibration, options.floor, options.detail)
+        self.extent = 1.0
+        """Size of the map in units of that of a short path, see `MapOptions.extent_px`."""
+        self.steps = 0
+        self._charge_error: Image = np.zeros((1, 1), np.float32)
+        self._rng = np.random.default_rng(seed)
+        self._losses: dict[int, float] = {}
+
+    @property
+    def cap(self) -> int:
+        """Maximum number of splats."""
+        share = self.options.splats_a_pixel * self.camera.width * self.camera.height
+        return min(int(share * self.extent), self.options.most_splats)
+
+    def seed(self, swept: SweptView, surer: float = 0.0) -> int:
+        """Add splats at the pixels of a swept view that the map does not cover, with a depth confidence of at least
+        `surer`; returns their number."""
+        rate, seeding = swept.view.rate, self.options.seeding
+        if len(self.scene):
+            alpha = self.rasteriser.forward(self.scene, swept.rotation[None], swept.centre[None]).alpha
+            empty = alpha < seeding.opacity
+        else:
+            self.white = float(np.percentile(rate, 99.5))
+            empty = np.ones(rate.shape, bool)
+        empty &= swept.sweep.confidence >= surer
+        stride = seeding.stride(rate.size, int(self.cap / self.extent), self.options.stride_px)
+        chosen = seeding.pixels(empty, stride, self.cap - len(self.scene))
+        if chosen is None:
+            return 0
+        v, u = chosen
+        depth = np.asarray(1 / swept.sweep.inverse_depth[v, u], np.float32)
+        colours = fill_mosaic(rate, self.channels)[v, u]
+        self._add(chosen, depth, colours, stride, swept.rotation, swept.centre)
+        return len(u)
+
+    def _add(
+        self,
+        pixels: tuple[NDArray[np.int64], NDArray[np.int64]],
+        depth: Image,
+        colours: Image,
+        apart_px: float,
+        rotation: Array,
+        centre: Array,
+    ) -> None:
+        """Add round splats at rows and columns of an image that are `apart_px` apart, at the depths [N]."""
+        v, u = pixels
+        at, deviation_px = np.stack([u + 0.5, v + 0.5], 1), self.options.seeding.size * apart_px
+        intrinsics = self.camera.intrinsics
+        self.scene = self.scene.join(isotropic_splats(intrinsics, at, depth, colours, deviation_px, rotation, centre))
+        self.adam.grow(len(at))
+
+    def level(self, coarse: float) -> Level:
+        """The pyramid level for a coarseness from 0 (full size) to 1 (smallest)."""
+        return self.levels[int(np.ceil(coarse * (len(self.levels) - 1)))]
+
+    def step(self, key: int, view: View, request: RenderRequest, decay: float, level: Level) -> None:
+        """One gradient step on the view of id `key`; `decay` scales all learning rates."""
+        # A random background: otherwise dark surfaces become holes.
+        background = float(self._rng.uniform(0, self.options.background)) * self.white
+        if request.warp is None:
+            slope = self._compare_rates(key, view, request, level, background)
+        else:
+            slope = self._compare_charge(key, request, level, background)
+        gradients = level.rasteriser.backward(slope)
+        self.steps += 1
+        o = self.options
+        others = (o.rate_quats, o.rate_scales, o.rate_opacities, o.rate_colours * self.white)
+        rates = tuple(decay * rate for rate in (o.rate_means * self.depth, *others))
+        self.adam.step(self.scene.arrays(), gradients.arrays(), rates, gradients.radius_px > 0)
+        # Viewers show splats of negative colour as black.
+        np.maximum(self.scene.colours, 0, out=self.scene.colours)
+
+    def _compare_rates(self, key: int, view: View, request: RenderRequest, level: Level, background: float) -> Image:
+        """Gradient of the loss by the image, from a view's rates over its pixels' windows."""
+        target = level.target(view, request.windows, request.seen)
+        image = level.render(self.scene, replace(request, windows=target.windows), background)
+        expected = image.values
+        factor: Image | None = None
+        if level.factor == 1 and self._knows_nuisances():
+            factor = self.nuisances.factor(key)
+            self.nuisances.observe(key, image.values, view.rate, target.deviation, self.steps >= GAINS_FROM)
+            expected = expected * factor
+            if self.steps % NUISANCE_STEPS == NUISANCE_STEPS - 1:
+                self.nuisances.update()
+        self._losses[key], slope = self.rate_loss(expected, target, self.white, level.mosaic)
+        if factor is not None:
+            slope *= factor
+        return slope
+
+    def _compare_charge(self, key: int, request: RenderRequest, level: Level, background: float) -> Image:
+        """As `_compare_rates`, from the charge between the spikes of all frames around a view."""
+        image = level.rasteriser.forward(self.scene, request.rotations, request.centres, background=background)
+        gain, phase = self.nuisances.factor(key), int(self._rng.integers(level.factor))
+        charge = self.charge_loss(image, request, gain, self.white, pixel=level.factor, phase=phase)
+        if self._knows_nuisances():
+            self.nuisances.note(key, self.nuisances.level(key) * charge.brightness)
+        self._losses[key], self._charge_error = charge.loss, charge.error
+        return charge.slope
+
+    def _knows_nuisances(self) -> bool:
+        return self.options.nuisances and self.steps >= NUISANCES_FROM
+
+    @property
+    def loss(self) -> float | None:
+        """Mean over the views of the last weighted squared error, in units of white squared; None before any step."""
+        return float(np.mean(list(self._losses.values()))) if self._losses else None
+
+    def forget_views(self) -> None:
+        """Drop what is stored for each view, after some were dropped."""
+        self._losses.clear()
+        self.nuisances.forget_views()
+
+    @property
+    def alignment_level(self) -> Level:
+        """The pyramid level of the alignment: large images and mosaics use larger pixels."""
+        large = self.channels is not None or self.camera.width * self.camera.height > LARGE_PIXELS
+        return self.levels[min(1, len(self.levels) - 1)] if large else self.levels[0]
+
+    def densify(self, key: int, view: View, request: RenderRequest) -> None:
+        """Add splats at the largest errors of a view, as `options.densification` says."""
+        strategy, middle = self.options.densification, len(request.centres) // 2
+        rotation, centre = request.rotations[middle], request.centres[middle]
+        if request.warp is None:
+            level = self.levels[0]
+            image = level.render(self.scene, request)
+            deviation = level.target(view, request.windows, request.seen).deviation
+            certainty = self.rate_loss.certainty(deviation, self.white)
+            error = (view.rate - self.nuisances.factor(key) * image.values) * certainty
+        else:
+            image = self.rasteriser.forward(self.scene, rotation[None], centre[None])
+            size = (self.camera.width, self.camera.height)
+            error = cv2.resize(self._charge_error, size, interpolation=cv2.INTER_LINEAR)
+        dead = strategy.dead(self.scene)
+        if dead.any():
+            self.scene = self.scene.select(~dead)
+            self.adam.keep(~dead)
+        chosen = strategy.choose(error, int(dead.sum()), self.cap, self.cap - len(self.scene), self._rng)
+        if chosen is None:
+            return
+        v, u = chosen
+        depth = np.where(image.depth > 0, image.depth, 1.0)[v, u]
+        seen = fill_mosaic(view.rate, self.channels) if request.warp is None else image.values
+        colours = seen.reshape(*seen.shape[:2], self.colours)[v, u]
+        self._add(chosen, depth, colours, 1.0, rotation, centre)
+
+    def render(self, rotation: Array, centre: Array) -> Image:
+        """Render the map from a pose: radiance [H, W, C]."""
+        values = self.rasteriser.forward(self.scene, rotation[None], centre[None]).values
+        return values[..., None] if values.ndim == 2 else values

@@ -1,0 +1,47 @@
+"""Options of the map."""
+
+from dataclasses import dataclass, field
+
+from spiked.recon.mapping.densification import DensifyStrategy
+from spiked.recon.mapping.loss import RateLoss, WarpedChargeLoss
+from spiked.recon.mapping.schedule import Schedule
+from spiked.recon.mapping.seeding import Seeding
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """How the map is fitted. Lengths are relative to the median depth of the scene, which is 1."""
+
+    stride_px: float = 2.0
+    """Spacing of the pixels that become the first splats."""
+    splats_a_pixel: float = 0.8
+    """Maximum number of splats for each sensor pixel."""
+    most_splats: int = 250_000
+    """Maximum number of splats in all."""
+    extent_px: float = 1000.0
+    """Image motion of a path up to which a map has the size above; beyond it splats, seeded views and steps grow in
+    proportion. The recordings of docs/accuracy.md move by up to 700 px."""
+    rate_means: float = 2e-3
+    """Learning rates at the start, per step; those of the means and of colour are in units of depth and of white."""
+    rate_quats: float = 2.5e-2
+    rate_scales: float = 1e-1
+    rate_opacities: float = 8e-2
+    rate_colours: float = 1.5e-2
+    ssim: float = RateLoss.ssim
+    """Share of structural similarity in the loss of rates, see `RateLoss`."""
+    sub_frames: int | None = None
+    """Sub-frames of straight motion in the render of a view; None follows the motion, 0 renders a still camera."""
+    nuisances: bool = True
+    """Estimate each pixel's gain and the brightness of each view (flicker, lamps)."""
+    background: float = 0.5
+    """Largest brightness of the random background while fitting, in units of white; 0 is always black."""
+    floor: float = RateLoss.floor
+    """Noise added to each pixel, in units of white, see `RateLoss`."""
+    detail: float = WarpedChargeLoss.detail
+    """Gain of fine detail for fast motion, see `WarpedChargeLoss`."""
+    seeding: Seeding = field(default_factory=Seeding)
+    """How the first splats are made."""
+    densification: DensifyStrategy = field(default_factory=DensifyStrategy)
+    """Where splats are added later."""
+    schedule: Schedule = field(default_factory=Schedule)
+    """What happens when in a refinement."""

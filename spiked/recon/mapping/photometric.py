@@ -1,0 +1,85 @@
+"""Photometric nuisances: each pixel's gain, and the brightness of each view (flicker, lamps)."""
+
+import numpy as np
+
+from spiked.sensor import Image
+
+PIXEL_RIDGE = 0.02
+"""Prior deviation of a pixel's gain from 1."""
+MODEL_ERROR = 0.07
+"""Relative error of the map's render, added to the noise of each residual."""
+FORGET = 0.7
+"""Decay of the accumulated residuals at each update: older ones are of an older map."""
+
+
+class Nuisances:
+    """Estimates gain(x) and a level for each view in `observed = gain(x) * level * rendered`.
+
+    Closed-form weighted regressions; the gains have a ridge towards 1 and mean log gain 0. The levels are relative to
+    each other: their mean belongs to the brightness of the scene.
+    """
+
+    def __init__(self, height: int, width: int, fixed: Image | None = None) -> None:
+        """`fixed` [H, W] are gains of a calibration; they are not estimated."""
+        self.gain: Image = np.ones((height, width), np.float32) if fixed is None else fixed.astype(np.float32)
+        self._fixed = fixed is not None
+        self._xx = np.zeros((height, width), np.float32)
+        self._xy = np.zeros((height, width), np.float32)
+        self._observed = 0.0
+        self._levels: dict[int, float] = {}
+        self._mean_level = 1.0
+
+    def level(self, key: int) -> float:
+        """Brightness of a view relative to the scene's."""
+        return self._levels.get(key, self._mean_level) / self._mean_level
+
+    def factor(self, key: int) -> Image:
+        """Gain times brightness of a view, [H, W]: the factor of its render."""
+        return np.asarray(self.gain * np.float32(self.level(key)), np.float32)
+
+    def observe(self, key: int, rendered: Image, observed: Image, deviation: Image, gains: bool = True) -> None:
+        """Take one view's render [H, W] (without nuisances), its rates and their deviations
+        (infinite where nothing was seen).
+
+        Without `gains` only the view's brightness is estimated.
+        """
+        expected = self.gain * rendered
+        error = MODEL_ERROR * (expected + observed)
+        precision = 1 / (deviation * deviation + error * error + 1e-12)
+        # A ratio of means: least squares underestimates the brightness while the map is rough, and the map follows.
+        # Weights by precision would give most weight to the darkest pixels.
+        agree = (np.abs(observed - expected) < 3 * (deviation + error)) & np.isfinite(deviation)
+        total = float(expected[agree].sum())
+        if total > 0:
+            self.note(key, float(observed[agree].sum()) / total)
+        if not gains:
+            return
+        model = rendered * np.float32(self.level(key))
+        self._xx += precision * model * model
+        self._xy += precision * model * (observed - model)
+        self._observed += 1
+
+    def note(self, key: int, brightness: float) -> None:
+        """Set the brightness of a view over its render without nuisances."""
+        self._levels[key] = brightness
+        self._mean_level = float(np.mean(list(self._levels.values())))
+
+    def update(self) -> None:
+        """Estimate the gains from the accumulated residuals."""
+        if not self._observed:
+            return
+        # A view observed again adds no information: the evidence is that of the distinct views.
+        once = np.float32(min(1.0, len(self._levels) / self._observed))
+        if not self._fixed:
+            relative = once * self._xy / (once * self._xx + np.float32(1 / PIXEL_RIDGE**2))
+            gain = np.clip(1 + relative, 0.5, 2.0)
+            self.gain = (gain / np.exp(np.log(gain).mean())).astype(np.float32)
+        self._xx *= FORGET
+        self._xy *= FORGET
+        self._observed *= FORGET
+
+    def forget_views(self) -> None:
+        """Drop what is stored for each view, after some were dropped."""
+        self._levels.clear()
+        self._xx[:] = self._xy[:] = 0
+        self._observed = 0.0

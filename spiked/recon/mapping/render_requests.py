@@ -1,0 +1,86 @@
+"""What to render for a view: poses along the camera's motion and the exposure of each pixel, or frames to warp."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.pose import Array
+from spiked.recon.frontend.windowing import View
+from spiked.recon.mapping.frame_warp import FrameWarp
+from spiked.render import Camera
+from spiked.sensor import Image
+from spiked.spline import Path
+
+SUB_FRAME_PX = 3.0
+"""Image motion that one sub-frame of straight, blurred motion renders well."""
+MAX_SUB_FRAMES = 6
+PROBE_SHARES = 0.15, 0.5, 0.85
+"""Shares of width and height at which image motion is predicted."""
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """What to render for a view: poses, camera to world, and the exposure of each pixel."""
+
+    rotations: Array
+    """[S, 3, 3]"""
+    centres: Array
+    """[S, 3]"""
+    windows: Image | None = None
+    """[2, H, W] for a camera that moves from pose to pose (`Rasteriser.forward_moving`); None: it stands still."""
+    seen: NDArray[np.bool_] | None = None
+    """[H, W], pixels that these windows describe; None: all."""
+    warp: FrameWarp | None = None
+    """Fast motion: the frames to compare with the render from the one given pose."""
+
+
+@dataclass
+class RenderPlanner:
+    """Plans the render of a view on a path. Times are in frames."""
+
+    camera: Camera
+    sub_frames: int | None = None
+    """Sub-frames of every view; None follows the motion, 0 renders a still camera."""
+    depth: float = 1.0
+    """Median depth of the points, in the path's unit, at which image motion is predicted."""
+
+    def request(self, view: View, path: Path, pixel: int = 1) -> RenderRequest:
+        """The render of a view: warped frames for fast motion, sub-frames otherwise.
+
+        `pixel` is the pixel size of the image to be rendered, in sensor pixels.
+        """
+        return self.warped(view, path) or self.exposed(view, path, pixel)
+
+    def exposed(self, view: View, path: Path, pixel: int = 1) -> RenderRequest:
+        """The camera's motion during the exposure of a view, in sub-frames of at most `SUB_FRAME_PX`."""
+        parts = self.sub_frames
+        if parts == 0:
+            rotations, centres = path.poses([view.time])
+            return RenderRequest(rotations, centres)
+        if parts is None:
+            times, _, _ = view.exposure(1)
+            rotations, centres = path.poses(np.clip(times, path.begin, path.end))
+            moved_px = self.motion_px(rotations[0], centres[0], rotations[-1], centres[-1])
+            parts = int(np.clip(np.ceil(moved_px / (SUB_FRAME_PX * pixel)), 1, MAX_SUB_FRAMES))
+        times, windows, seen = view.exposure(parts)
+        rotations, centres = path.poses(np.clip(times, path.begin, path.end))
+        return RenderRequest(rotations, centres, windows, seen)
+
+    def warped(self, view: View, path: Path) -> RenderRequest | None:
+        """For a view of fast motion: one pose, and the frames around it inside the path; None for others."""
+        if view.frames is None:
+            return None
+        times = view.first + 0.5 + np.arange(len(view.frames))
+        covered = (times >= path.begin) & (times <= path.end)
+        rotations, centres = path.poses(np.append(times[covered], view.time))
+        warp = FrameWarp(view.frames[covered], rotations[:-1], centres[:-1])
+        return RenderRequest(rotations[-1:], centres[-1:], warp=warp)
+
+    def motion_px(self, rotation: Array, centre: Array, other: Array, other_centre: Array) -> float:
+        """Image motion in px between two poses, camera to world: 75th percentile over nine points at `depth`."""
+        k = self.camera.intrinsics
+        size = [self.camera.width, self.camera.height]
+        at = np.array([[x, y] for x in PROBE_SHARES for y in PROBE_SHARES]) * size
+        there = (k.unproject(at) * self.depth @ rotation.T + centre - other_centre) @ other
+        return float(np.percentile(np.linalg.norm(k.project(there) - at, axis=1), 75))

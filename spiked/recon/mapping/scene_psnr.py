@@ -1,0 +1,37 @@
+"""PSNR of a scene against the views of a recording: compares the versions of one reconstruction."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from spiked.recon.frontend.windowing import View, luminance
+from spiked.render import AnyRasteriser
+from spiked.scene import Scene
+from spiked.sensor import Sensor
+from spiked.trajectory import Trajectory
+
+VIEWS = 8
+"""Number of views compared, spread over the recording."""
+
+
+def scene_psnr_db(
+    views: Sequence[View], sensor: Sensor, rasteriser: AnyRasteriser, scene: Scene, trajectory: Trajectory
+) -> float:
+    """PSNR of a scene rendered along a trajectory, against noisy views, each scaled to the view's brightness.
+
+    A view without a pose counts as rendered black.
+    """
+    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, VIEWS).round().astype(int))]
+    rate = sensor.frame_rate_hz
+    rows = trajectory.nearest(np.array([view.time / rate for view in chosen]), 0.51 / rate)
+    errors, whites = [], []
+    for view, row in zip(chosen, rows, strict=True):
+        seen = luminance(view.rate, sensor.mosaic) if view.sharp is None else view.sharp
+        shown = np.zeros_like(seen)
+        if row >= 0:
+            values = rasteriser.forward(scene, trajectory.rotations[row, None], trajectory.centres[row, None]).values
+            shown = values if values.ndim == 2 else values @ np.array([0.25, 0.5, 0.25], np.float32)
+        brightness = float((seen * shown).sum()) / max(float((shown * shown).sum()), 1e-12)
+        errors.append(float(np.mean((seen - brightness * shown) ** 2)))
+        whites.append(float(np.percentile(seen, 99.5)))
+    return float(-10 * np.log10(max(float(np.mean(errors)), 1e-12) / max(float(np.mean(whites)), 1e-6) ** 2))

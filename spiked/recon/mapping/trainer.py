@@ -1,0 +1,165 @@
+"""Training of the map: which view each step takes, how it is rendered, and which views are swept for depth."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from spiked.calibration import Calibration
+from spiked.pose import Array
+from spiked.recon.frontend.windowing import luminance
+from spiked.recon.mapping.mapper import Mapper
+from spiked.recon.mapping.options import MapOptions
+from spiked.recon.mapping.plane_sweep import SWEPT_PIXELS, PosedImage, neighbours, sweep
+from spiked.recon.mapping.render_requests import RenderPlanner
+from spiked.recon.mapping.seeding import SweptView
+from spiked.recon.view_store import ViewStore
+from spiked.render import Camera
+from spiked.sensor import Intrinsics, Sensor
+from spiked.spline import Path, Waypoints
+
+QUICK_SWEEP = 4
+"""Divisor of the swept pixels where views are far apart: 0.1 s, short enough not to lose a fast camera."""
+VERSION_STEPS = 20
+"""Steps from one version of the map to the next."""
+
+
+class MapTrainer:
+    """Fits a map to the views of a path, in steps, live and in the refinement."""
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        views: ViewStore,
+        options: MapOptions,
+        seed: int,
+        threads: int | None = None,
+        calibration: Calibration | None = None,
+    ) -> None:
+        """The sensor has intrinsics."""
+        assert sensor.intrinsics is not None
+        self.sensor = sensor
+        self.views = views
+        self.options = options
+        self.version = 0
+        """Increases when the map changes."""
+        self._seed, self._threads, self._calibration = seed, threads, calibration
+        self._rng = np.random.default_rng(seed)
+        self.planner = RenderPlanner(Camera(sensor.intrinsics, sensor.width, sensor.height), options.sub_frames)
+        self.restart()
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the map."""
+        return self.planner.camera
+
+    def restart(self, intrinsics: Intrinsics | None = None) -> None:
+        """Start an empty map, with other intrinsics if given."""
+        if intrinsics is not None:
+            self.sensor = replace(self.sensor, intrinsics=intrinsics)
+            self.planner.camera = replace(self.camera, intrinsics=intrinsics)
+        self.mapper = Mapper(self.sensor, self.camera, self.options, self._seed, self._threads, self._calibration)
+        self._queue: list[int] = []
+        self._seeded_at = -np.inf
+        """Time in frames of the view that was seeded last."""
+        self._fitted_path: Path | None = None
+        """The path of the last step."""
+
+    @property
+    def extent(self) -> float:
+        """Size of the map by the path so far, see `MapOptions.extent_px`; limited by the number of splats."""
+        pixels, options = self.camera.width * self.camera.height, self.options
+        most = max(1.0, options.most_splats / (options.splats_a_pixel * pixels))
+        return float(np.clip(self.views.travelled_px / options.extent_px, 1.0, most))
+
+    def reshuffle(self) -> None:
+        """Draw a new random order of the views at the next step."""
+        self._queue = []
+
+    def forget_views(self) -> None:
+        """Drop what is stored for each view, after some were dropped."""
+        self.reshuffle()
+        self.mapper.forget_views()
+
+    def seed(self, path: Path, points: Array, ids: list[int], quick: bool = False) -> None:
+        """Sweep the depth of views and seed splats where the map is empty.
+
+        points [N, 3] are landmarks, whose depths give the range of the sweep; quick: sweep small images.
+        """
+        self.mapper.extent = self.extent
+        begins, mappable = len(self.mapper.scene) == 0, self.views.mappable(path)
+        poses = path.poses([self.views[i].time for i in mappable])
+        found = [self._sweep(mappable, *poses, mappable.index(view_id), points, quick) for view_id in ids]
+        swept = [one for one in found if one is not None]
+        for one in swept:
+            self.mapper.seed(one, self.options.seeding.sure)
+        for one in swept:
+            self.mapper.seed(one)
+        if swept:
+            self.planner.depth, self._seeded_at = swept[-1].depth, swept[-1].view.time
+        if swept and begins:
+            self.mapper.depth = float(np.median([one.depth for one in swept]))
+        self.version += 1
+
+    def _sweep(
+        self, ids: list[int], rotations: Array, centres: Array, row: int, points: Array, quick: bool
+    ) -> SweptView | None:
+        """The depth of view `ids[row]`, compared with others of `ids`; None if too few points are in front of it.
+
+        rotations [V, 3, 3] and centres [V, 3] are the poses of `ids`, camera to world.
+        """
+        seeding, view = self.options.seeding, self.views.image(ids[row])
+        depths = (points - centres[row]) @ rotations[row][:, 2]
+        planes = seeding.planes(depths)
+        if planes is None:
+            return None
+
+        def posed(at: int) -> PosedImage:
+            image = luminance(self.views.image(ids[at]).rate, self.sensor.mosaic)
+            return PosedImage(image, rotations[at], centres[at])
+
+        others = [posed(at) for at in neighbours(centres, rotations[:, :, 2], row, seeding.neighbours)]
+        pixels = SWEPT_PIXELS // QUICK_SWEEP if quick else SWEPT_PIXELS
+        noise = seeding.noise * view.deviation
+        swept = sweep(posed(row), others, self.camera.intrinsics, planes, noise, pixels, self._threads)
+        return SweptView(view, rotations[row], centres[row], float(np.median(depths[depths > 0])), swept)
+
+    def step(self, path: Path, decay: float, coarse: float, share: float) -> None:
+        """One gradient step on the next view of a random order.
+
+        `decay` scales the learning rates; `coarse` is the pyramid level, 0 to 1; `share` of the refinement is done.
+        """
+        if not self._queue:
+            self._queue = [int(i) for i in self._rng.permutation(self.views.mappable(path))]
+        view_id = self._queue.pop()
+        view, level = self.views.image(view_id), self.mapper.level(coarse)
+        request = self.planner.request(view, path, level.factor)
+        self.mapper.step(view_id, view, request, decay, level)
+        if self.options.densification.due(self.mapper.steps, share):
+            self.mapper.densify(view_id, view, request)
+        self._fitted_path = path
+        self.version += self.mapper.steps % VERSION_STEPS == 0
+
+    def train_live(self, path: Path, points: Array, until: float) -> None:
+        """Seed recent views if needed, then take steps until that time of `time.perf_counter`."""
+        ids, quick = self.views.mappable(path), isinstance(path, Waypoints)
+        if len(self.mapper.scene) == 0:
+            self.seed(path, points, [ids[len(ids) // 2]], quick)
+        elif self.options.seeding.due([self.views[i].time for i in ids], self._seeded_at):
+            self.seed(path, points, [ids[-3]], quick)
+        while time.perf_counter() < until:
+            self.step(path, 1.0, self.options.schedule.live_coarseness(self.mapper.steps), 0.0)
+
+    def stale(self, path: Path) -> bool:
+        """Whether the path moved since the map was fitted to it, see `Schedule.stale_px`: such a map would bias the
+        alignment."""
+        old = self._fitted_path
+        if old is None:
+            return False
+        times = [self.views[i].time for i in self.views.mappable(path)]
+        times = [t for t in times if old.begin <= t <= old.end]
+        if not times:
+            return True
+        poses = zip(*old.poses(times), *path.poses(times), strict=True)
+        moved_px = [self.planner.motion_px(*both) for both in poses]
+        return float(np.percentile(moved_px, 90)) > self.options.schedule.stale_px

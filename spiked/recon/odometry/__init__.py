@@ -1,0 +1,1 @@
+"""From tracks to the camera's path."""

@@ -1,0 +1,234 @@
+"""Sparse visual odometry: views in order, poses, points and a spline of the path out.
+
+It needs no map of Gaussians: a trajectory exists within a second or two, and mapping then refines it.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from spiked.pose import Array
+from spiked.recon.frontend.feature_tracks import Picture, Tracks
+from spiked.recon.frontend.spike_intervals import SpikeIntervals
+from spiked.recon.frontend.track_timestamps import TrackTimestamps
+from spiked.recon.odometry.global_adjuster import GlobalAdjuster
+from spiked.recon.odometry.initialiser import Initialiser
+from spiked.recon.odometry.keyframe_adjuster import LONG_FRAMES, LONG_VIEWS, KeyframeAdjuster
+from spiked.recon.odometry.path_adjuster import PathAdjuster
+from spiked.recon.odometry.pnp import fit_pose
+from spiked.recon.odometry.pose_tracker import LOCAL_BA_EVERY, PoseTracker
+from spiked.recon.odometry.relocaliser import Relocaliser
+from spiked.recon.odometry.self_calibration import UNSURE, Focal
+from spiked.recon.odometry.sparse_map import Pose, SparseMap, TrackedView
+from spiked.recon.odometry.tracking_state import State, TrackingState
+from spiked.sensor import Intrinsics
+from spiked.spline import Spline, Waypoints
+
+WORST_PATH_ERROR = 0.03
+"""Predicted path error, relative to the path's RMS radius, above which the path is degraded and a warning is given."""
+FINAL_STATE_VIEWS = 8
+"""The final state is that of most of the last 8 views: one noisy view does not decide it."""
+MIN_GIVEN_POINTS = 10
+"""Points in front of the camera that given poses have to explain."""
+
+
+class Odometry:
+    """Feed views in order with `add`, then call `end`; the path is `spline`, or `waypoints` where it is `sparse`.
+
+    Composed of the parts of one map: `Initialiser` until there is one, then `PoseTracker` with its `Relocaliser`,
+    and `GlobalAdjuster`, which owns the spline; on long paths `KeyframeAdjuster` takes its place.
+    """
+
+    def __init__(self, intrinsics: Intrinsics, seed: int = 0, focal: Focal | None = None, live: bool = False) -> None:
+        """focal: set where the focal length is to be estimated; live: reasons advise how to move the camera now."""
+        self._map = SparseMap(intrinsics, focal)
+        self._status = TrackingState()
+        self._tracks = Tracks()
+        self._timestamps = TrackTimestamps()
+        self._initialiser = Initialiser(self._map, self._status, seed, live)
+        self._adjuster: PathAdjuster = GlobalAdjuster(self._map)
+        self._relocaliser = Relocaliser(self._map)
+        self._tracker = PoseTracker(self._map, self._status, self._tracks, self._relocaliser, self._adjuster)
+        self.path_error: float | None = None
+        """Predicted error of the finished path relative to its RMS radius; None before the end."""
+
+    @property
+    def map(self) -> SparseMap:
+        """Views and points."""
+        return self._map
+
+    @property
+    def keyframe_images(self) -> dict[int, Picture]:
+        """Images of the keyframes by view id."""
+        return self._relocaliser.keyframes
+
+    @property
+    def closures(self) -> int:
+        """Loops that were closed by `end`."""
+        return self._adjuster.closures
+
+    @property
+    def views(self) -> list[TrackedView]:
+        """All views by id; poses change with every adjustment."""
+        return self._map.views
+
+    @property
+    def points(self) -> Array:
+        """Position [tracks, 3] of every track by id, NaN where unknown."""
+        return self._map.points
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Given or, so far, estimated."""
+        return self._map.intrinsics
+
+    @property
+    def focal(self) -> Focal | None:
+        """Estimate of the focal length; None if it was given."""
+        return self._map.focal
+
+    @property
+    def state(self) -> State:
+        """Of the newest view, after `end` of the last views."""
+        return self._status.state
+
+    @property
+    def reason(self) -> str:
+        """Of the state, for users."""
+        return self._status.reason
+
+    @property
+    def changes(self) -> list[tuple[float, State, str]]:
+        """(time in frames, state, reason) of each change of state."""
+        return self._status.changes
+
+    @property
+    def spline(self) -> Spline | None:
+        """The path so far in frames; None before the bootstrap and where the path is `sparse`."""
+        return self._adjuster.spline
+
+    @property
+    def sparse(self) -> bool:
+        """Views are too far apart for a spline, or the path is long: it is interpolated, see `waypoints`."""
+        return self._adjuster.interpolated
+
+    def waypoints(self) -> Waypoints | None:
+        """The path interpolated between views with a pose; None before the bootstrap."""
+        return self._map.waypoints()
+
+    def information(self) -> Array | None:
+        """Inverse covariance [6 knots, 6 knots] of `spline`, see `GlobalAdjuster.information`."""
+        return self._adjuster.information()
+
+    def skip(self) -> None:
+        """Frames are skipped before the next view; see `sparse`."""
+        self._adjuster.interpolated = self._tracks.far = True
+
+    def add(
+        self,
+        time: float,
+        length: int,
+        picture: Picture,
+        known: tuple[Array, Array] | None = None,
+        intervals: SpikeIntervals | None = None,
+        after_gap: bool = False,
+    ) -> TrackedView:
+        """Track one view of `length` frames around `time` and estimate its pose.
+
+        known: its pose, if given; intervals: time of each pixel's charge; after_gap: frames are missing before it.
+        Returns the new element of `views`.
+        """
+        view = self._track(time, length, picture, intervals, after_gap)
+        if known is not None:
+            view.pose = Pose(*known)
+            if len(self.views) % LOCAL_BA_EVERY == 0:
+                self._tracker.triangulate_recent()
+            self._status.set(time, State.TRACK, "poses are given")
+        elif self.state is not State.BOOT:
+            self._adjust_keyframes_if_long()
+            self._tracker.track(picture)
+        elif self._initialiser.attempt():
+            self._adjuster.adjust()
+        self._relocaliser.remember(view, picture)
+        view.state = self.state
+        return view
+
+    def _adjust_keyframes_if_long(self) -> None:
+        """From `LONG_FRAMES` or `LONG_VIEWS` on, adjust keyframes in a window instead of the whole path."""
+        if self.sparse:  # long already, or views too far apart
+            return
+        posed = self._map.posed()
+        if posed and (len(posed) >= LONG_VIEWS or posed[-1].time - posed[0].time >= LONG_FRAMES):
+            self._adjuster = self._tracker.adjuster = KeyframeAdjuster(self._map, self._relocaliser.keyframes)
+
+    def _track(
+        self, time: float, length: int, picture: Picture, intervals: SpikeIntervals | None, after_gap: bool
+    ) -> TrackedView:
+        """Append a view with its tracks, moved to its time."""
+        number = len(self.views)
+        motion_px = self._tracks.add(number, picture, after_gap)
+        ids, at = self._tracks.ids.copy(), self._tracks.at.copy()
+        late = np.zeros(len(ids)) if intervals is None else intervals.delays(picture, at)
+        pixels, sigma_px = self._timestamps.align(time, ids, at, late)
+        view = TrackedView(number, time, length, ids, pixels, motion_px, self.state, timing_sigma_px=sigma_px)
+        self.views.append(view)
+        self._map.reserve(self._tracks.next_id)
+        return view
+
+    def end(self) -> None:
+        """After the last view: a last bootstrap attempt if needed, then the final global adjustment."""
+        if self.state is State.BOOT and self._initialiser.last_attempt():
+            self._adjuster.adjust()
+        self._adjuster.finish()
+        self.path_error = self._adjuster.path_error()
+        self._reassess_views()
+
+    def end_with_path(self, spline: Spline, middle: float) -> float | None:
+        """After the last view with a given pose: take the given path; its median depth at `middle` (frames) becomes 1.
+
+        Returns that depth in the unit of the given path. None if fewer than `MIN_GIVEN_POINTS` were triangulated:
+        there is no path then, and `reason` says so.
+        """
+        self._map.triangulate(self.views)
+        points = self.points[np.isfinite(self.points[:, 0])]
+        rotations, centres = spline.poses([middle])
+        depth = (points - centres[0]) @ rotations[0][:, 2]
+        if (depth > 0).sum() < MIN_GIVEN_POINTS:
+            self._status.explain("the given poses do not explain the tracks: no point could be triangulated")
+            return None
+        unit = float(np.median(depth[depth > 0]))
+        self._map.rescale(unit)
+        self._adjuster.spline = replace(spline, centres=spline.centres / unit)
+        return unit
+
+    def _reassess_views(self) -> None:
+        """Recompute inliers, chi2 and state of every view with the final path and points; set the final state."""
+        assessed: list[str | None] = []
+        for view in self.views:
+            if view.pose is None:
+                continue
+            fit = fit_pose(self._map, view, view.pose, move=False)
+            doubt = fit.degraded_reason(len(view.ids))
+            fit.store_quality(view)
+            if view.state in (State.TRACK, State.DEGRADED):
+                view.state = State.TRACK if doubt is None else State.DEGRADED
+            assessed.append(doubt)
+        if assessed and self.state in (State.TRACK, State.DEGRADED):
+            last = assessed[-FINAL_STATE_VIEWS:]
+            doubts = [doubt for doubt in last if doubt is not None]
+            most = doubts[-1] if len(doubts) > len(last) - len(doubts) else None
+            self._status.assess(self.views[-1].time, most)
+            if why := self._path_degraded_reasons():
+                self._status.set(self.views[-1].time, State.DEGRADED, "; ".join(why))
+
+    def _path_degraded_reasons(self) -> list[str]:
+        """Why the final path is degraded as a whole, however well each view fits."""
+        why = []
+        if self.path_error is not None and self.path_error > WORST_PATH_ERROR:
+            about = f"about {self.path_error:.0%}"
+            why.append(f"the whole path's shape is only known to {about}: few tracks tie it together")
+        if self.focal is not None and self.focal.relative_sigma > UNSURE:
+            sigma = self.focal.relative_sigma
+            known = "that the recording does not determine" if sigma > 1 else f"only known to about {sigma:.0%}"
+            why.append(f"path and depths depend on a focal length {known}")
+        return why

@@ -1,0 +1,42 @@
+"""What adjusts the path of a map while it grows."""
+
+from typing import Protocol
+
+from spiked.pose import Array
+from spiked.recon.odometry.sparse_map import TrackedView
+from spiked.spline import Spline
+
+
+class PathAdjuster(Protocol):
+    """Adjusts poses and points of a map: `GlobalAdjuster` for short paths, `KeyframeAdjuster` for long ones."""
+
+    interpolated: bool
+    """There is no spline: the path is interpolated between views, see `SparseMap.waypoints`."""
+
+    spline: Spline | None
+    """The path in frames; None before the first adjustment, and where it is interpolated."""
+    closures: int
+    """Loops that were closed by `finish`."""
+
+    @property
+    def reference_views(self) -> list[TrackedView]:
+        """Earlier views, oldest first, from which tracks are triangulated and to which the newest views are adjusted.
+
+        Empty: those just before the newest.
+        """
+
+    @property
+    def due(self) -> bool:
+        """Whether the map has grown enough since the last adjustment."""
+
+    def adjust(self, final: bool = True) -> None:
+        """Adjust what is due; without `final`, with less effort where that suffices."""
+
+    def finish(self) -> None:
+        """The last adjustment, of the whole path."""
+
+    def path_error(self) -> float | None:
+        """Predicted error of the path relative to its RMS radius; None if it is not predicted."""
+
+    def information(self) -> Array | None:
+        """Inverse covariance [6 knots, 6 knots] of `spline`; None without one."""

@@ -1,0 +1,106 @@
+"""Pose of one view from known points (PnP), and whether it can be trusted."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+import spiked.native._bundle as _bundle
+from spiked.recon.odometry.initialisation import INLIER_PX, SCALE_PX
+from spiked.recon.odometry.sparse_map import Pose, SparseMap, TrackedView
+from spiked.recon.statistics import RAYLEIGH_MEDIAN, median
+
+LEAST_POINTS = 6
+"""Known points below which no pose is computed: a pose has six parameters, a point gives two equations."""
+FIT_SCALES_PX = (4.0, 2.0, 1.0, *[SCALE_PX] * 5)
+"""Scales of the robust loss in the iterations of one pose."""
+COUNTED_INLIER_PX = 1.5 * INLIER_PX
+"""Largest residual of an inlier of one pose."""
+LEAST_NOISE_PX = 0.15
+"""Lower bound of the assumed track noise: new points carry errors of this size however clean their tracks are."""
+NOISE_MARGIN = 1.3
+"""Residual noise of new views over that of the newest global bundle. Medians on the streams: 1.30 (living), 1.48
+(garden), 1.55 (camp_color), 1.40 (garden_fast); 80 % of the views lie within 1.1 and 2.0."""
+MIN_POINTS = 15
+"""Known points that a pose needs: below, tracking is lost; below twice as many it is degraded."""
+WORST_CHI2 = 2.5
+WORST_SIGMA_PX = 1.0
+WORST_INLIERS = 0.5
+WORST_OVERLAP = 0.25
+"""Tracking counts as degraded beyond any of these; overlap is the share of the tracks whose points are known."""
+LOST_CHI2, LOST_INLIERS = 25.0, 0.35
+"""A pose is rejected if points lie 5 times as far off as noise explains, or if a smaller share of them agrees."""
+
+
+@dataclass(frozen=True)
+class PnPResult:
+    """Pose of one view from known points."""
+
+    pose: Pose
+    inliers: float
+    """Share of the points within `COUNTED_INLIER_PX`."""
+    points: int
+    """Known points in view."""
+    chi2: float = 1.0
+    """Squared median residual over the expected one; 1 if the noise explains it."""
+    sigma_px: float = np.inf
+    """Predicted standard deviation of the pose, as image displacement at the median depth."""
+
+    def store(self, view: TrackedView) -> None:
+        """Make this the pose of a view."""
+        view.pose = self.pose
+        self.store_quality(view)
+
+    def store_quality(self, view: TrackedView) -> None:
+        """Copy inliers, chi2 and sigma to a view."""
+        view.inliers, view.chi2, view.sigma_px = self.inliers, self.chi2, self.sigma_px
+
+    def lost_reason(self) -> str | None:
+        """Why the pose is rejected, or None."""
+        if self.points < MIN_POINTS or self.inliers < LOST_INLIERS:
+            return f"{self.points} known points in view, {self.inliers:.0%} agree with one pose"
+        if self.chi2 > LOST_CHI2:
+            return f"points lie {np.sqrt(self.chi2):.0f} times as far off as their noise explains"
+        return None
+
+    def degraded_reason(self, tracks: int) -> str | None:
+        """Why the pose of a view with so many tracks is degraded, or None."""
+        if self.inliers < WORST_INLIERS or self.points < 2 * MIN_POINTS:
+            return f"{self.points} known points in view, {self.inliers:.0%} agree with one pose"
+        if self.sigma_px > WORST_SIGMA_PX:
+            return f"the pose is only known to {self.sigma_px:.1f} px: the known points leave much of the view empty"
+        if self.chi2 > WORST_CHI2:
+            return f"points lie {np.sqrt(self.chi2):.1f} times as far off as their noise explains"
+        if self.points < WORST_OVERLAP * tracks:
+            return f"only {self.points / tracks:.0%} of the tracks in view have a known position"
+        return None
+
+
+def noise_outside_px(bundle_noise_px: float, timing_sigma_px: float) -> float:
+    """Assumed noise of a view's tracks from the residual noise of a bundle and the view's timing errors."""
+    return float(np.hypot(max(NOISE_MARGIN * bundle_noise_px, LEAST_NOISE_PX), timing_sigma_px))
+
+
+def chi2_of(median_px: float, noise_px: float) -> float:
+    """Squared median residual over the one expected from this noise in one direction."""
+    return float((median_px / (RAYLEIGH_MEDIAN * noise_px)) ** 2)
+
+
+def fit_pose(sparse_map: SparseMap, view: TrackedView, start: Pose, move: bool = True) -> PnPResult:
+    """Robust Gauss-Newton of one pose on the known points; without `move` the start is only evaluated."""
+    points = sparse_map.points[view.ids]
+    known = np.isfinite(points[:, 0])
+    points, pixels = points[known], view.pixels[known]
+    if len(points) < LEAST_POINTS:
+        return PnPResult(start, 0.0, len(points))
+    k = sparse_map.intrinsics
+    rotation, centre = start.rotation.copy(), start.centre.copy()
+    size, hessian = np.empty(len(points)), np.empty((6, 6))
+    scales = np.array(FIT_SCALES_PX if move else FIT_SCALES_PX[-1:])
+    _bundle.fit_pose(points, pixels, k.fx, k.fy, k.cx, k.cy, scales, rotation, centre, size, hessian, move)
+    inliers = float(np.mean(size < COUNTED_INLIER_PX))
+    noise = noise_outside_px(sparse_map.noise_px, view.timing_sigma_px)
+    chi2 = chi2_of(median(size), noise)
+    depth = median((points - centre) @ rotation[:, 2])
+    seen_px = _bundle.displacement(hessian, rotation, k.fx, k.fy, k.cx, k.cy, max(depth, 1e-6))
+    sigma_px = float(np.sqrt(max(chi2, 1.0)) * noise * seen_px)
+    return PnPResult(Pose(rotation, centre), inliers, len(points), chi2, sigma_px)

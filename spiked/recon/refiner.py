@@ -1,0 +1,79 @@
+"""The refinement: path and map together, after the last frame."""
+
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from spiked.pose import Array
+from spiked.recon.mapping.pose_alignment import TrajectoryPrior, align_spline
+from spiked.recon.mapping.trainer import MapTrainer
+from spiked.spline import Path, Spline
+
+ALIGNED_VIEWS = 160
+"""Most views of an alignment."""
+PROGRESS_STEPS = 50
+"""Steps between reports of progress."""
+
+
+class Refiner:
+    """Seeds and trains the map on the final path, and aligns the path with the map."""
+
+    def __init__(
+        self, trainer: MapTrainer, path: Path, points: Array, prior: TrajectoryPrior | None, align: bool
+    ) -> None:
+        """points [N, 3] are landmarks on the tracked `path`; `prior` is its information from the tracks.
+
+        With `align` a path that is a spline is corrected by the map.
+        """
+        self.path = path
+        """The path, corrected so far."""
+        self.aligned = 0
+        """Number of alignments made."""
+        self._trainer = trainer
+        self._schedule = trainer.options.schedule
+        self._points = points
+        self._prior = prior
+        self._align = align
+
+    def run(self, most_steps: int, deadline: float, cancelled: Callable[[], bool]) -> Iterator[float]:
+        """Refine in at most `most_steps` steps for small images; yields the share that is done, every 50 steps.
+
+        If the steps would end after `deadline`, a time of `time.perf_counter`, the schedule is compressed to fewer.
+        """
+        trainer, schedule = self._trainer, self._schedule
+        if trainer.stale(self.path):
+            trainer.restart()
+        trainer.reshuffle()
+        ids = trainer.views.mappable(self.path)
+        trainer.seed(self.path, self._points, trainer.options.seeding.order(ids, trainer.extent))
+        fast = float(np.mean([trainer.views.image(i).frames is not None for i in ids]))
+        pixels = trainer.camera.width * trainer.camera.height
+        steps = schedule.steps(most_steps, pixels, fast, trainer.extent)
+        begin = time.perf_counter()
+        available_s = max(deadline - begin, 1e-9)
+        for done in range(steps):
+            share = max(done / steps, (time.perf_counter() - begin) / available_s)
+            if share >= 1 or cancelled():
+                break
+            trainer.step(self.path, schedule.rate(share), schedule.coarseness(share), share)
+            self._align_if_due(share)
+            if done % PROGRESS_STEPS == PROGRESS_STEPS - 1:
+                yield max(share, (done + 1) / steps)
+
+    def _align_if_due(self, share: float) -> None:
+        due = self._schedule.alignments_due(share)
+        if due <= self.aligned or not self._align or not isinstance(self.path, Spline):
+            return
+        self.aligned = due
+        views = self._trainer.views
+        ids = views.mappable(self.path)
+        ids = ids[:: -(-len(ids) // ALIGNED_VIEWS)]
+        self.path = align_spline(
+            self.path,
+            [(i, views.image(i)) for i in ids],
+            self._trainer.mapper,
+            self._trainer.planner,
+            self._prior,
+            self._schedule.alignment_step(due),
+        )

@@ -1,0 +1,211 @@
+"""What a reconstruction reports: its status, its tracked views, its work, and the sections of `report.json`."""
+
+import platform
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import PackageNotFoundError, version
+
+import numpy as np
+
+from spiked.pose import Array, log_so3
+from spiked.recon.frontend.demosaic import fill_mosaic
+from spiked.recon.mapping.mapper import Mapper
+from spiked.recon.odometry.odometry import WORST_PATH_ERROR, Odometry
+from spiked.recon.odometry.self_calibration import Focal
+from spiked.recon.odometry.sparse_map import TrackedView
+from spiked.recon.odometry.tracking_state import State
+from spiked.recon.options import Options
+from spiked.recon.view_store import ViewRecord, ViewStore
+from spiked.sensor import Image
+from spiked.spline import Path, Spline
+
+LIBRARIES = "numpy", "opencv-python-headless"
+"""Packages whose versions are reported: results depend on them."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """Progress and state of a reconstruction."""
+
+    state: State
+    reason: str
+    stage: str
+    """waiting, tracking, mapping, refining or done."""
+    frames: int
+    splats: int
+    loss: float | None
+    """Mean squared error of the views in units of white squared, weighted by the noise."""
+    version: int
+    """Increases when the scene or the trajectory changes."""
+    progress: float
+    """Share of the final refinement done, 0 to 1."""
+    inliers: float | None = None
+    """Of the newest pose, as are the next two: share of the known points that agree with it."""
+    chi2: float | None = None
+    """Squared median residual over the expected one; 1 if the noise explains it."""
+    sigma_px: float | None = None
+    """Predicted error, as a displacement of the image at the median depth."""
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """Tracking result of one view."""
+
+    time: float
+    """Middle of the view in frames."""
+    time_s: float
+    state: State
+    rotation: Array | None
+    """Camera to world, [3, 3]; None before the bootstrap and while lost."""
+    centre: Array | None
+    """[3], in the trajectory's unit."""
+    rate: float
+    """Mean spikes a pixel and frame."""
+    sigma_px: float | None = None
+    """Standard deviation of the pose in the image, if known."""
+    chi2: float | None = None
+    """Squared median residual over the expected one, if known."""
+
+    @classmethod
+    def of(cls, record: ViewRecord, frame_rate_hz: float, unit: float) -> "Tracked":
+        """From the record of a view; `unit` is the trajectory's length unit over the map's."""
+        view = record.tracked
+        centre = None if view.centre is None else view.centre * unit
+        time_s = view.time / frame_rate_hz
+        return cls(view.time, time_s, view.state, view.rotation, centre, record.rate, view.sigma_px, view.chi2)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Observed and rendered image [H, W, C] of one view, radiance, for visual comparison."""
+
+    time_s: float
+    observed: Image
+    rendered: Image | None
+    """None without a map."""
+
+
+def samples(views: ViewStore, mapper: Mapper, path: Path | None, frame_rate_hz: float, count: int) -> list[Sample]:
+    """At most `count` views, evenly spread over the recording, beside their renders from `path`."""
+    path = path if len(mapper.scene) else None
+    ids = views.kept if path is None else views.mappable(path)
+    out = []
+    for i in np.unique(np.linspace(0, len(ids) - 1, min(count, len(ids))).round().astype(int)):
+        view, rendered = views.image(ids[i]), None
+        if path is not None:
+            rotations, centres = path.poses([view.time])
+            rendered = mapper.render(rotations[0], centres[0])
+        out.append(Sample(view.time / frame_rate_hz, fill_mosaic(view.rate, mapper.channels), rendered))
+    return out
+
+
+@dataclass
+class WorkLog:
+    """Seconds of work in each stage, and the quality of the map over them."""
+
+    seconds: dict[str, float] = field(default_factory=lambda: {"tracking": 0.0, "mapping": 0.0, "refining": 0.0})
+    psnr_db: list[tuple[float, float]] = field(default_factory=list)
+    """(seconds of work, PSNR of the views)."""
+    _begin: float | None = None
+
+    @contextmanager
+    def measure(self, stage: str) -> Iterator[None]:
+        """Count the time within as work of a stage."""
+        self._begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] += self._running_s()
+            self._begin = None
+
+    def _running_s(self) -> float:
+        return 0.0 if self._begin is None else time.perf_counter() - self._begin
+
+    def note(self, loss: float | None) -> None:
+        """Append the PSNR of a mean squared error in units of white squared, if there is one."""
+        if loss is not None:
+            self.psnr_db.append((sum(self.seconds.values()) + self._running_s(), float(-10 * np.log10(loss))))
+
+    def report(self) -> dict[str, object]:
+        """The section of the report."""
+        seconds = self.seconds | {"total": sum(self.seconds.values())}
+        return {
+            "psnr_of_views_over_seconds": [[round(s, 2), round(p, 2)] for s, p in self.psnr_db],
+            "seconds": {stage: round(s, 3) for stage, s in seconds.items()},
+        }
+
+
+def path_warning(path_error: float | None) -> str | None:
+    """A warning where the predicted error of the path is large."""
+    if path_error is None or path_error <= WORST_PATH_ERROR:
+        return None
+    return (
+        f"the shape of the whole path is only known to about {path_error:.0%}, before the map corrects it: "
+        "few tracks tie its parts together; more sideways motion, slower motion or more light would help"
+    )
+
+
+def versions() -> dict[str, str]:
+    """Versions of the program, Python, and the libraries that results depend on."""
+    try:
+        release = version("spiked")
+    except PackageNotFoundError:
+        release = "unknown"
+    return {"spiked": release, "python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
+
+
+def options_section(options: Options) -> dict[str, object]:
+    """All options; of poses and calibration only whether they were given."""
+    given = {"poses": options.poses is not None, "calibration": options.calibration is not None}
+    return asdict(replace(options, poses=None, calibration=None)) | given
+
+
+def tracking_section(odometry: Odometry, frame_rate_hz: float) -> dict[str, object]:
+    """State, its changes, and every view."""
+    return {
+        "path_error_predicted": odometry.path_error,
+        "state": str(odometry.state),
+        "reason": odometry.reason,
+        "states": [{"time_s": t / frame_rate_hz, "state": str(s), "reason": r} for t, s, r in odometry.changes],
+        "views": [_view(view, frame_rate_hz) for view in odometry.views],
+    }
+
+
+def _view(view: TrackedView, frame_rate_hz: float) -> dict[str, object]:
+    return {
+        "time_s": view.time / frame_rate_hz,
+        "frames": view.length,
+        "motion_px": round(view.motion_px, 3),
+        "inliers": round(view.inliers, 3),
+        "chi2": None if view.chi2 is None else round(view.chi2, 3),
+        "sigma_px": None if view.sigma_px is None else round(view.sigma_px, 4),
+        "state": str(view.state),
+    }
+
+
+def focal_section(mapper: Mapper, focal: Focal | None) -> dict[str, object]:
+    """The focal length in use; `focal` where it was estimated."""
+    sigma = None if focal is None or not np.isfinite(focal.relative_sigma) else focal.relative_sigma
+    return {
+        "focal_px": [mapper.camera.intrinsics.fx, mapper.camera.intrinsics.fy],
+        "focal_estimated": focal is not None,
+        "focal_relative_sigma": sigma,
+    }
+
+
+def map_section(mapper: Mapper) -> dict[str, object]:
+    """Size and fit of the map."""
+    return {"splats": len(mapper.scene), "steps": mapper.steps, "loss": mapper.loss}
+
+
+def path_section(path: Path | None, odometry: Odometry, aligned: bool) -> dict[str, object]:
+    """Knots of the final path, and where it was aligned with the map its RMS rotation from the tracked one."""
+    correction_deg, tracked = None, odometry.spline
+    if aligned and path is not None and tracked is not None:
+        times = np.array([view.time for view in odometry.views if view.rotation is not None])
+        turned = path.poses(times)[0] @ tracked.poses(times)[0].swapaxes(1, 2)
+        correction_deg = float(np.degrees(np.sqrt((log_so3(turned) ** 2).sum(1).mean())))
+    spacing = path.spacing if isinstance(path, Spline) else None
+    return {"knot_spacing_frames": spacing, "correction_deg": correction_deg}

@@ -1,0 +1,17 @@
+"""Robust statistics of a few hundred numbers."""
+
+import numpy as np
+
+from spiked.pose import Array
+
+RAYLEIGH_MEDIAN = 1.1774
+"""sqrt(2 ln 2): median length of a two-dimensional error over its standard deviation in one direction."""
+
+
+def median(values: Array) -> float:
+    """Of [n > 0] numbers without NaN: `np.median` takes five times as long to look for axes and NaN as to sort."""
+    middle = len(values) // 2
+    if len(values) % 2:
+        return float(np.partition(values, middle)[middle])
+    around = np.partition(values, (middle - 1, middle))
+    return 0.5 * float(around[middle - 1] + around[middle])

@@ -1,18 +1,18 @@
-"""What cameras can do, and what nobody publishes of them: that reads "not supported", and no register is invented."""
+"""Capabilities of the cameras. Features that their makers do not document are "not supported"."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Capability:
-    """One thing in which cameras differ."""
+    """A feature that a camera has or lacks."""
 
     supported: bool
     value: str | float | None = None
-    """What it is, where there is one value; never set where it is not supported."""
+    """Its value, if it has one; None if it is not supported."""
 
     def __str__(self) -> str:
-        """For people."""
+        """As shown to users."""
         if not self.supported:
             return "not supported"
         return "yes" if self.value is None else str(self.value)
@@ -38,11 +38,11 @@ USB_CAPABILITIES = {
     "frame_counter": Capability(True),
     **_UNKNOWN,
 }
-"""Of the SPS10-002. Its line counter tells how many frames are lost."""
+"""SPS10-002. Its line counter shows how many frames are lost."""
 PCIE_CAPABILITIES = {
     "resolution": Capability(True, "1000x1000"),
     "frame_rate_hz": Capability(True, 20_000.0),
     "frame_counter": Capability(False),
     **_UNKNOWN,
 }
-"""Of the M1K40. Its stream counts lines within a frame, not frames."""
+"""M1K40. Its stream numbers lines within a frame, not frames."""

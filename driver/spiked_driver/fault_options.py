@@ -1,21 +1,30 @@
-"""Faults as options of a source's text, and the same as flags: `gap=8000:40ms`, `--unplug-at 5000:2s`."""
+"""Fault injection as options of a source's text (`gap=8000:40ms`) and as flags (`--unplug-at 5000:2s`)."""
 
 import math
 import re
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema, field_validator
 
-from spiked.ring import Cause
+from spiked.ring import LossCause
 from spiked_driver.faults import Faults, Loss, Stall
 
-_SPAN = re.compile(r"(\d+(?:\.\d+)?)(s|ms)?")
+MOST_FRAMES = 10**12
+"""Upper bound of frame indices and counts: a year and a half at 20 kHz."""
+_MOST_FAULTS = 1000
+_MOST_STALL_S = 3600.0
+_SPAN = re.compile(r"(\d{1,12}(?:\.\d{1,9})?)(s|ms)?")
+_Frame = Annotated[int, Field(ge=0, le=MOST_FRAMES)]
+
+
+_TEXTS = WithJsonSchema({"type": "array", "items": {"type": "string"}, "maxItems": _MOST_FAULTS, "default": []})
+"""JSON schema of an option that may be repeated."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """A number of frames, given as such or as a time."""
+    """A number of frames, stated directly or as a time."""
 
     frames: int | None
     seconds: float = 0.0
@@ -31,34 +40,36 @@ class Span:
         return cls(None, float(found[1]) * (1e-3 if found[2] == "ms" else 1.0))
 
     def at(self, rate_hz: float) -> int:
-        """In frames; a time is at least one."""
-        return self.frames if self.frames is not None else max(1, math.ceil(self.seconds * rate_hz))
+        """Number of frames; a time is at least one frame."""
+        return self.frames if self.frames is not None else max(1, min(MOST_FRAMES, math.ceil(self.seconds * rate_hz)))
 
 
 class FaultOptions(BaseModel):
-    """What shall go wrong with a source. Each list may be given any number of times."""
+    """Faults to inject into a source. Options with a list may be repeated."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     drop: float = Field(0.0, ge=0, lt=1)
-    """Fraction of the frames lost at random, as if the host were too slow."""
-    drop_run: int = Field(1, ge=1)
-    """Frames lost each time."""
-    gap: tuple[tuple[int, Span, Cause], ...] = ()
-    """`FIRST:LENGTH` or `FIRST:LENGTH:CAUSE`: frames to lose; the length in frames, or as `40ms` or `2s`."""
+    """Fraction of the frames lost at random, with cause usb."""
+    drop_run: int = Field(1, ge=1, le=10**6)
+    """Frames per random loss."""
+    gap: Annotated[tuple[tuple[_Frame, Span, LossCause], ...], _TEXTS] = Field((), max_length=_MOST_FAULTS)
+    """`FIRST:LENGTH` or `FIRST:LENGTH:CAUSE`: frames to lose; LENGTH in frames, or as `40ms` or `2s`."""
     corrupt: float = Field(0.0, ge=0, le=1)
     """Fraction of the frames delivered with noise in some pixels."""
-    unplug_at: tuple[tuple[int, Span], ...] = ()
-    """`FRAME:LENGTH`: the camera is pulled out, and is back after so many frames or so long."""
-    stall: tuple[tuple[int, float], ...] = ()
-    """`FRAME:SECONDS`: nothing comes for a while."""
-    fault_seed: int = 0
-    """Of whatever is random here."""
+    unplug_at: Annotated[tuple[tuple[_Frame, Span], ...], _TEXTS] = Field((), max_length=_MOST_FAULTS)
+    """`FRAME:LENGTH`: the camera is unplugged for this number of frames or this time."""
+    stall: Annotated[tuple[tuple[_Frame, Annotated[float, Field(ge=0, le=_MOST_STALL_S)]], ...], _TEXTS] = Field(
+        (), max_length=_MOST_FAULTS
+    )
+    """`FRAME:SECONDS`: no frames come for this time; none is lost."""
+    fault_seed: int = Field(0, ge=0, lt=1 << 32)
+    """Seed of random losses and of noise."""
 
     @field_validator("gap", mode="before")
     @classmethod
     def _gaps(cls, values: Any) -> Any:
-        return [(*_first_and_length(text, 3), *(text.split(":")[2:] or [Cause.USB])) for text in many(values)]
+        return [(*_first_and_length(text, 3), *(text.split(":")[2:] or [LossCause.USB])) for text in many(values)]
 
     @field_validator("unplug_at", mode="before")
     @classmethod
@@ -76,15 +87,17 @@ class FaultOptions(BaseModel):
         return stalls
 
     def faults(self, rate_hz: float) -> Faults:
-        """The faults, for a source of so many frames a second. Raises ConfigurationError if they do not go together."""
+        """The faults for a source of `rate_hz` frames a second. Raises ConfigurationError if losses overlap."""
         losses = [Loss(first, length.at(rate_hz), cause) for first, length, cause in self.gap]
-        losses += [Loss(first, length.at(rate_hz), Cause.DEVICE, unplugged=True) for first, length in self.unplug_at]
+        losses += [
+            Loss(first, length.at(rate_hz), LossCause.DEVICE, unplugged=True) for first, length in self.unplug_at
+        ]
         stalls = tuple(Stall(*stall) for stall in self.stall)
         return Faults(tuple(losses), stalls, self.drop, self.drop_run, self.fault_seed, self.corrupt)
 
 
 def many(values: Any) -> list[str]:
-    """An option that may be given more than once, as a list."""
+    """The values of an option that may be repeated, as a list."""
     return [values] if isinstance(values, str) else list(values)
 
 

@@ -1,4 +1,4 @@
-"""Faults on purpose, for any source: losses, stalls, damage and unplugging at exactly repeatable frames."""
+"""Fault injection for any source: losses, stalls, damage and unplugging at exactly repeatable frames."""
 
 import time
 from collections import deque
@@ -9,25 +9,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.errors import ConfigurationError
-from spiked.ring import Cause, Condition, DeviceState, End, Gap
+from spiked.ring import DeviceState, DeviceStatus, End, Gap, LossCause
 from spiked.sensor import Sensor
-from spiked_driver.source import READ_WAIT_S, Chunk, Source
+from spiked_driver.source import READ_WAIT_S, Chunk, Source, former_source_names
+
+_NOISE_SHARE = 16
+"""A damaged frame has noise in one of so many parts of its bytes."""
 
 
 @dataclass(frozen=True)
 class Loss:
-    """Frames that the source delivers and the fault takes away."""
+    """Frames that are removed from the source's."""
 
     first: int
     count: int
-    cause: Cause = Cause.USB
+    cause: LossCause = LossCause.USB
     unplugged: bool = False
-    """The device is seen as lost meanwhile."""
+    """The device state is `lost` during the loss."""
 
 
 @dataclass(frozen=True)
 class Stall:
-    """Nothing comes for a while before this frame; the frames come late, and are not lost."""
+    """A pause before a frame. The frames after it come late and are not lost."""
 
     frame: int
     seconds: float
@@ -35,18 +38,17 @@ class Stall:
 
 @dataclass(frozen=True)
 class Faults:
-    """What shall go wrong with a source."""
+    """Faults to inject into a source."""
 
     losses: tuple[Loss, ...] = ()
     stalls: tuple[Stall, ...] = ()
     drop: float = 0.0
     """Fraction of the frames lost at random (cause usb)."""
     drop_run: int = 1
-    """Frames lost each time."""
+    """Frames per loss."""
     seed: int = 0
     corrupt: float = 0.0
-    """Fraction of the frames in which a stretch of pixels is noise, delivered as if nothing were wrong: the wire has no
-    checksum over pixels."""
+    """Fraction of the frames delivered with noise in some pixels. Not detectable: the wire has no checksum of them."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.drop < 1 or self.drop_run < 1:
@@ -56,27 +58,28 @@ class Faults:
         if not 0 <= self.corrupt <= 1:
             raise ConfigurationError(f"corrupting a fraction of {self.corrupt:g} of the frames is not possible")
         if any(loss.first < 0 or loss.count < 1 for loss in self.losses):
-            raise ConfigurationError("a loss begins at frame 0 or later and takes at least one frame")
+            raise ConfigurationError("a loss must start at frame 0 or later and have at least one frame")
         if any(stall.frame < 0 or stall.seconds < 0 for stall in self.stalls):
-            raise ConfigurationError("a stall is at frame 0 or later and takes no negative time")
+            raise ConfigurationError("a stall must be at frame 0 or later and last 0 s or longer")
         for earlier, later in pairwise(sorted(self.losses, key=lambda loss: loss.first)):
             if earlier.first + earlier.count > later.first:
                 raise ConfigurationError(f"losses overlap at frame {later.first}: give each frame to one of them")
 
 
+@former_source_names
 class FaultySource:
-    """A source with faults. Frames are lost after the inner source delivered them, so its timing and content stay."""
+    """A source with injected faults. The inner source delivers all frames, so its timing and content do not change."""
 
     def __init__(self, inner: Source, faults: Faults) -> None:
         self.inner = inner
         self.faults = faults
         self._losses: deque[Loss] = deque()
         self._stalls: deque[Stall] = deque()
-        self._told: deque[Gap | End] = deque()
-        self._loss: Loss | None = None  # the one going on
+        self._pending: deque[Gap | End] = deque()
+        self._loss: Loss | None = None  # the current one
         self._stalled_since_s: float | None = None
         self.corrupted = 0
-        """Frames that were damaged since `open`."""
+        """Frames damaged since `open`."""
         self._restart()
 
     @property
@@ -86,23 +89,23 @@ class FaultySource:
 
     @property
     def frames(self) -> int | None:
-        """The inner source's: a lost frame counts."""
+        """The inner source's: lost frames are counted."""
         return self.inner.frames
 
     @property
-    def waits(self) -> bool:
+    def can_block(self) -> bool:
         """The inner source's."""
-        return self.inner.waits
+        return self.inner.can_block
 
     @property
-    def condition(self) -> Condition:
-        """The inner source's, but lost while unplugged."""
+    def device_status(self) -> DeviceStatus:
+        """The inner source's, or lost during an injected unplugging."""
         if self._loss is not None and self._loss.unplugged:
-            return Condition(DeviceState.LOST, "unplugged on purpose")
-        return self.inner.condition
+            return DeviceStatus(DeviceState.LOST, "unplugged by fault injection")
+        return self.inner.device_status
 
     def open(self) -> None:
-        """Open the inner source and start the faults anew."""
+        """Open the inner source and restart the faults."""
         self._restart()
         self.inner.open()
 
@@ -113,8 +116,8 @@ class FaultySource:
 
     def read_into(self, view: NDArray[np.uint8]) -> Chunk | Gap | End | None:
         """See `Source.read_into`."""
-        if self._told:
-            return self._told.popleft()
+        if self._pending:
+            return self._pending.popleft()
         if self._stalls and self._stalls[0].frame <= self._next:
             self._stall(self._stalls[0])
             return None
@@ -139,26 +142,26 @@ class FaultySource:
         self._next_corrupt = self._draw_corrupt(0)
         self.corrupted = 0
         self._loss = None
-        self._told.clear()
+        self._pending.clear()
         self._stalled_since_s = None
 
     def _draw_drop(self) -> int | None:
-        """Where the next random loss begins: after a geometric number of frames whose mean gives the fraction."""
+        """First frame of the next random loss: a geometric number of frames ahead, whose mean gives the fraction."""
         if not self.faults.drop:
             return None
         chance = self.faults.drop / (self.faults.drop_run * (1 - self.faults.drop) + self.faults.drop)
         return self._next + int(self._random.geometric(chance)) - 1
 
     def _draw_corrupt(self, start: int) -> int | None:
-        """The first frame from `start` on that is damaged."""
+        """The first damaged frame from `start` on."""
         return start + int(self._noise.geometric(self.faults.corrupt)) - 1 if self.faults.corrupt else None
 
     def _corrupt(self, frames: NDArray[np.uint8]) -> None:
-        """Put noise into those of the frames, uint8 [n, frame_bytes], whose turn it is; the first has index _next."""
+        """Damage the selected ones of the frames, uint8 [n, frame_bytes], in place; the first has index `_next`."""
         while self._next_corrupt is not None and self._next_corrupt < self._next + len(frames):
-            noise = self._noise.integers(0, 256, frames.shape[1] // 16 + 1, np.uint8)
+            noise = self._noise.integers(0, 256, frames.shape[1] // _NOISE_SHARE + 1, np.uint8)
             at = int(self._noise.integers(0, frames.shape[1] - len(noise) + 1))
-            if self._next_corrupt >= self._next:  # else it was lost
+            if self._next_corrupt >= self._next:  # otherwise it was lost
                 frames[self._next_corrupt - self._next, at : at + len(noise)] ^= noise
                 self.corrupted += 1
             self._next_corrupt = self._draw_corrupt(self._next_corrupt + 1)
@@ -176,16 +179,16 @@ class FaultySource:
         return loss
 
     def _undisturbed(self, wanted: int) -> int:
-        """How many frames may be read before the next fault begins."""
+        """Number of frames up to `wanted` that can be read before the next fault."""
         starts = [self._losses[0].first] if self._losses else []
         starts += [self._stalls[0].frame] if self._stalls else []
         starts += [self._next_drop] if self._next_drop is not None else []
         return min([wanted, *(start - self._next for start in starts)])
 
     def _lose(self, loss: Loss, view: NDArray[np.uint8]) -> Gap | End | None:
-        """Take away what the inner source delivers, and tell of it once, when all of it has come.
+        """Discard frames of the inner source; return one gap when all frames of the loss have come.
 
-        One read a call, so that the state of an unplugged device can be seen while it lasts.
+        Makes one read per call, so that the caller sees the device state during the loss.
         """
         item = self.inner.read_into(view[: loss.first + loss.count - self._next])
         if isinstance(item, Chunk):
@@ -194,15 +197,15 @@ class FaultySource:
         return None if item is None else self._interrupted(loss, item)
 
     def _interrupted(self, loss: Loss, item: Gap | End) -> Gap | End:
-        """The inner source itself tells of a gap or the end: that comes behind what was lost until then."""
-        self._losses.appendleft(loss)  # it goes on after the gap
+        """The inner source returned a gap or the end: return it after the gap of the frames lost so far."""
+        self._losses.appendleft(loss)  # it continues after the gap
         if self._next == self._lost_first:
             self._loss = None
             self._advance(item)
             return item
         lost = self._end_loss(loss)
         self._advance(item)
-        self._told.append(item)
+        self._pending.append(item)
         return lost
 
     def _end_loss(self, loss: Loss) -> Gap:

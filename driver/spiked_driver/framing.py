@@ -1,4 +1,4 @@
-"""The bytes of the USB3 camera (flavour C) to compact frames and gaps, and back."""
+"""Converts bytes of the USB3 camera (`Flavour.C`) to compact frames and gaps, and back."""
 
 import time
 from collections.abc import Callable
@@ -10,41 +10,42 @@ from numpy.typing import NDArray
 from spiked.native._wire import Counters, Event, Kind, UsbParser
 
 from spiked.errors import SourceError
-from spiked.ring import Cause, Gap
+from spiked.ring import Gap, LossCause
 from spiked_driver.source import Chunk
 
 USB_WIDTH, USB_HEIGHT = 400, 250
 USB_FRAME_BYTES = 13_016
 """A frame on the wire: 16 bytes of header and 250 rows of 52 bytes."""
 USB_COMPACT_BYTES = 12_500
+"""A frame's pixels: 250 rows of 50 bytes."""
 _MAGIC, _WORD1 = 0x63606300, 0x00100021
 
 
 @dataclass(frozen=True)
 class FramingCounters:
-    """What a parser made of the bytes so far."""
+    """Counters of a parser since its creation."""
 
     bytes: int
     received: int
     """Frames delivered."""
     lost: int
-    """Frames told of in gaps."""
+    """Frames reported in gaps."""
     duplicates: int
-    """Frames that came a second time or late, and were dropped."""
+    """Frames that came again or late and were dropped."""
     skipped_bytes: int
-    """Bytes of no delivered or duplicated frame: junk, and what damage spoilt."""
+    """Bytes outside delivered and duplicated frames: junk and damaged frames."""
     resyncs: int
-    """Times that frames no longer followed one another."""
+    """Times that synchronisation was lost."""
     restarts: int
-    """Times that the camera's counters began anew."""
+    """Times that the camera's counters started anew."""
 
     def position(self, frame_bytes: int) -> int:
-        """Up to which byte of the stream it has been understood, if a frame has that many."""
+        """Bytes of the stream that are parsed, for frames of `frame_bytes` bytes on the wire."""
         return (self.received + self.duplicates) * frame_bytes + self.skipped_bytes
 
 
 class Parser(Protocol):
-    """The native face that both wire formats share."""
+    """Interface of the native parsers of both wire formats."""
 
     def feed(self, chunk: NDArray[np.uint8]) -> None: ...
     def keep(self) -> None: ...
@@ -58,9 +59,9 @@ class Parser(Protocol):
 
 
 class Framing:
-    """Bytes in, in chunks of any size; frames and gaps out. Used by one thread.
+    """Parses bytes in chunks of any size into frames and gaps. Used by one thread.
 
-    Index 0 is the first frame found; every index below `next_index` was delivered once or was in one gap.
+    Index 0 is the first frame found. Every index below `next_index` was delivered once or was in one gap.
     """
 
     def __init__(self, parser: Parser) -> None:
@@ -73,24 +74,24 @@ class Framing:
 
     @property
     def counters(self) -> FramingCounters:
-        """What was made of the bytes so far."""
+        """Counters since the start."""
         c = self._parser.counters
         return FramingCounters(c.bytes, c.received, c.lost, c.duplicates, c.skipped, c.resyncs, c.restarts)
 
     def feed(self, chunk: bytes | bytearray | memoryview | NDArray[np.uint8]) -> None:
-        """Give the next bytes. They are read in place: leave them as they are until the next `feed` or `keep`."""
+        """Parse the next bytes. They are read in place and must not change until the next `feed` or `keep`."""
         self._parser.feed(np.frombuffer(chunk, np.uint8))
 
     def keep(self) -> None:
-        """Copy what is left of the chunk, so that its memory may be used again."""
+        """Copy the unread rest of the chunk, so that its memory may be reused."""
         self._parser.keep()
 
     def mark_loss(self) -> None:
-        """Say that bytes were lost before the next chunk: what is missing then is the host's loss, not the camera's."""
+        """State that the host lost bytes before the next chunk: frames missing there have the cause `usb`."""
         self._parser.mark_loss()
 
     def finish(self) -> None:
-        """Say that no more bytes come; `read_into` then gives what waited for its successor."""
+        """State that no more bytes follow; `read_into` then returns a last frame that awaited the next header."""
         self._parser.finish()
 
     def read_into(self, view: NDArray[np.uint8]) -> Chunk | Gap | None:
@@ -104,37 +105,37 @@ class Framing:
 class UsbFraming(Framing):
     """The parser of the SPS10's stream from endpoint 0x82.
 
-    A frame is delivered when its header has the session's constants, its counters agree with each other and all its row
-    numbers are right; pixels have no check. The first one also needs the next header to confirm it. A gap is the
-    device's when the counters jump between frames that follow one another without a byte amiss, else the host's.
+    A frame is delivered if its header has the session's constants, its two counters agree and all row numbers are
+    right; pixels are not checked. The first frame must also be confirmed by the next header. A gap has the cause
+    `device` if the counters jump between two frames without a damaged byte between them, else `usb`.
     """
 
     def __init__(self) -> None:
         self._usb = UsbParser()
         super().__init__(self._usb)
 
-    def resume(self, lost: int, tolerance: int, cause: Cause) -> None:
-        """The stream broke off, and the camera may count anew: half frames are dropped, a gap follows with that cause.
+    def resume(self, lost: int, tolerance: int, cause: LossCause) -> None:
+        """The stream was interrupted and the camera may count anew: drop partial frames; a gap of `cause` follows.
 
-        By the host's clock `lost` frames are missing; the camera's own count is taken instead if it runs on and differs
-        by at most `tolerance`. Called again before a frame came, the later call counts.
+        `lost` frames are missing by the host's clock. The camera's count is used instead if it continues and differs by
+        at most `tolerance` frames. If called again before the next frame, the later call is used.
         """
-        self._usb.resume(lost, tolerance, Kind.DEVICE_GAP if cause is Cause.DEVICE else Kind.HOST_GAP)
+        self._usb.resume(lost, tolerance, Kind.DEVICE_GAP if cause is LossCause.DEVICE else Kind.HOST_GAP)
 
 
 def event_item(event: Event) -> Chunk | Gap | None:
-    """What a native parser found, in the words of a `Source`."""
+    """Converts an event of a native parser to an item of a `Source`."""
     if event.kind == Kind.NONE:
         return None
     if event.kind == Kind.FRAMES:
         return Chunk(event.first, event.count)
-    return Gap(event.first, event.count, Cause.DEVICE if event.kind == Kind.DEVICE_GAP else Cause.USB)
+    return Gap(event.first, event.count, LossCause.DEVICE if event.kind == Kind.DEVICE_GAP else LossCause.USB)
 
 
 def encode_usb(frames: NDArray[np.uint8], *, first: int = 0, lines: int = 0, nbytes: int = 0) -> NDArray[np.uint8]:
-    """The wire bytes, uint8 [n, 13016], of compact frames, uint8 [n, 12500], with indices from `first` on.
+    """Wire bytes, uint8 [n, 13016], of compact frames, uint8 [n, 12500], with indices from `first` on.
 
-    `lines` and `nbytes` are what the camera's two counters, modulo 2^32, show at index 0.
+    `lines` and `nbytes` are the values of the camera's two counters at index 0, modulo 2^32.
     """
     count = len(frames)
     wire = np.empty((count, USB_FRAME_BYTES), np.uint8)
@@ -152,19 +153,19 @@ def encode_usb(frames: NDArray[np.uint8], *, first: int = 0, lines: int = 0, nby
 
 @dataclass(frozen=True)
 class FramingBenchmark:
-    """Throughput of a parser in wire bytes, next to plain copying of the same bytes, on one core."""
+    """Throughput of a parser in wire bytes, and of copying the same bytes, on one core."""
 
     parsed_bytes_a_second: float
     memcpy_bytes_a_second: float
 
     @property
     def ratio(self) -> float:
-        """Parser to memcpy."""
+        """Parser divided by memcpy."""
         return self.parsed_bytes_a_second / self.memcpy_bytes_a_second
 
 
 def benchmark_usb(frames: int = 1500, repeat: int = 3) -> FramingBenchmark:
-    """Best of `repeat` passes over so many random frames in reads of 256 KiB, as the camera is read."""
+    """Best of `repeat` passes over `frames` random frames in chunks of 256 KiB."""
     pixels = np.random.default_rng(0).integers(0, 256, (frames, USB_COMPACT_BYTES), np.uint8)
     return benchmark_framing(UsbFraming, encode_usb(pixels), USB_COMPACT_BYTES, 256 << 10, repeat)
 

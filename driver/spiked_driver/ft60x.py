@@ -1,7 +1,7 @@
-"""What is said to FTDI's FT60x bridge: identity, endpoints, the request that asks for data, the chip's configuration.
+"""Protocol of FTDI's FT60x bridge: identity, endpoints, read requests, the chip's configuration.
 
-The facts come from public drivers of the chip, not from its maker and not from tests on hardware; a correction belongs
-here and nowhere else. No transfer is made here: bytes to send and bytes to understand.
+The facts come from public drivers of the chip, not from its maker, and were not tested on hardware. Corrections belong
+here. This module encodes and decodes bytes; it makes no transfer.
 """
 
 import struct
@@ -12,20 +12,20 @@ from spiked.errors import SourceError
 
 VENDOR_ID = 0x0403
 PRODUCTS = {0x601E: "FT600", 0x601F: "FT601"}
-"""Product ids and the chips behind them; the SPS10-002 camera has an FT601."""
+"""Chip by USB product id; the SPS10-002 camera has an FT601."""
 
 SESSION_INTERFACE, DATA_INTERFACE = 0, 1
 SESSION_OUT = 0x01
-"""Bulk endpoint that takes requests."""
+"""Bulk endpoint for requests."""
 NOTIFICATION_IN = 0x81
-"""Interrupt endpoint; nothing that we know needs it."""
+"""Interrupt endpoint; not used."""
 DATA_OUT = 0x02
-"""Bulk endpoint that the camera's own software never writes to."""
+"""Bulk endpoint; the vendor's software never writes to it."""
 DATA_IN = 0x82
 """Bulk endpoint of the camera's stream."""
 
 REQUEST_TYPE, REQUEST_CONFIGURATION, REQUEST_VALUE, REQUEST_INDEX = 0xC0, 0xCF, 1, 0
-"""The vendor request (device to host) that reads the chip's configuration, with its value and index."""
+"""Vendor request (device to host) that reads the chip's configuration."""
 CONFIGURATION_BYTES = 152
 
 _READ_REQUEST = struct.Struct("<IBBHIII")
@@ -35,7 +35,7 @@ _CONFIGURATION = struct.Struct("<HH128sBBHBBBBHBBII")
 
 
 def read_request(index: int, length: int) -> bytes:
-    """The 20 bytes that, sent to SESSION_OUT, let up to `length` bytes come from DATA_IN; `index` counts requests.
+    """A 20-byte request for SESSION_OUT: up to `length` bytes may then come from DATA_IN. `index` counts requests.
 
     {u32 index, u8 pipe, u8 command 1 = read, u16 0, u32 length, u32 0, u32 0}, little endian.
     """
@@ -43,7 +43,7 @@ def read_request(index: int, length: int) -> bytes:
 
 
 class FifoClock(IntEnum):
-    """Clock of the bus between camera and chip; the value is the chip's code."""
+    """Clock of the bus between camera and chip, by the chip's code."""
 
     MHZ_100 = 0
     MHZ_66 = 1
@@ -63,21 +63,39 @@ class FifoMode(IntEnum):
     MODE_600 = 1
 
 
+class Channels(IntEnum):
+    """Channels between camera and host, by the chip's code."""
+
+    FOUR = 0
+    TWO = 1
+    ONE = 2
+    ONE_TO_CAMERA = 3
+    ONE_TO_HOST = 4
+
+    def __str__(self) -> str:
+        """As shown to users."""
+        return self.name.lower().replace("_", " ") + (" channel" if self >= Channels.ONE else " channels")
+
+
+_BUS_BYTES = {0x601E: 2, 0x601F: 4}
+"""Bytes per clock of the bus between camera and chip, by product id."""
+_SET_IT = "set it with FTDI's FT60X configuration programmer to one channel, FIFO mode 245, 100 MHz"
+
+
 @dataclass(frozen=True)
 class ChipConfiguration:
-    """What we use of the chip's stored configuration; None for a code that we do not know."""
+    """Fields of the chip's stored configuration; None for an unknown code."""
 
     vendor_id: int
     product_id: int
     power_ma: int
     fifo_clock: FifoClock | None
     fifo_mode: FifoMode | None
-    channels: int
-    """The chip's code, not a number of channels: 2 is one channel, 4 one channel towards the host only."""
+    channels: Channels | None
 
     @classmethod
     def parse(cls, data: bytes) -> "ChipConfiguration":
-        """From the answer to REQUEST_CONFIGURATION. Raises SourceError if it has not the length it must have."""
+        """From the answer to REQUEST_CONFIGURATION. Raises SourceError for an answer of another length."""
         if len(data) != CONFIGURATION_BYTES:
             raise SourceError(
                 f"the camera's USB bridge answered the request for its configuration with {len(data)} bytes, "
@@ -90,5 +108,36 @@ class ChipConfiguration:
             power,
             FifoClock(clock) if clock in list(FifoClock) else None,
             FifoMode(mode) if mode in list(FifoMode) else None,
-            channels,
+            Channels(channels) if channels in list(Channels) else None,
         )
+
+    def __str__(self) -> str:
+        """As shown to users."""
+        mode = "unknown FIFO mode" if self.fifo_mode is None else f"FIFO mode {self.fifo_mode.name[5:]}"
+        clock = "unknown clock" if self.fifo_clock is None else f"{self.fifo_clock.mhz} MHz"
+        return f"{mode}, {clock}, {'unknown channels' if self.channels is None else self.channels}"
+
+    def impossible(self, wire_bytes_s: float) -> str | None:
+        """Why the chip cannot carry that many bytes a second, and what to do; None if it can."""
+        if self.channels is Channels.ONE_TO_CAMERA:
+            return f"its bridge has no channel to the host: {_SET_IT}"
+        if self.fifo_clock is None:
+            return None
+        carries = 1e6 * self.fifo_clock.mhz * _BUS_BYTES.get(self.product_id, 4)
+        if carries >= wire_bytes_s:
+            return None
+        what = f"its bridge's bus carries {carries / 1e6:.0f} MB/s at {self.fifo_clock.mhz} MHz"
+        return f"{what}, and the camera sends {wire_bytes_s / 1e6:.0f}: {_SET_IT}"
+
+    def unusual(self) -> str | None:
+        """Settings that differ from an SPS10's and may still work, and what to do; None if there are none."""
+        odd = []
+        if self.fifo_mode is not FifoMode.MODE_245:
+            odd.append("unknown FIFO mode" if self.fifo_mode is None else f"FIFO mode {self.fifo_mode.name[5:]}")
+        if self.channels not in (Channels.ONE, Channels.ONE_TO_HOST):
+            odd.append("unknown channels" if self.channels is None else f"{self.channels}")
+        if self.fifo_clock is None:
+            odd.append("unknown clock")
+        if not odd:
+            return None
+        return f"its bridge has {' and '.join(odd)}, and only the first channel is read: if no frames come, {_SET_IT}"

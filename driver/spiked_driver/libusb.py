@@ -1,7 +1,7 @@
-"""What pyusb does not offer of libusb: a context of one's own, and transfers that run while we do something else.
+"""Parts of libusb that pyusb does not offer: a context for each camera, and asynchronous transfers.
 
-The only module that leans on private parts of pyusb (its context, its open handle and its loaded library), and the
-reason why the version is pinned. Layouts and codes are those of libusb 1.0's public header.
+This is the only module that uses private parts of pyusb (its context, open handle and loaded library); pyusb's version
+is pinned because of it. Layouts and codes are those of libusb 1.0's public header, libusb.h.
 """
 
 import ctypes
@@ -20,9 +20,12 @@ from spiked_driver.usb_cameras import UsbCamera
 
 Callback = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 _NO_MEMORY = -11
+"""LIBUSB_ERROR_NO_MEM."""
 _BULK = 2
+"""LIBUSB_TRANSFER_TYPE_BULK."""
 _ATTEMPTS = 5
-_AGAIN_S = 0.02
+_RETRY_S = 0.02
+"""Pause after the first failed attempt, seconds; it grows by as much with each."""
 
 
 class Status(IntEnum):
@@ -38,7 +41,7 @@ class Status(IntEnum):
 
 
 class Transfer(ctypes.Structure):
-    """struct libusb_transfer, as far as bulk transfers use it."""
+    """struct libusb_transfer without its isochronous packets."""
 
     _fields_ = (
         ("dev_handle", ctypes.c_void_p),
@@ -64,19 +67,18 @@ class _Timeval(ctypes.Structure):
 
 
 class OutOfUsbMemoryError(SourceError):
-    """The kernel takes no more transfers: its limit is reached."""
+    """The kernel takes no more transfers: its memory limit is reached."""
 
 
 class NoContextError(SourceError):
-    """libusb is there but cannot begin now: it may in a moment."""
+    """libusb is installed but cannot be initialised now; a later attempt may succeed."""
 
 
 @cache
 def load_libusb() -> Any:
-    """The library, prepared by pyusb. Raises SourceError if it is not installed.
+    """The libusb library with pyusb's prototypes. Raises SourceError if it is not installed.
 
-    pyusb's own `get_backend` answers None for every trouble, that of a moment too, and makes a context that nobody
-    uses.
+    pyusb's own `get_backend` returns None for every error, including temporary ones, and makes an unused context.
     """
     try:
         library = usb.backend.libusb1._load_library()
@@ -85,20 +87,20 @@ def load_libusb() -> Any:
             f"libusb 1.0 is not installed ({error}): install it (Debian: apt install libusb-1.0-0)"
         ) from error
     usb.backend.libusb1._setup_prototypes(library)
-    usb.backend.libusb1._lib = library  # where pyusb looks for the texts of errors
+    usb.backend.libusb1._lib = library  # pyusb takes the texts of errors from there
     return library
 
 
 class UsbContext:
-    """A libusb context with nothing in it but one camera.
+    """A libusb context for one camera.
 
-    Each is made anew, since a context learns of plugging only where udev runs, which it does not in most containers.
+    A new one is made for each opening: a context notices new devices only where udev runs, and not in most containers.
     """
 
     def __init__(self) -> None:
-        """Raises SourceError if there is no libusb, NoContextError if it does not begin, after a few attempts."""
+        """Raises SourceError if libusb is not installed, NoContextError if it cannot be initialised."""
         self._lib: Any = load_libusb()
-        self._backend: Any = _begun(self._lib)
+        self._backend: Any = _new_backend(self._lib)
         self._device: usb.core.Device | None = None
         self._submit = self._function("libusb_submit_transfer", ctypes.c_int, ctypes.c_void_p)
         self._cancel = self._function("libusb_cancel_transfer", ctypes.c_int, ctypes.c_void_p)
@@ -113,14 +115,14 @@ class UsbContext:
         )
 
     def find(self, camera: UsbCamera) -> usb.core.Device | None:
-        """pyusb's device for a camera, None if it is gone."""
+        """pyusb's device of a camera; None if it is unplugged."""
         self._device = usb.core.find(backend=self._backend, bus=camera.bus, address=camera.address)
         return self._device
 
     def allocate(self, endpoint: int, buffer: int, length: int, callback: Any) -> Transfer:
-        """A bulk transfer from or to that many bytes at address `buffer`, without a time limit, for the open device.
+        """A bulk transfer of the open device without a time limit; `buffer` is the address of `length` bytes.
 
-        `callback` is called with the transfer's address, in `handle_events`.
+        `handle_events` calls `callback` with the transfer's address.
         """
         assert self._device is not None, "a camera was found"
         address = self._allocate(0)
@@ -133,27 +135,27 @@ class UsbContext:
         return transfer
 
     def free(self, transfer: Transfer) -> None:
-        """Let go of a transfer that is not in flight."""
+        """Free a transfer that is not in flight."""
         self._free(ctypes.addressof(transfer))
 
     def submit(self, transfer: Transfer) -> None:
-        """Queue it. Raises usb.core.USBError, or OutOfUsbMemoryError."""
+        """Queue a transfer. Raises usb.core.USBError or OutOfUsbMemoryError."""
         code = self._submit(ctypes.addressof(transfer))
         if code == _NO_MEMORY:
             raise OutOfUsbMemoryError("the kernel takes no more USB transfers (NO_MEM)")
         usb.backend.libusb1._check(code)
 
     def cancel(self, transfer: Transfer) -> None:
-        """Ask for its end, which comes as a callback; fine if it is not in flight."""
+        """Cancel a transfer; its callback follows. A transfer that is not in flight is no error."""
         self._cancel(ctypes.addressof(transfer))
 
     def handle_events(self, timeout_s: float) -> None:
-        """Let callbacks happen: wait for the first so long, and return after it."""
+        """Run the callbacks of completed transfers; wait at most `timeout_s` for the first."""
         wait = _Timeval(int(timeout_s), int(1e6 * (timeout_s % 1)))
         usb.backend.libusb1._check(self._handle_events(self._backend.ctx, ctypes.byref(wait), None))
 
     def close(self) -> None:
-        """Close the device and the context, in this order; pyusb by itself may do it in the other."""
+        """Close the device, then the context. pyusb's own finalisers may run in the other order."""
         if self._device is not None:
             usb.util.dispose_resources(self._device)
             self._device._ctx.dev.finalize()
@@ -161,18 +163,18 @@ class UsbContext:
         self._backend.finalize()
 
     def _function(self, name: str, result: Any, *arguments: Any) -> Callable[..., Any]:
-        """A function object of our own: argument types set on pyusb's would be pyusb's too."""
+        """A separate function object: argument types set on pyusb's object would change pyusb's calls as well."""
         function: Callable[..., Any] = ctypes.CFUNCTYPE(result, *arguments)((name, self._lib))
         return function
 
 
-def _begun(library: Any) -> Any:
-    """pyusb's backend with a new context: where udev is just telling others of cameras, beginning can fail once."""
+def _new_backend(library: Any) -> Any:
+    """pyusb's backend with a new context. Initialisation can fail while udev reports new devices to other programs."""
     for attempt in range(_ATTEMPTS):
         try:
             return usb.backend.libusb1._LibUSB(library)
         except usb.core.USBError as error:
             if attempt == _ATTEMPTS - 1:
-                raise NoContextError(f"libusb does not begin: {error.strerror}") from error
-            time.sleep(_AGAIN_S * (attempt + 1))
+                raise NoContextError(f"libusb cannot be initialised: {error.strerror}") from error
+            time.sleep(_RETRY_S * (attempt + 1))
     raise AssertionError("unreachable")

@@ -1,4 +1,4 @@
-"""An acquisition process that is not kept waiting: scheduled before others, its memory never paged out."""
+"""Real-time scheduling and locked memory for the acquisition process."""
 
 import ctypes
 import os
@@ -6,13 +6,13 @@ import resource
 from pathlib import Path
 
 PRIORITY = 20
-"""Of 1 to 99: above everything ordinary, below the kernel's own interrupt threads (50)."""
+"""SCHED_FIFO priority, 1 to 99: above all ordinary processes, below the kernel's interrupt threads (50)."""
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 
 
 def take_priority() -> list[str]:
-    """Do what is permitted for the calling thread and its process; a note for each thing that is not."""
+    """Schedule the calling thread in real time, lock the process's memory; a note for each that is not permitted."""
     return [note for note in (_schedule(), _lock_memory()) if note]
 
 
@@ -24,14 +24,14 @@ def may_schedule() -> bool:
 
 
 def may_lock_memory() -> bool:
-    """Whether all of this process's memory may be locked, now and later."""
+    """Whether this process may lock all of its present and future memory."""
     _, hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     return hard == resource.RLIM_INFINITY or bool(_effective_capabilities() >> _CAP_IPC_LOCK & 1)
 
 
 def _schedule() -> str | None:
     try:
-        # What this process starts is ordinary again.
+        # Child processes get ordinary scheduling.
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
     except OSError as error:
         return (
@@ -43,7 +43,7 @@ def _schedule() -> str | None:
 
 def _lock_memory() -> str | None:
     permit = "permit it with LimitMEMLOCK=infinity in the systemd unit, or `- memlock unlimited` in limits.d"
-    # With a limit, some later allocation would fail instead of being paged: then better nothing is locked.
+    # With a limit, a later allocation would fail. Without a lock it can be paged out instead.
     if not may_lock_memory():
         return f"acquisition's memory may be paged out (the limit of locked memory): {permit}"
     _, hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
@@ -54,7 +54,7 @@ def _lock_memory() -> str | None:
 
 
 def _effective_capabilities() -> int:
-    """Bits as in capabilities(7)."""
+    """Effective capabilities of this process, bits as in capabilities(7)."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("CapEff:"):
             return int(line.split()[1], 16)

@@ -1,24 +1,52 @@
-"""A recording played as if it were the camera."""
+"""Replays a recording as a camera."""
 
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, WithJsonSchema, field_validator
 
 from spiked.errors import SourceError
-from spiked.recording import Recording
-from spiked.ring import Cause, Condition, DeviceState, End, EndReason, Gap
+from spiked.recording import Recording, RecordingGeometry, open_recording
+from spiked.ring import DeviceState, DeviceStatus, End, EndReason, Gap, LossCause
 from spiked.sensor import BitOrder, Sensor
-from spiked_driver.source import Chunk, Pacer
+from spiked_driver.fault_options import MOST_FRAMES
+from spiked_driver.source import Chunk, Pacer, former_source_names
+from spiked_driver.source_kind import Device, PacedOptions, Rate, Side, SourceKind, SourceSpec, Warn, path_of
+
+_Index = Annotated[int, Field(ge=0, le=MOST_FRAMES)]
+_Range = Annotated[tuple[_Index | None, _Index | None], WithJsonSchema({"type": "string", "pattern": r"^\d*:\d*$"})]
 
 
+class ReplayOptions(PacedOptions):
+    """Options of `replay:FILE`. Width, height and rate are for a recording without a sidecar."""
+
+    width: Side | None = None
+    """Pixels in a row."""
+    height: Side | None = None
+    """Rows."""
+    rate: Rate | None = None
+    """Frames per second."""
+    repeat: int = Field(1, ge=1, le=10**6)
+    """Number of times the range is played."""
+    range: _Range = (None, None)
+    """`FIRST:STOP`: frames FIRST to STOP - 1; either may be omitted."""
+
+    @field_validator("range", mode="before")
+    @classmethod
+    def _bounds(cls, value: Any) -> Any:
+        return [part or None for part in value.split(":")] if isinstance(value, str) else value
+
+
+@former_source_names
 class ReplaySource:
-    """Frames `first` to `stop - 1` of a recording, `repeat` times; the index starts at 0 and runs on over repeats.
+    """Frames `first` to `stop - 1` of a recording, `repeat` times. The index starts at 0 and continues over repeats.
 
-    Frames that the recording lost are lost again, with their cause; `first` and `stop` count the frames it has.
-    `pace` is a factor of the recorded rate; with 0 frames come as fast as lossless consumers take them.
+    `first` and `stop` count stored frames. Frames that the recording lost are gaps with the same cause. `pace` is a
+    factor of the recorded rate; with 0, frames come as fast as lossless consumers take them.
     """
 
     def __init__(
@@ -34,7 +62,9 @@ class ReplaySource:
         if not 0 <= first < last <= recording.frames:
             raise SourceError(f"range {first}:{last} is not within the {recording.frames} frames of {recording.path}")
         if pace < 0 or repeat < 1:
-            raise SourceError(f"a replay at pace {pace:g}, {repeat} times, is not possible")
+            raise SourceError(
+                f"a replay at pace {pace:g}, {repeat} times, is not possible: pace must be >= 0 and repeat >= 1"
+            )
         self._recording = recording
         self._pieces = _pieces(recording, first, last)
         self._length = sum(piece.count for piece in self._pieces)
@@ -42,7 +72,7 @@ class ReplaySource:
         self._pace = pace
         self._pacer = Pacer(self.sensor.frame_rate_hz, pace)
         self._next = 0
-        self._condition = Condition(DeviceState.IDLE)
+        self._device_status = DeviceStatus(DeviceState.IDLE)
 
     @property
     def path(self) -> Path:
@@ -51,38 +81,38 @@ class ReplaySource:
 
     @property
     def sensor(self) -> Sensor:
-        """The camera of the recording, with compact frames, leftmost pixel in the lowest bit."""
+        """The recording's sensor with compact frames, leftmost pixel in the lowest bit."""
         return replace(self._recording.sensor.compact(), bit_order=BitOrder.LSB)
 
     @property
     def frames(self) -> int:
-        """All repeats together, lost frames included."""
+        """Frames of all repeats, with lost ones."""
         return self._length * self._repeat
 
     @property
-    def waits(self) -> bool:
-        """Only without a pace: a paced replay behaves like the camera, which never waits."""
+    def can_block(self) -> bool:
+        """Without a pace only: a paced replay behaves like a camera, which does not wait."""
         return self._pace == 0
 
     @property
-    def condition(self) -> Condition:
+    def device_status(self) -> DeviceStatus:
         """Armed once open, streaming from the first frame, idle after the last."""
-        return self._condition
+        return self._device_status
 
     def open(self) -> None:
         """Start again at frame 0."""
         self._next = 0
         self._pacer = Pacer(self.sensor.frame_rate_hz, self._pace)
-        self._condition = Condition(DeviceState.ARMED)
+        self._device_status = DeviceStatus(DeviceState.ARMED)
 
     def close(self) -> None:
-        """Leaves the recording open: it is its owner's."""
-        self._condition = Condition(DeviceState.IDLE)
+        """Stop. The recording stays open; its owner closes it."""
+        self._device_status = DeviceStatus(DeviceState.IDLE)
 
     def read_into(self, view: NDArray[np.uint8]) -> Chunk | Gap | End | None:
         """See `Source.read_into`; a chunk ends where a repeat or the recording's next gap begins."""
         if self._next == self.frames:
-            self._condition = Condition(DeviceState.IDLE, "the recording is at its end")
+            self._device_status = DeviceStatus(DeviceState.IDLE, "the recording has ended")
             return End(self.frames, EndReason.FINISHED)
         position = self._next % self._length
         piece = self._pieces[bisect_right(self._pieces, position, key=lambda piece: piece.start) - 1]
@@ -92,7 +122,7 @@ class ReplaySource:
             return None
         first = self._next
         self._next += count
-        self._condition = Condition(DeviceState.STREAMING)
+        self._device_status = DeviceStatus(DeviceState.STREAMING)
         if piece.cause:
             return Gap(first, count, piece.cause)
         view[:count] = self._recording.compact(piece.stored + skip, count)
@@ -101,19 +131,19 @@ class ReplaySource:
 
 @dataclass(frozen=True)
 class _Piece:
-    """Frames of the capture that lie together in the file, or were lost together."""
+    """Consecutive frames of the range that are all stored, or all lost for the same cause."""
 
     start: int
-    """Index of the first, counted from the range's first frame."""
+    """Index of the first frame, counted from the start of the range."""
     count: int
     stored: int
-    """Which frame of the file the first one is, or would be."""
-    cause: Cause | None = None
-    """Why they were lost, None if they were not."""
+    """Index in the file of the first frame; of a loss, of the frame after it."""
+    cause: LossCause | None = None
+    """Cause of the loss; None for stored frames."""
 
 
 def _pieces(recording: Recording, first: int, stop: int) -> list[_Piece]:
-    """The range in order; gaps at its ends belong to it only where they are at the ends of the recording."""
+    """Pieces of the range in order. A gap at an end of the range belongs to it only at an end of the recording."""
     pieces: list[_Piece] = []
     start, stored, lost_before = 0, first, 0
     for gap in sorted(recording.gaps, key=lambda gap: gap.first):
@@ -131,9 +161,32 @@ def _pieces(recording: Recording, first: int, stop: int) -> list[_Piece]:
     return pieces
 
 
-def _cause(recording: Recording, text: str) -> Cause:
+def _cause(recording: Recording, text: str) -> LossCause:
     try:
-        return Cause(text)
+        return LossCause(text)
     except ValueError as error:
-        known = ", ".join(Cause)
-        raise SourceError(f"the sidecar of {recording.path} has a gap by {text!r}; causes are {known}") from error
+        known = ", ".join(LossCause)
+        raise SourceError(f"the sidecar of {recording.path} has a gap of cause {text!r}; causes are {known}") from error
+
+
+def _open(spec: SourceSpec, options: ReplayOptions, warn: Warn | None) -> ReplaySource:
+    geometry = RecordingGeometry(options.width, options.height, options.rate)
+    recording = open_recording(path_of(spec, KIND.usage), **geometry.stated())
+    first, stop = options.range
+    return ReplaySource(recording, pace=options.pace, repeat=options.repeat, first=first or 0, stop=stop)
+
+
+def _describe(spec: SourceSpec) -> Device:
+    return Device(spec.text, KIND.name, "configured with --device")
+
+
+KIND = SourceKind(
+    name="replay",
+    usage="replay:FILE",
+    summary="a recording, replayed as a camera",
+    options=ReplayOptions,
+    open=_open,
+    describe=_describe,
+    can_block=True,
+    takes_path=True,
+)

@@ -4,20 +4,44 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from spiked.errors import SourceError
-from spiked.ring import Condition, DeviceState, End, EndReason, Gap
+from spiked.ring import DeviceState, DeviceStatus, End, EndReason, Gap
 from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
 from spiked.simulate.camera import DEFAULT_FOV_DEG
-from spiked_driver.source import Chunk, Pacer
+from spiked_driver.source import Chunk, Pacer, former_source_names
+from spiked_driver.source_kind import Device, PacedOptions, Rate, Side, SourceKind, SourceSpec, Warn
 
 
+class SimulationOptions(PacedOptions):
+    """Options of `sim:`."""
+
+    seed: int = Field(0, ge=0, lt=1 << 32)
+    """The same seed gives the same frames."""
+    seconds: float | None = Field(None, gt=0, le=1e7)
+    """Length in seconds; without it the simulation does not end."""
+    width: Side = 320
+    """Pixels in a row."""
+    height: Side = 180
+    """Rows."""
+    rate: Rate = 20_000.0
+    """Frames per second."""
+    motion: MotionKind = MotionKind.HAND_SHAKE
+    """Path of the camera."""
+    flow_px: float = Field(0.12, ge=1e-4, le=8)
+    """Mean image motion per frame in pixels."""
+    threads: int = Field(1, ge=1, le=64)
+    """Threads of the simulation. The frames do not depend on it."""
+
+
+@former_source_names
 class SimulatedSource:
     """A hand-held camera in a procedural room; the same seed gives the same frames.
 
-    `flow_px` is the mean image motion a frame. `frames` bounds the capture, None: no end. `pace` is a factor of the
-    sensor's rate; a machine that cannot simulate so fast delivers later, never less. With 0 frames come as fast as
+    `flow_px` is the mean image motion in pixels per frame. `frames` is the length of the capture; None: no end. `pace`
+    is a factor of the sensor's rate; a slow machine delivers late and loses nothing. With 0, frames come as fast as
     lossless consumers take them.
     """
 
@@ -43,54 +67,89 @@ class SimulatedSource:
         self._camera: SimulatedCamera | None = None
         self._pacer = Pacer(sensor.frame_rate_hz, pace)
         self._next = 0
-        self._condition = Condition(DeviceState.IDLE)
+        self._device_status = DeviceStatus(DeviceState.IDLE)
 
     @property
     def sensor(self) -> Sensor:
-        """As given, with compact frames and the intrinsics it is drawn with."""
+        """The sensor as passed, with compact frames and the intrinsics of the rendering."""
         return self._sensor
 
     @property
     def frames(self) -> int | None:
-        """As given."""
+        """Number of frames of the capture; None: no end."""
         return self._frames
 
     @property
-    def waits(self) -> bool:
-        """Only without a pace: a paced simulation behaves like the camera, which never waits."""
+    def can_block(self) -> bool:
+        """Without a pace only: a paced simulation behaves like a camera, which does not wait."""
         return self._pace == 0
 
     @property
-    def condition(self) -> Condition:
+    def device_status(self) -> DeviceStatus:
         """Armed once open, streaming from the first frame, idle after the last."""
-        return self._condition
+        return self._device_status
 
     def open(self) -> None:
-        """Build the scene, which takes a moment, and start again at frame 0."""
+        """Build the scene and start at frame 0."""
         self._camera = SimulatedCamera(
             self._sensor, self._seed, self._motion, flow_px=self._flow_px, threads=self._threads
         )
         self._pacer = Pacer(self._sensor.frame_rate_hz, self._pace)
         self._next = 0
-        self._condition = Condition(DeviceState.ARMED)
+        self._device_status = DeviceStatus(DeviceState.ARMED)
 
     def close(self) -> None:
-        """Let go of the scene."""
+        """Free the scene."""
         self._camera = None
-        self._condition = Condition(DeviceState.IDLE)
+        self._device_status = DeviceStatus(DeviceState.IDLE)
 
     def read_into(self, view: NDArray[np.uint8]) -> Chunk | Gap | End | None:
         """See `Source.read_into`."""
         if self._camera is None:
             raise SourceError("the simulated camera is not open: open it before reading")
         if self._next == self._frames:
-            self._condition = Condition(DeviceState.IDLE, "the simulation is at its end")
+            self._device_status = DeviceStatus(DeviceState.IDLE, "the simulation has ended")
             return End(self._next, EndReason.FINISHED)
         count = len(view) if self._frames is None else min(len(view), self._frames - self._next)
         if not self._pacer.wait_for(self._next + count):
             return None
-        self._condition = Condition(DeviceState.STREAMING)
+        self._device_status = DeviceStatus(DeviceState.STREAMING)
         view[:count] = self._camera.next_frames(count)
         chunk = Chunk(self._next, count)
         self._next += count
         return chunk
+
+
+def _open(spec: SourceSpec, options: SimulationOptions, warn: Warn | None) -> SimulatedSource:
+    if spec.target:
+        raise SourceError(f"source {spec.text!r}: sim: takes options only, as in sim:?seed=1")
+    return SimulatedSource(
+        Sensor(options.width, options.height, options.rate),
+        seed=options.seed,
+        motion=options.motion,
+        flow_px=options.flow_px,
+        frames=None if options.seconds is None else round(options.seconds * options.rate),
+        pace=options.pace,
+        threads=options.threads,
+    )
+
+
+def _describe(spec: SourceSpec) -> Device:
+    return Device(spec.text, KIND.name, "configured with --device")
+
+
+def _find() -> list[Device]:
+    room = "simulated hand-held camera in a built-in room; options seed, seconds, width, height"
+    return [Device(KIND.usage, KIND.name, room)]
+
+
+KIND = SourceKind(
+    name="sim",
+    usage="sim:",
+    summary="a simulated hand-held camera in a built-in room",
+    options=SimulationOptions,
+    open=_open,
+    describe=_describe,
+    find=_find,
+    can_block=True,
+)

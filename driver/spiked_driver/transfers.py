@@ -1,7 +1,7 @@
-"""Reads that stay queued at the camera: asynchronous libusb, or pyusb's synchronous reads where that cannot be.
+"""Bulk reads of the camera's stream: queued by asynchronous libusb, or one at a time by pyusb as a fallback.
 
-The bytes lie where the kernel put them until `release`: framing reads them there and writes compact frames into the
-ring, which is the one copy that this side of the kernel makes.
+The bytes stay in the transfer's buffer until `release`. Framing reads them there and writes compact frames into the
+ring: one copy in user space.
 """
 
 import array
@@ -12,7 +12,7 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from enum import StrEnum
-from itertools import count
+from itertools import count, islice
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -24,70 +24,74 @@ from spiked_driver.libusb import Callback, OutOfUsbMemoryError, Status, Transfer
 from spiked_driver.usb_budget import MIN_TRANSFERS, TransferPlan
 
 
-class Trouble(StrEnum):
-    """What befell a read."""
+class TransferError(StrEnum):
+    """How a transfer failed."""
 
     STALLED = "the endpoint stalled"
-    BABBLE = "the camera sent more than it was asked for"
+    BABBLE = "the camera sent more than was requested"
     FAILED = "a transfer failed"
     GONE = "the camera is gone"
 
 
-_TROUBLES = {
-    Status.ERROR: Trouble.FAILED,
-    Status.STALL: Trouble.STALLED,
-    Status.NO_DEVICE: Trouble.GONE,
-    Status.OVERFLOW: Trouble.BABBLE,
+_ERRORS = {
+    Status.ERROR: TransferError.FAILED,
+    Status.STALL: TransferError.STALLED,
+    Status.NO_DEVICE: TransferError.GONE,
+    Status.OVERFLOW: TransferError.BABBLE,
 }
-"""The others, cancelled and timed out, are no trouble: what they brought are bytes like others."""
-_BY_NUMBER = {errno.EPIPE: Trouble.STALLED, errno.EOVERFLOW: Trouble.BABBLE, errno.ENODEV: Trouble.GONE}
-_SYNC_WAIT_MS = 100
+"""Cancelled and timed-out transfers are no errors: their bytes are used like all others."""
+_BY_NUMBER = {
+    errno.EPIPE: TransferError.STALLED,
+    errno.EOVERFLOW: TransferError.BABBLE,
+    errno.ENODEV: TransferError.GONE,
+}
+_REQUEST_TIMEOUT_MS = 100
 
 
 @dataclass(frozen=True)
-class Arrival:
-    """The end of one read: bytes, trouble, or both, the bytes first."""
+class CompletedTransfer:
+    """A completed read: bytes, an error, or both, the bytes first."""
 
     data: NDArray[np.uint8]
     """uint8 [n], valid until `release`."""
-    trouble: Trouble | None = None
+    error: TransferError | None = None
 
 
-class Reads(Protocol):
-    """The camera's stream, read in transfers. Used by one thread."""
+class BulkReader(Protocol):
+    """Reads the camera's stream in transfers. Used by one thread."""
 
     @property
     def in_flight_bytes(self) -> int:
-        """What the camera may send without our doing anything."""
+        """Bytes of all reads: what the camera can send while the host is busy."""
         ...
 
-    def ran_dry(self) -> int | None:
-        """If the camera had nothing to write into at the last `release`: bytes that waited for `next`; else None."""
+    def underrun_bytes(self) -> int | None:
+        """If no read was queued at the last `release`: bytes that were complete and not taken then. Else None."""
         ...
 
     def start(self) -> None:
         """Queue all reads. Raises usb.core.USBError, or OutOfUsbMemoryError where too few fit."""
         ...
 
-    def next(self, timeout_s: float) -> Arrival | None:
-        """What came next, in the camera's order; None after the timeout, or if nothing is queued."""
+    def next(self, timeout_s: float) -> CompletedTransfer | None:
+        """The next completed transfer, in the camera's order; None after the timeout, or if no read is queued."""
         ...
 
     def release(self) -> None:
-        """The data of the last arrival is not needed any more; its buffer is queued again, unless reading stopped."""
+        """Queue the buffer of the last transfer again, unless reading has stopped. Its data is invalid from now on."""
         ...
 
     def stop(self, timeout_s: float) -> bool:
-        """Cancel what is queued; false if that took too long. What had come before is still to be had by `next`."""
+        """Cancel all queued reads; false if some do not end in time. `next` still returns those that have completed."""
         ...
 
     def close(self) -> bool:
-        """Let go of the transfers; false if some are still in flight, whose memory and device must then stay."""
+        """Free the transfers; false if some are still in flight: their memory and the open device must then stay."""
         ...
 
 
 class Buffers:
-    """Memory for the transfers of a plan: made once, kept over unplugging, its pages present from the start."""
+    """Memory for the transfers of a plan. Allocated once, kept over unplugging, all pages present from the start."""
 
     def __init__(self, plan: TransferPlan) -> None:
         self.plan = plan
@@ -118,43 +122,43 @@ class _Request:
 _One = TypeVar("_One", _Read, _Request)
 
 _abandoned: list[object] = []
-"""Transfers that did not end: the kernel may still write into them, so nothing of theirs is ever freed."""
+"""Readers whose transfers did not end. The kernel may still write into their memory, so it is never freed."""
 
 
-class AsynchronousReads:
-    """As many reads in flight as the plan says, each asked for by a request of its own."""
+class AsynchronousBulkReader:
+    """Keeps the reads of a plan in flight; a request of its own precedes each read."""
 
     def __init__(self, context: UsbContext, buffers: Buffers) -> None:
         self._context = context
         self._buffers = buffers
-        self._callback = Callback(self._ended)
+        self._callback = Callback(self._completed)
         self._by_address: dict[int, _Read | _Request] = {}
         self._reads = [self._new_read(row) for row in buffers.rows]
         self._free_requests: list[_Request] = []
         self._requests = count()
         self._queue: deque[_Read] = deque()
-        self._put_off: list[_Read] = []
+        self._unsubmitted: list[_Read] = []
         self._current: _Read | None = None
         self._in_flight = 0
-        self._endings = 0
-        self._dry: int | None = None
+        self._completions = 0
+        self._underrun: int | None = None
         self._running = False
-        self._request_trouble: Trouble | None = None
+        self._request_error: TransferError | None = None
 
     @property
     def in_flight_bytes(self) -> int:
-        """See `Reads`."""
+        """See `BulkReader`."""
         return len(self._reads) * self._buffers.plan.transfer_bytes
 
-    def ran_dry(self) -> int | None:
-        """See `Reads`."""
-        return self._dry
+    def underrun_bytes(self) -> int | None:
+        """See `BulkReader`."""
+        return self._underrun
 
     def start(self) -> None:
-        """See `Reads`; where the kernel takes at least a few transfers, those are what is used."""
+        """See `BulkReader`. If the kernel takes fewer transfers than planned, but MIN_TRANSFERS, those are used."""
         self._running = True
-        self._request_trouble = None
-        self._put_off.clear()
+        self._request_error = None
+        self._unsubmitted.clear()
         for number, read in enumerate(self._reads):
             try:
                 self._submit(read)
@@ -162,45 +166,50 @@ class AsynchronousReads:
                 if number < MIN_TRANSFERS:
                     raise
                 for surplus in self._reads[number:]:
-                    self._forget(surplus)
+                    self._free(surplus)
                 del self._reads[number:]
                 break
 
-    def next(self, timeout_s: float) -> Arrival | None:
-        """See `Reads`."""
+    def next(self, timeout_s: float) -> CompletedTransfer | None:
+        """See `BulkReader`."""
         if not self._queue:
             return None
         self._wait(timeout_s)
         if self._queue[0].pending:
-            trouble, self._request_trouble = self._request_trouble, None
-            return Arrival(self._queue[0].buffer[:0], trouble) if trouble else None
+            error, self._request_error = self._request_error, None
+            return CompletedTransfer(self._queue[0].buffer[:0], error) if error else None
         read = self._current = self._queue.popleft()
         status = Status(read.transfer.status)
-        return Arrival(read.buffer[: read.transfer.actual_length], _TROUBLES.get(status))
+        return CompletedTransfer(read.buffer[: read.transfer.actual_length], _ERRORS.get(status))
 
     def release(self) -> None:
-        """See `Reads`. Raises usb.core.USBError, or OutOfUsbMemoryError if nothing can be queued any more."""
+        """See `BulkReader`. Raises usb.core.USBError, or OutOfUsbMemoryError if no read can be queued any more."""
         read, self._current = self._current, None
-        self._dry = None
+        self._underrun = None
         if read is None or not self._running:
             return
         self._reap()
         if not self._in_flight:
-            self._dry = sum(ended.transfer.actual_length for ended in self._queue)
-        self._put_off.append(read)
+            self._underrun = self._completed_bytes(len(self._queue))
+        self._unsubmitted.append(read)
+        queued = len(self._queue)
         try:
-            while self._put_off:
-                self._submit(self._put_off[-1])
-                self._put_off.pop()
+            while self._unsubmitted:
+                self._submit(self._unsubmitted[-1])
+                self._unsubmitted.pop()
         except OutOfUsbMemoryError:
             if not self._queue:
                 raise
+        self._reap()
+        # All earlier reads may have completed before the new ones were queued. Bytes of the new ones came after that.
+        if self._underrun is None and self._in_flight <= len(self._queue) - queued and queued:
+            self._underrun = self._completed_bytes(queued)
 
     def stop(self, timeout_s: float) -> bool:
-        """See `Reads`."""
+        """See `BulkReader`."""
         self._running = False
         pending = [one for one in self._by_address.values() if one.pending]
-        # Backwards, so that none is cancelled while a later one already takes its place at the camera.
+        # Last first: otherwise the camera fills a later read after an earlier one is cancelled, and bytes are lost.
         for one in reversed(pending):
             self._context.cancel(one.transfer)
         deadline = time.monotonic() + timeout_s
@@ -212,38 +221,42 @@ class AsynchronousReads:
         return True
 
     def close(self) -> bool:
-        """See `Reads`."""
+        """See `BulkReader`."""
         if any(one.pending for one in self._by_address.values()):
             _abandoned.append(self)
             return False
         for one in list(self._by_address.values()):
-            self._forget(one)
+            self._free(one)
         self._reads.clear()
         self._free_requests.clear()
         self._queue.clear()
         return True
 
+    def _completed_bytes(self, count: int) -> int:
+        """Bytes of those of the oldest `count` reads that have completed."""
+        return sum(read.transfer.actual_length for read in islice(self._queue, count) if not read.pending)
+
     def _new_read(self, buffer: NDArray[np.uint8]) -> _Read:
         transfer = self._context.allocate(DATA_IN, buffer.ctypes.data, buffer.size, self._callback)
-        return self._keep(_Read(buffer, transfer))
+        return self._register(_Read(buffer, transfer))
 
     def _new_request(self) -> _Request:
         request = _Request()
         request.transfer = self._context.allocate(
             SESSION_OUT, ctypes.addressof(request.bytes), READ_REQUEST_BYTES, self._callback
         )
-        return self._keep(request)
+        return self._register(request)
 
-    def _keep(self, one: _One) -> _One:
+    def _register(self, one: _One) -> _One:
         self._by_address[ctypes.addressof(one.transfer)] = one
         return one
 
-    def _forget(self, one: _Read | _Request) -> None:
+    def _free(self, one: _Read | _Request) -> None:
         del self._by_address[ctypes.addressof(one.transfer)]
         self._context.free(one.transfer)
 
     def _submit(self, read: _Read) -> None:
-        """Ask for the data first: the camera then has it when the read comes."""
+        """Send the request before the read, so that the bridge has the data when the read arrives."""
         request = self._free_requests.pop() if self._free_requests else self._new_request()
         request.bytes.raw = read_request(next(self._requests), read.buffer.size)
         try:
@@ -264,91 +277,92 @@ class AsynchronousReads:
             raise
 
     def _wait(self, timeout_s: float) -> None:
-        """Until the oldest read has ended."""
+        """Wait until the oldest read has completed."""
         deadline = time.monotonic() + timeout_s
-        while self._queue[0].pending and self._request_trouble is None:
+        while self._queue[0].pending and self._request_error is None:
             remaining_s = deadline - time.monotonic()
+            # At least once: the process may have been suspended since the deadline was set.
+            self._context.handle_events(max(0.0, remaining_s))
             if remaining_s <= 0:
                 return
-            self._context.handle_events(remaining_s)
 
     def _reap(self) -> None:
-        """Hear of all that has ended; libusb looks at no more than a few at a time."""
-        seen = -1
-        while seen != self._endings:
-            seen = self._endings
+        """Handle all completed transfers; libusb handles a limited number in one call."""
+        handled = -1
+        while handled != self._completions:
+            handled = self._completions
             self._context.handle_events(0)
 
-    def _ended(self, address: int) -> None:
-        """Called by libusb: nothing here may raise, or take long."""
+    def _completed(self, address: int) -> None:
+        """Callback of libusb: must not raise, and must return soon."""
         one = self._by_address[address]
         one.pending = False
-        self._endings += 1
+        self._completions += 1
         if isinstance(one, _Request):
             self._free_requests.append(one)
             if one.transfer.status != Status.COMPLETED and self._running:
-                self._request_trouble = _TROUBLES.get(Status(one.transfer.status), Trouble.FAILED)
+                self._request_error = _ERRORS.get(Status(one.transfer.status), TransferError.FAILED)
         else:
             self._in_flight -= 1
 
 
-class SynchronousReads:
-    """One read at a time by pyusb alone: what the host hides is next to nothing, since nothing is queued in between."""
+class SynchronousBulkReader:
+    """One read at a time by pyusb. Nothing is queued between two reads, so any delay of the host loses frames."""
 
     def __init__(self, device: usb.core.Device, plan: TransferPlan) -> None:
         self._device = device
         self._buffer = array.array("B", bytes(plan.transfer_bytes))
         self._view = np.frombuffer(self._buffer, np.uint8)
         self._requests = count()
-        self._asked = 0
+        self._requested_bytes = 0
         self._running = False
 
     @property
     def in_flight_bytes(self) -> int:
-        """See `Reads`."""
+        """See `BulkReader`."""
         return len(self._buffer)
 
-    def ran_dry(self) -> int | None:
-        """See `Reads`; always, between two reads."""
+    def underrun_bytes(self) -> int | None:
+        """See `BulkReader`. No read is ever queued between two reads."""
         return 0
 
     def start(self) -> None:
-        """See `Reads`."""
-        self._asked = 0
+        """See `BulkReader`."""
+        self._requested_bytes = 0
         self._running = True
 
-    def next(self, timeout_s: float) -> Arrival | None:
-        """See `Reads`."""
+    def next(self, timeout_s: float) -> CompletedTransfer | None:
+        """See `BulkReader`."""
         if not self._running:
             return None
         try:
-            if not self._asked:
+            if not self._requested_bytes:
                 request = read_request(next(self._requests), self._view.size)
-                self._device.write(SESSION_OUT, request, _SYNC_WAIT_MS)
-                self._asked = self._view.size
+                self._device.write(SESSION_OUT, request, _REQUEST_TIMEOUT_MS)
+                self._requested_bytes = self._view.size
             timeout_ms = max(1, round(1e3 * timeout_s))
             size = self._device.read(DATA_IN, self._buffer, timeout_ms)
         except usb.core.USBTimeoutError:
-            return None  # without a byte: the request stays open
+            return None  # no byte came, so the request remains valid
         except usb.core.USBError as error:
-            self._asked = 0
-            return Arrival(self._view[:0], trouble_of(error))
-        self._asked = 0
-        return Arrival(self._view[:size])
+            self._requested_bytes = 0
+            return CompletedTransfer(self._view[:0], transfer_error_of(error))
+        self._requested_bytes = 0
+        return CompletedTransfer(self._view[:size])
 
     def release(self) -> None:
-        """See `Reads`."""
+        """See `BulkReader`."""
 
     def stop(self, timeout_s: float) -> bool:
-        """See `Reads`."""
+        """See `BulkReader`."""
         self._running = False
         return True
 
     def close(self) -> bool:
-        """See `Reads`."""
+        """See `BulkReader`."""
         return True
 
 
-def trouble_of(error: usb.core.USBError) -> Trouble:
-    """What a failed call of pyusb means. Unplugging has many error numbers; whether it is that, the bus must tell."""
-    return _BY_NUMBER.get(error.errno or 0, Trouble.FAILED)
+def transfer_error_of(error: usb.core.USBError) -> TransferError:
+    """Class of a failed call of pyusb. Unplugging has several error numbers; sysfs shows whether the camera is gone."""
+    return _BY_NUMBER.get(error.errno or 0, TransferError.FAILED)

@@ -1,4 +1,4 @@
-"""How many bytes to keep in flight, and whether the kernel lets us."""
+"""Number of queued transfers for a given buffer time, within the kernel's memory limit."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,39 +7,41 @@ from spiked.errors import SourceError
 
 LIMIT_FILE = Path("/sys/module/usbcore/parameters/usbfs_memory_mb")
 TRANSFER_BYTES = 1 << 20
+"""Default size of a bulk transfer."""
 MIN_TRANSFERS = 4
-"""With fewer the camera has at times nothing to write into, however fast the host is."""
-HIDE_S = 0.25
-"""How long the host may be busy otherwise, by default, before the camera drops frames."""
+"""Least number of transfers: with fewer the camera at times has none to write into, even on a fast host."""
+BUFFER_S = 0.25
+"""Default time that the host may be busy before the camera drops frames, seconds."""
 _OVERHEAD = 512
-"""The kernel's bookkeeping for each piece of 16 KiB of a transfer, at most; it counts against the limit."""
+"""Upper bound of the kernel's own memory for each 16 KiB of a transfer, bytes; it counts against the limit."""
 _PIECE_BYTES = 16 << 10
+"""Size of usbfs's scatter-gather buffers (drivers/usb/core/devio.c)."""
 
 
 @dataclass(frozen=True)
 class TransferPlan:
-    """Transfers that are queued at the camera at any time."""
+    """Transfers that are kept queued at the camera."""
 
     count: int
     transfer_bytes: int
     rate_bytes: float
-    """What the camera sends in a second."""
+    """Bytes a second that the camera sends."""
     note: str | None = None
-    """Why it is less than was wanted, and how to get more."""
+    """Why it is less than wanted, and how to get more; None if it is not."""
 
     @property
     def in_flight_bytes(self) -> int:
-        """All of them together."""
+        """Bytes of all transfers."""
         return self.count * self.transfer_bytes
 
     @property
-    def hides_s(self) -> float:
-        """How long the host may not look without losing a frame."""
+    def buffered_s(self) -> float:
+        """Seconds that the host may be busy without losing a frame."""
         return self.in_flight_bytes / self.rate_bytes
 
 
 def usbfs_limit() -> int | None:
-    """Bytes that all USB transfers of all processes may have in flight; None if there is no limit, or none to read."""
+    """Limit of the bytes in flight of all processes' USB transfers; None if there is none or it cannot be read."""
     try:
         megabytes = int(LIMIT_FILE.read_text())
     except (OSError, ValueError):
@@ -48,13 +50,13 @@ def usbfs_limit() -> int | None:
 
 
 def kernel_bytes(count: int, transfer_bytes: int) -> int:
-    """What the kernel counts for so many transfers, from above."""
+    """Upper bound of the memory that the kernel counts for `count` transfers."""
     return count * (transfer_bytes + _OVERHEAD * -(-transfer_bytes // _PIECE_BYTES))
 
 
 def how_to_raise(needed_bytes: int) -> str:
-    """What to type so that so many bytes fit."""
-    # Twice as much: the limit is for all cameras and programs together.
+    """The commands that raise the limit for `needed_bytes`."""
+    # Twice as much: all cameras and programs share the limit.
     megabytes = max(64, 1 << (2 * needed_bytes - 1 >> 20).bit_length())
     return (
         f"raise it with `echo {megabytes} | sudo tee {LIMIT_FILE}`, "
@@ -66,15 +68,15 @@ def plan_transfers(
     rate_bytes: float,
     limit_bytes: int | None,
     *,
-    hide_s: float | None = None,
+    buffer_s: float | None = None,
     transfer_bytes: int = TRANSFER_BYTES,
 ) -> TransferPlan:
-    """Enough transfers to hide `hide_s` (default HIDE_S) of a busy host at that rate.
+    """Transfers that buffer `buffer_s` (default BUFFER_S) at `rate_bytes` bytes a second.
 
-    What was asked for and does not fit into `limit_bytes` is refused with a SourceError; the default shrinks to what
-    fits, with a note.
+    Without `buffer_s`, the plan shrinks to `limit_bytes` and has a note. Raises SourceError if a stated `buffer_s` does
+    not fit, or fewer than MIN_TRANSFERS do.
     """
-    wanted = max(MIN_TRANSFERS, -(-round(rate_bytes * (hide_s or HIDE_S)) // transfer_bytes))
+    wanted = max(MIN_TRANSFERS, -(-round(rate_bytes * (buffer_s or BUFFER_S)) // transfer_bytes))
     needed = kernel_bytes(wanted, transfer_bytes)
     if limit_bytes is None or needed <= limit_bytes:
         return TransferPlan(wanted, transfer_bytes, rate_bytes)
@@ -85,6 +87,6 @@ def plan_transfers(
     )
     hides_ms = 1e3 * fits * transfer_bytes / rate_bytes
     most = f"{fits} transfers of {transfer_bytes >> 10} KiB fit, which hide {hides_ms:.0f} ms"
-    if hide_s is not None or fits < MIN_TRANSFERS:
-        raise SourceError(f"{what}; {most}: ask for less, or {how_to_raise(needed)}")
+    if buffer_s is not None or fits < MIN_TRANSFERS:
+        raise SourceError(f"{what}; {most}: request less, or {how_to_raise(needed)}")
     return TransferPlan(fits, transfer_bytes, rate_bytes, f"{what}; {most}; to get all, {how_to_raise(needed)}")

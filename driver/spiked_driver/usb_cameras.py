@@ -1,6 +1,6 @@
-"""Which USB cameras there are, which one is meant, and whether it can be used: read from sysfs, opening nothing.
+"""Lists USB cameras, selects one, and checks whether it can be used. Reads sysfs and opens no device.
 
-sysfs shows a camera that this user may not open, and a camera on a slow port, with the serial number the kernel read.
+sysfs also shows cameras that this user may not open, and cameras on slow ports, with their serial numbers.
 """
 
 import os
@@ -14,20 +14,21 @@ from spiked_driver.ft60x import PRODUCTS, VENDOR_ID
 
 SYSFS = Path("/sys/bus/usb/devices")
 USB3_MBPS = 5000
+"""Least link speed of USB 3, Mbit/s."""
 UDEV_FILE = "/etc/udev/rules.d/70-spiked.rules"
 UDEV_RULES = "\n".join(
     f'SUBSYSTEM=="usb", ATTR{{idVendor}}=="{VENDOR_ID:04x}", ATTR{{idProduct}}=="{product:04x}", '
     'MODE="0660", GROUP="plugdev", TAG+="uaccess", ATTR{power/control}="on"'
     for product in PRODUCTS
 )
-"""For whoever sits at the machine, for the group plugdev (a daemon's user), and never put to sleep."""
+"""Access for the user at the machine (uaccess) and the group plugdev (a daemon's user); no power saving."""
 
 _PORT = re.compile(r"\d+-\d+(\.\d+)*")
 _SPEEDS = {1.5: "USB 1, 1.5 Mbit/s", 12: "USB 1, 12 Mbit/s", 480: "USB 2, 480 Mbit/s"}
 
 
 class NotUsableError(SourceError):
-    """The camera is there, and something keeps us from using it that the user can mend."""
+    """The camera is plugged in and cannot be used for a reason that the user can fix."""
 
 
 @dataclass(frozen=True)
@@ -35,13 +36,13 @@ class UsbCamera:
     """A camera that is plugged in."""
 
     port: str
-    """Bus and port path as the kernel writes it: `2-1.4` is port 4 of the hub in port 1 of bus 2."""
+    """Bus and port path in the kernel's notation: `2-1.4` is port 4 of the hub in port 1 of bus 2."""
     bus: int
     address: int
-    """Number on the bus; another one after each plugging in."""
+    """Number on the bus; changes each time that the camera is plugged in."""
     product_id: int
     serial: str | None
-    """Not unique: FTDI's factory serial is the same on many cameras."""
+    """Not unique: FTDI's factory serial number is the same on many cameras."""
     speed_mbps: float | None
     firmware: str | None
     """Release number in the bridge's descriptor, as `1.06`."""
@@ -53,12 +54,12 @@ class UsbCamera:
 
     @property
     def node(self) -> Path:
-        """The file by which it is opened."""
+        """Its device node."""
         return Path(f"/dev/bus/usb/{self.bus:03d}/{self.address:03d}")
 
     @property
     def speed(self) -> str:
-        """Speed of its link, for people."""
+        """Speed of its link, as shown to users."""
         if self.speed_mbps is None:
             return "unknown speed"
         if self.speed_mbps < USB3_MBPS:
@@ -66,7 +67,7 @@ class UsbCamera:
         return f"USB 3, {self.speed_mbps / 1000:g} Gbit/s"
 
     def speed_problem(self) -> str | None:
-        """Why its port is too slow, and what to do."""
+        """Why its port is too slow, and what to do; None if it is not."""
         if self.speed_mbps is None or self.speed_mbps >= USB3_MBPS:
             return None
         return (
@@ -75,7 +76,7 @@ class UsbCamera:
         )
 
     def permission_problem(self) -> str | None:
-        """Why this user may not open it, and the udev rule that helps."""
+        """Why this user may not open it, and the udev rule to add; None if it may be opened."""
         if os.access(self.node, os.R_OK | os.W_OK):
             return None
         return (
@@ -91,17 +92,17 @@ def _rule(product: int) -> str:
 
 
 def find_cameras() -> list[UsbCamera]:
-    """Every camera that is plugged in, by bus and port."""
+    """All cameras that are plugged in, ordered by bus and port."""
     try:
         folders = list(SYSFS.iterdir())
     except OSError:
-        return []  # no USB on this machine, or none that this container may see
+        return []  # no USB on this machine, or none visible in this container
     found = [camera for folder in folders if _PORT.fullmatch(folder.name) and (camera := _read(folder))]
     return sorted(found, key=lambda camera: [int(number) for number in re.findall(r"\d+", camera.port)])
 
 
 def _read(folder: Path) -> UsbCamera | None:
-    """None if it is no camera, or was unplugged meanwhile."""
+    """The camera of a sysfs folder; None if it is another device, or was unplugged meanwhile."""
     try:
         vendor, product = (int((folder / name).read_text(), 16) for name in ("idVendor", "idProduct"))
         if vendor != VENDOR_ID or product not in PRODUCTS:
@@ -130,7 +131,7 @@ def _optional(file: Path) -> str | None:
 
 @dataclass(frozen=True)
 class CameraChoice:
-    """Which camera is meant: one of `number` (in order of bus and port), `port` and `serial`."""
+    """The camera that a user names by one of `number` (in order of bus and port), `port` and `serial`."""
 
     number: int | None = None
     port: str | None = None
@@ -152,7 +153,7 @@ class CameraChoice:
         return f"usb{self.number}" if self.number is not None else f"usb:{self.port or self.serial}"
 
     def pick(self, cameras: Sequence[UsbCamera]) -> UsbCamera | None:
-        """The camera that is meant, None if it is not there. Raises NotUsableError if several have the serial."""
+        """The named camera; None if it is not plugged in. Raises NotUsableError if several have the serial number."""
         if self.number is not None:
             return cameras[self.number] if self.number < len(cameras) else None
         fitting = [camera for camera in cameras if self.serial in (None, camera.serial)]
@@ -166,13 +167,14 @@ class CameraChoice:
         return fitting[0] if fitting else None
 
     def find_again(self, cameras: Sequence[UsbCamera], lost: UsbCamera, others: Collection[str]) -> UsbCamera | None:
-        """A camera in use that went away, `others` being the ports of the cameras that were there beside it.
+        """The camera that replaces `lost`: one at the same port, else one with its serial number at a new port.
 
-        It is the one at the same port, else one with its serial number at a port where none was; never another camera
-        that was there all the time. A choice by port stays at that port.
+        `others` are the ports of the cameras that were plugged in beside it; those are never returned. A choice by port
+        keeps the port, a choice by serial number keeps the number.
         """
         for camera in cameras:
-            if camera.port == lost.port and camera.product_id == lost.product_id:
+            same_serial = self.serial in (None, camera.serial)
+            if camera.port == lost.port and camera.product_id == lost.product_id and same_serial:
                 return camera
         if self.port is not None:
             return None

@@ -1,4 +1,4 @@
-"""One opened camera: its interfaces claimed, its bridge's configuration read, its reads queued."""
+"""One open camera: claimed interfaces, the bridge's configuration, and the reader of its stream."""
 
 import errno
 import logging
@@ -21,22 +21,22 @@ from spiked_driver.ft60x import (
     ChipConfiguration,
 )
 from spiked_driver.libusb import NoContextError, UsbContext
-from spiked_driver.transfers import AsynchronousReads, Buffers, Reads, SynchronousReads
+from spiked_driver.transfers import AsynchronousBulkReader, Buffers, BulkReader, SynchronousBulkReader
 from spiked_driver.usb_cameras import NotUsableError, UsbCamera
 
 _log = logging.getLogger(__name__)
-_CONTROL_MS = 500
+_CONTROL_TIMEOUT_MS = 500
 
 
 class NotThereError(SourceError):
-    """The camera is not there, or does not answer: it may be back in a moment."""
+    """The camera is unplugged or does not answer; a later attempt may succeed."""
 
 
 class UsbSession:
-    """From opening to closing of one camera. Used by one thread."""
+    """A camera from opening to closing. Used by one thread."""
 
     def __init__(self, camera: UsbCamera, buffers: Buffers, *, asynchronous: bool = True) -> None:
-        """Opens it; nothing is read before `reads.start`. Raises NotUsableError or NotThereError."""
+        """Open the camera; `reader.start` starts reading. Raises NotUsableError or NotThereError."""
         self.camera = camera
         problem = camera.speed_problem() or camera.permission_problem()
         if problem:
@@ -48,41 +48,41 @@ class UsbSession:
         try:
             self._device = self._open()
             self.chip = self._read_configuration()
-            self.reads: Reads = (
-                AsynchronousReads(self._context, buffers)
+            self.reader: BulkReader = (
+                AsynchronousBulkReader(self._context, buffers)
                 if asynchronous
-                else SynchronousReads(self._device, buffers.plan)
+                else SynchronousBulkReader(self._device, buffers.plan)
             )
         except usb.core.USBError as error:
             self._context.close()
-            raise self._explained(error) from error
+            raise self._error_of(error) from error
         except BaseException:
             self._context.close()
             raise
 
     def rearm(self) -> None:
-        """After `reads.stop`: clear a stall of both endpoints and queue the reads again. Raises usb.core.USBError."""
+        """After `reader.stop`: clear a stall of both endpoints and queue the reads again. Raises usb.core.USBError."""
         self._device.clear_halt(DATA_IN)
         self._device.clear_halt(SESSION_OUT)
-        self.reads.start()
+        self.reader.start()
 
     def reset(self) -> None:
-        """Reset its port, after which it must be opened again."""
-        with suppress(usb.core.USBError):  # it may come back under another address: then this one is gone
+        """Reset the port. The camera must be opened again afterwards."""
+        with suppress(usb.core.USBError):  # the camera may get another address
             self._device.reset()
 
     def close(self, timeout_s: float) -> None:
-        """End all transfers and close; if some do not end in time, their memory and the open camera are left alone."""
-        ended = self.reads.stop(timeout_s)
-        if self.reads.close() and ended:
+        """End all transfers and close. If some do not end in time, their memory is kept and the camera stays open."""
+        ended = self.reader.stop(timeout_s)
+        if self.reader.close() and ended:
             self._context.close()
         else:
-            _log.warning("transfers of the camera at %s did not end: it stays open", self.camera.port)
+            _log.warning("transfers of the camera at %s did not end: the camera stays open", self.camera.port)
 
     def _open(self) -> usb.core.Device:
         device = self._context.find(self.camera)
         if device is None:
-            raise NotThereError(f"the camera at {self.camera.port} is gone")
+            raise NotThereError(f"the camera at {self.camera.port} is unplugged")
         for interface in (SESSION_INTERFACE, DATA_INTERFACE):
             with suppress(NotImplementedError):
                 if device.is_kernel_driver_active(interface):
@@ -91,21 +91,20 @@ class UsbSession:
         return device
 
     def _read_configuration(self) -> ChipConfiguration | None:
-        """None where the bridge does not answer as the FT601 is said to: reading works without."""
+        """None if the bridge does not answer as public drivers of the FT601 describe; reading works without it."""
         try:
-            answer = self._device.ctrl_transfer(
-                REQUEST_TYPE, REQUEST_CONFIGURATION, REQUEST_VALUE, REQUEST_INDEX, CONFIGURATION_BYTES, _CONTROL_MS
-            )
-            return ChipConfiguration.parse(bytes(answer))
+            return _request_configuration(self._device)
         except usb.core.USBError as error:
             if error.errno == errno.ENODEV:
                 raise
-            _log.warning("the bridge of the camera at %s does not tell its configuration: %s", self.camera.port, error)
+            _log.warning(
+                "the bridge of the camera at %s does not return its configuration: %s", self.camera.port, error
+            )
         except SourceError as error:
             _log.warning("%s", error)
         return None
 
-    def _explained(self, error: usb.core.USBError) -> SourceError:
+    def _error_of(self, error: usb.core.USBError) -> SourceError:
         where = f"the camera at {self.camera.port}"
         match error.errno:
             case errno.EACCES | errno.EPERM:
@@ -113,6 +112,28 @@ class UsbSession:
                     self.camera.permission_problem() or f"{where} may not be opened: {error.strerror}"
                 )
             case errno.EBUSY:
-                return NotUsableError(f"{where} is used by another program or capture: end that first")
+                return NotUsableError(f"{where} is used by another program or capture: end it first")
             case _:
                 return NotThereError(f"{where} cannot be opened: {error.strerror}")
+
+
+def bridge_configuration(camera: UsbCamera) -> ChipConfiguration:
+    """The configuration of a camera's bridge, also while the camera is being read. Raises SourceError."""
+    context = UsbContext()
+    try:
+        device = context.find(camera)
+        if device is None:
+            raise NotThereError(f"the camera at {camera.port} is unplugged")
+        return _request_configuration(device)
+    except usb.core.USBError as error:
+        raise SourceError(f"the bridge of the camera at {camera.port} does not answer: {error.strerror}") from error
+    finally:
+        context.close()
+
+
+def _request_configuration(device: usb.core.Device) -> ChipConfiguration:
+    """Raises USBError or SourceError."""
+    answer = device.ctrl_transfer(
+        REQUEST_TYPE, REQUEST_CONFIGURATION, REQUEST_VALUE, REQUEST_INDEX, CONFIGURATION_BYTES, _CONTROL_TIMEOUT_MS
+    )
+    return ChipConfiguration.parse(bytes(answer))

@@ -1,5 +1,10 @@
-"""`python -m spiked_service` is the command `spiked`."""
+"""`python -m spiked_service` is the command `spiked`, which imports nothing from the current folder either."""
 
-from spiked_service.cli import main
+import sys
+
+if not sys.flags.safe_path:
+    del sys.path[0]  # the current folder, which `python -m` adds
+
+from spiked_service.cli.main import main
 
 main()

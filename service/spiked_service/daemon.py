@@ -1,53 +1,72 @@
-"""The running service: its parts put together, its sockets, its signals, and its end."""
+"""The service process: puts the parts together, handles signals and shuts down.
+
+No other module constructs the parts, except for tools that need one of them without a service.
+"""
 
 import asyncio
-import os
 import signal
 import socket
-import ssl
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import uvicorn
 
 from spiked.errors import ConfigurationError, SpikedError
-from spiked_service.api.announce import BusAnnouncer
+from spiked.ring import clean_stale
 from spiked_service.api.app import create_app
+from spiked_service.api.auth.security import is_loopback
+from spiked_service.api.bus_notifier import BusNotifier
+from spiked_service.api.idempotency import IdempotencyKeys
+from spiked_service.api.listener import listen, server_config
+from spiked_service.api.results import Results
+from spiked_service.api.routes.devices import DeviceWatch
 from spiked_service.api.services import Services
-from spiked_service.commands.version import installed_version
-from spiked_service.config import Settings
-from spiked_service.events import Bus
-from spiked_service.health import Health, Pulse, failed
-from spiked_service.keeping import Keeping
-from spiked_service.live import LiveSettings
-from spiked_service.logs import configure_logs, logger, set_level
-from spiked_service.runtime import RuntimeFolder
-from spiked_service.security import is_loopback
-from spiked_service.store.folder import default_folder
-from spiked_service.systemd import Notifier
-from spiked_service.tokens import Tokens
-from spiked_service.zmq import ZmqServer
+from spiked_service.api.sources import Sources
+from spiked_service.api.zmq import Endpoints, ZmqServer
+from spiked_service.base.health import EventLoopHeartbeat, Health, failed
+from spiked_service.base.limits import ConcurrencyLimit
+from spiked_service.base.version import installed_version
+from spiked_service.captures.archive import DataStore
+from spiked_service.captures.captures import Captures
+from spiked_service.captures.reconcile import open_catalogue, reconcile
+from spiked_service.captures.recovery import Recovery
+from spiked_service.captures.uploads import Uploads
+from spiked_service.events.bus import Bus
+from spiked_service.events.logging import configure_logs, logger, set_level
+from spiked_service.operations.metrics import Metrics
+from spiked_service.operations.metrics_sources import metrics_source_of
+from spiked_service.operations.runtime_folder import RuntimeFolder
+from spiked_service.operations.systemd import SystemdNotifier
+from spiked_service.reconstructions.notifier import Notifier
+from spiked_service.reconstructions.queue import Reconstructions
+from spiked_service.reconstructions.queue_policy import QueuePolicy
+from spiked_service.reconstructions.repository import ReconstructionRepository
+from spiked_service.results.view_renderer import ViewRenderer
+from spiked_service.settings.reload import ReloadableSettings
+from spiked_service.settings.settings import Settings
+from spiked_service.settings.tokens import Tokens, token_of
+from spiked_service.store.folder import DataFolder, default_folder
+from spiked_service.store.retention import Retention
+from spiked_service.store.room import Room
 
 _log = logger("spiked.daemon")
-_CONNECTIONS = 1000
-"""More at a time are answered with 503 at once."""
-_GONE_MS = 60_000
-"""A connection whose other end takes nothing for this long is closed by the kernel."""
-_MESSAGE_BYTES = 65_536
 
 
 class Daemon:
-    """Everything but the command line. As a context manager it owns sockets, folders and workers."""
+    """The service without its command line. A context manager that owns sockets, folders and workers."""
 
-    def __init__(self, settings: LiveSettings) -> None:
-        """Raises ConfigurationError for what cannot be served."""
+    def __init__(self, settings: ReloadableSettings) -> None:
+        """Raises ConfigurationError for settings that cannot be used."""
         now = settings.now
-        tokens = Tokens(now.data or default_folder(), now.token.get_secret_value() if now.token else None)
+        tokens = Tokens(now.data or default_folder(), token_of(now))
         check_access(now, tokens)
-        self._notifier = Notifier()
-        self._listener = _listen(now.host, now.port)
+        self._systemd = SystemdNotifier()
+        self._listener = listen(now.host, now.port)
         with ExitStack() as ends:
             ends.callback(self._listener.close)
             self._folder = RuntimeFolder(now.runtime)
@@ -56,12 +75,12 @@ class Daemon:
             configure_logs(now.log_level, now.log_format, bus)
             settings.on_change(lambda changed: set_level(changed.log_level))
             health = Health()
-            self.pulse = Pulse()
-            health.add("event loop", self.pulse.check, life=True)
-            keeping = Keeping(now.data, BusAnnouncer(bus))
-            ends.callback(keeping.close)
-            health.add("catalogue", keeping.check_catalogue)
-            health.add("disk", keeping.check_disk)
+            self.heartbeat = EventLoopHeartbeat()
+            health.add("event loop", self.heartbeat.check, life=True)
+            data_store = open_data_store(now.data, BusNotifier(bus))
+            ends.callback(data_store.close)
+            health.add("catalogue", data_store.check_catalogue)
+            health.add("disk", data_store.check_disk)
             endpoints = None
             if now.zmq:
                 port = self.port + 1 if now.zmq_port is None and now.port else now.zmq_port or 0
@@ -69,38 +88,38 @@ class Daemon:
                 ends.callback(zmq.close)
                 health.add("zmq", zmq.check, life=True)
                 endpoints = zmq.endpoints
-            self.services = Services(settings, tokens, keeping, bus, health, zmq=endpoints)
-            self._config = self._server_config(now)
+            self.services = build_services(settings, tokens, data_store, bus, health, endpoints)
+            self._config = server_config(create_app(self.services), settings)
             self._ends = ends.pop_all()
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """TCP port that it listens on."""
         return int(self._listener.getsockname()[1])
 
     @property
     def address(self) -> str:
-        """For a browser on this machine."""
+        """URL for a browser on this machine."""
         now = self.services.settings.now
         name = f"[{now.host}]" if ":" in now.host else now.host
         return f"{'https' if now.tls_certificate else 'http'}://{name}:{self.port}/"
 
     def run(self) -> None:
-        """Serve until a signal says to end."""
-        _Server(self._config, self, self._notifier).run(sockets=[self._listener])
+        """Serve until SIGINT or SIGTERM."""
+        _Server(self._config, self, self._systemd).run(sockets=[self._listener])
 
     def reload(self) -> None:
-        """Take what has changed in file and environment; an error is told, and all stays as it was."""
-        self._notifier.reloading()
+        """Reload the settings. Errors are logged and change nothing."""
+        self._systemd.reloading()
         try:
             done = self.services.settings.reload()
             _log.info("settings reloaded", changed=done.changed, waiting=done.waiting)
         except SpikedError as error:
             _log.error("settings not reloaded", reason=str(error))
-        self._notifier.ready(f"serving at {self.address}")
+        self._systemd.ready(f"serving at {self.address}")
 
     def lives(self) -> bool:
-        """Whether the checks of life pass."""
+        """Whether the liveness checks pass."""
         return not failed(self.services.health.life())
 
     def __enter__(self) -> "Daemon":
@@ -109,64 +128,114 @@ class Daemon:
     def __exit__(self, *_: object) -> None:
         self._ends.close()
 
-    def _server_config(self, now: Settings) -> uvicorn.Config:
-        config = uvicorn.Config(
-            create_app(self.services),
-            log_config=None,
-            access_log=False,
-            lifespan="on",
-            timeout_graceful_shutdown=1,
-            limit_concurrency=_CONNECTIONS,
-            ws="websockets-sansio",
-            ws_max_size=_MESSAGE_BYTES,
-            ws_per_message_deflate=False,
-            server_header=False,
-            proxy_headers=False,
-        )
-        config.load()
-        if now.tls_certificate is not None:
-            config.ssl = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-            self.services.settings.on_change(lambda settings: _load_certificate(config.ssl, settings))
-        return config
+
+def open_data_store(data: Path | None, notifier: Notifier) -> DataStore:
+    """Open and reconcile the data folder, and start its maintenance. Raises ConfigurationError or StoreError."""
+    folder = DataFolder(data)
+    try:
+        folder.sweep()
+        clean_stale()
+        catalogue = open_catalogue(folder, notifier.log)
+        orphans = reconcile(folder, catalogue, notifier.log)
+    except BaseException:
+        folder.close()
+        raise
+    room = Room(folder, catalogue)
+    policy = QueuePolicy()
+    rows = ReconstructionRepository(folder, catalogue, notifier, policy)
+    reconstructions = Reconstructions(folder, catalogue, notifier, policy, rows)
+    captures = Captures(folder, catalogue, room, reconstructions, notifier)
+    retention = Retention(folder, catalogue, captures, lambda text: notifier.log("info", text))
+    recovery = Recovery(folder, catalogue, rows, notifier, orphans)
+    return DataStore(folder, catalogue, room, reconstructions, captures, retention, recovery, notifier)
+
+
+def build_services(
+    settings: ReloadableSettings,
+    tokens: Tokens,
+    data_store: DataStore,
+    bus: Bus,
+    health: Health,
+    zmq: Endpoints | None = None,
+) -> Services:
+    """The parts that the application uses, with the limits of the settings, now and after each reload."""
+    captures, reconstructions, folder = data_store.captures, data_store.reconstructions, data_store.folder
+    renders = ConcurrencyLimit("renders", 1)
+    trajectories = ConcurrencyLimit("trajectories", 1)
+    event_clients = ConcurrencyLimit("event clients", 1)
+    limits = {"renders": renders, "trajectories": trajectories, "event_clients": event_clients}
+    settings.on_change(lambda now: setattr(renders, "limit", now.limit_renders))
+    settings.on_change(lambda now: setattr(trajectories, "limit", now.limit_trajectories))
+    settings.on_change(lambda now: setattr(event_clients, "limit", now.limit_event_clients))
+    settings.on_change(data_store.configure)
+    sources = Sources(settings)
+    return Services(
+        settings=settings,
+        tokens=tokens,
+        bus=bus,
+        health=health,
+        metrics=Metrics(metrics_source_of(captures, reconstructions, folder.path), bus, health, limits),
+        folder=folder,
+        captures=captures,
+        reconstructions=reconstructions,
+        uploads=Uploads(folder, data_store.catalogue, data_store.room, lambda: settings.now.limit_upload_bytes),
+        results=Results(reconstructions.rows, captures, trajectories),
+        views=ViewRenderer(renders),
+        sources=sources,
+        device_watch=DeviceWatch(captures, sources, bus),
+        idempotency_keys=IdempotencyKeys(data_store.catalogue),
+        event_clients=event_clients,
+        zmq=zmq,
+    )
+
+
+def api_document() -> dict[str, Any]:
+    """The OpenAPI document of a service with default settings and an empty data folder."""
+    with tempfile.TemporaryDirectory(prefix="spiked-") as name, ExitStack() as ends:
+        bus, folder = Bus(), Path(name)
+        data_store = open_data_store(folder, BusNotifier(bus))
+        ends.callback(data_store.close)
+        services = build_services(ReloadableSettings(), Tokens(folder, None), data_store, bus, Health())
+        return create_app(services).openapi()
 
 
 class _Server(uvicorn.Server):
-    """Leaves with exit code 0 after SIGINT and SIGTERM: both are ways to end a daemon. SIGHUP reloads the settings."""
+    """Exits with code 0 after SIGINT and SIGTERM. SIGHUP reloads the settings."""
 
-    def __init__(self, config: uvicorn.Config, daemon: Daemon, notifier: Notifier) -> None:
+    def __init__(self, config: uvicorn.Config, daemon: Daemon, systemd: SystemdNotifier) -> None:
         super().__init__(config)
         self._daemon = daemon
-        self._notifier = notifier
+        self._systemd = systemd
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Tell systemd when requests are answered."""
+        """Notify systemd once requests are answered."""
         await super().startup(sockets)
         if self.started:
-            self._beating = asyncio.create_task(self._daemon.pulse.beat())
-            self._notifier.ready(f"serving at {self._daemon.address}")
+            self._beating = asyncio.create_task(self._daemon.heartbeat.beat())
+            self._systemd.ready(f"serving at {self._daemon.address}")
             _log.info("serving", address=self._daemon.address, version=installed_version())
-            self._notifier.watch(self._daemon.lives)
+            self._systemd.watch(self._daemon.lives)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """The workers learn of the end at once, not when the last response is sent.
+        """Dismiss the workers at once rather than after the last response.
 
-        On a thread: the signal may have come while this one held a lock of the log or of the events.
+        On a thread, because the signal may have interrupted code that holds a lock of the log or the bus.
         """
         threading.Thread(target=self._dismiss, args=(signal.Signals(sig).name,), name="dismissal").start()
         super().handle_exit(sig, frame)
 
     def _dismiss(self, name: str) -> None:
-        self._notifier.stopping()
+        self._systemd.stopping()
         _log.info("stopping", signal=name)
         self._daemon.services.captures.dismiss()
 
     def handle_reload(self, sig: int, frame: FrameType | None) -> None:
-        """On a thread: files are read."""
+        """Reload on a thread, because files are read."""
         threading.Thread(target=self._daemon.reload, name="reload").start()
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """As uvicorn does, but without dying of the signal afterwards, which would leave the runtime folder behind."""
+        """As in uvicorn, but without raising the signal again afterwards, which would skip the cleanup."""
         handlers = {
             signal.SIGINT: self.handle_exit,
             signal.SIGTERM: self.handle_exit,
@@ -181,35 +250,8 @@ class _Server(uvicorn.Server):
 
 
 def check_access(settings: Settings, tokens: Tokens) -> None:
-    """Raises ConfigurationError for an address that others can reach without a token."""
+    """Raises ConfigurationError if other hosts could connect without a token."""
     if (settings.require_token or not is_loopback(settings.host)) and not tokens.some():
         raise ConfigurationError(
             f"--host {settings.host} needs a token that requests must bring: make one with `spiked token create NAME`"
         )
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    """A listening socket, so that the address is known before anything is started. Raises ConfigurationError."""
-    try:
-        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        listener = socket.create_server((host, port), family=family)
-    except OSError as error:
-        why = str(error) if error.errno is None or error.errno < 0 else os.strerror(error.errno)
-        raise ConfigurationError(f"cannot listen at {host}:{port}: {why}; choose another --host or --port") from error
-    # A response is written as head and body: without this the body waits 40 ms for the head's acknowledgement. asyncio
-    # would say so too, but only of sockets that name TCP as their protocol.
-    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _GONE_MS)  # its connections inherit it
-    return listener
-
-
-def _load_certificate(context: ssl.SSLContext | None, settings: Settings) -> None:
-    """Used by connections made from now on."""
-    assert context is not None and settings.tls_certificate is not None
-    try:
-        context.load_cert_chain(settings.tls_certificate, settings.tls_key)
-    except OSError as error:  # ssl.SSLError is one
-        raise ConfigurationError(
-            f"cannot use {settings.tls_certificate} with {settings.tls_key}: {error}; both are PEM files that belong "
-            "together"
-        ) from error

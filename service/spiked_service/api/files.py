@@ -1,8 +1,9 @@
-"""Answers that are files or versions of something: validators, ranges."""
+"""Responses with validators and ranges."""
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from email.utils import formatdate
 from http import HTTPStatus
 from pathlib import Path
@@ -13,83 +14,114 @@ from fastapi.responses import StreamingResponse
 from spiked_service.api.problems import NotReadyError, problem
 
 _CHUNK_BYTES = 1 << 20
-_RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
+_RANGE = re.compile(r"bytes=([0-9]*)-([0-9]*)")
+_FAR = 10**18
+"""Larger than any file; longer numbers are not parsed."""
 _OCTETS = "application/octet-stream"
 
 
 def etag(*parts: object) -> str:
-    """A strong validator made of what the content depends on."""
+    """A strong validator from the values that the content depends on."""
     return '"' + "-".join(str(part) for part in parts) + '"'
 
 
 def stamp(path: Path) -> str:
-    """What changes when a file is replaced or written to. Raises NotReadyError when it is not there."""
+    """A validator from inode, size and time of a file. Raises NotReadyError if it does not exist."""
     stat = _stat(path)
     return f"{stat.st_size:x}-{stat.st_mtime_ns:x}"
 
 
 def unchanged(request: Request, tag: str) -> bool:
-    """Whether the client has it already, by If-None-Match."""
+    """Whether If-None-Match shows that the client has the content."""
     known = request.headers.get("if-none-match", "")
     return known.strip() == "*" or tag in [one.strip().removeprefix("W/") for one in known.split(",")]
 
 
 def not_modified(tag: str) -> Response:
-    """The answer then."""
+    """The 304 response."""
     return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=_validators(tag))
+
+
+def attached(tag: str, filename: str) -> dict[str, str]:
+    """Headers of a download."""
+    return {**_validators(tag), **_named(filename)}
 
 
 def content(
     request: Request, body: bytes, media_type: str, tag: str, filename: str | None = None, **headers: str
 ) -> Response:
-    """Bytes with a validator, or 304 if the client has them."""
+    """Response with bytes: all, the requested range, or 304."""
     if unchanged(request, tag):
         return not_modified(tag)
     named = {} if filename is None else _named(filename)
-    return Response(body, media_type=media_type, headers={**_validators(tag), **named, **headers})
+    return _part(request, len(body), {**_validators(tag), **named, **headers}, (tag,)).response(
+        lambda first, count: Response(body[first : first + count], media_type=media_type)
+    )
 
 
 def ranged(request: Request, path: Path, filename: str, media_type: str = _OCTETS, **headers: str) -> Response:
-    """A file, or the part of it that a Range header asks for, if If-Range allows (RFC 9110, 14).
-
-    One range at a time: a list of ranges, and what cannot be understood, gets the whole file. Raises NotReadyError when
-    the file is not there.
-    """
+    """Response with a file: all, the requested range, or 304. Raises NotReadyError if it does not exist."""
     stat = _stat(path)
-    tag, size = etag(stamp(path)), stat.st_size
+    tag = etag(stamp(path))
     if unchanged(request, tag):
         return not_modified(tag)
     modified = formatdate(stat.st_mtime, usegmt=True)
-    headers = {
-        **_validators(tag),
-        **_named(filename),
-        **headers,
-        "Last-Modified": modified,
-        "Accept-Ranges": "bytes",
-    }
-    first, last, status = 0, size - 1, HTTPStatus.OK
+    headers = {**_validators(tag), **_named(filename), **headers, "Last-Modified": modified}
+    return _part(request, stat.st_size, headers, (tag, modified)).response(
+        lambda first, count: StreamingResponse(_chunks(path, first, count), media_type=media_type)
+    )
+
+
+@dataclass(frozen=True)
+class _Part:
+    """The bytes of a response: all, a range, or none if the range is outside."""
+
+    first: int
+    count: int
+    status: HTTPStatus
+    headers: dict[str, str]
+    refused: Response | None = None
+
+    def response(self, made: Callable[[int, int], Response]) -> Response:
+        if self.refused is not None:
+            return self.refused
+        answer = made(self.first, self.count)
+        answer.status_code = self.status
+        answer.headers.update({**self.headers, "Accept-Ranges": "bytes", "Content-Length": str(self.count)})
+        return answer
+
+
+def _part(request: Request, size: int, headers: dict[str, str], validators: tuple[str, ...]) -> _Part:
+    """The range of a Range header for a content of `size` bytes, if If-Range allows (RFC 9110, 14).
+
+    One range at a time: a list of ranges, and what cannot be understood, gets everything.
+    """
+    whole = _Part(0, size, HTTPStatus.OK, headers)
     wanted = _RANGE.fullmatch(request.headers.get("range", "").replace(" ", "").lower())
-    if wanted and wanted.groups() != ("", "") and request.headers.get("if-range", tag) in (tag, modified):
-        begin, end = wanted.groups()
-        first = int(begin) if begin else max(0, size - int(end))
-        last = min(size - 1, int(end)) if begin and end else size - 1
-        if begin and end and int(end) < int(begin):
-            first, last = 0, size - 1  # such a range is invalid, and to be ignored
-        elif first >= size or (not begin and int(end) == 0):
-            return problem(
-                HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE,
-                f"the file has {size} bytes; the range {begin}-{end} lies outside",
-                {"Content-Range": f"bytes */{size}"},
-                instance=request.url.path,
-            )
-        else:
-            status = HTTPStatus.PARTIAL_CONTENT
-            headers["Content-Range"] = f"bytes {first}-{last}/{size}"
-    count = last - first + 1
-    headers["Content-Length"] = str(count)
-    if request.method == "HEAD":
-        return Response(status_code=status, media_type=media_type, headers=headers)
-    return StreamingResponse(_chunks(path, first, count), status, headers, media_type)
+    if not wanted or wanted.groups() == ("", "") or request.headers.get("if-range", validators[0]) not in validators:
+        return whole
+    begin, end = (_number(digits) for digits in wanted.groups())
+    if begin is not None and end is not None and end < begin:
+        return whole  # an invalid range is ignored
+    first = max(0, size - (end or 0)) if begin is None else begin
+    last = size - 1 if begin is None or end is None else min(size - 1, end)
+    if first >= size or (begin is None and end == 0):
+        refused = problem(
+            HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE,
+            f"there are {size} bytes; the range {wanted[1][:20]}-{wanted[2][:20]} lies outside",
+            {"Content-Range": f"bytes */{size}"},
+            instance=request.url.path,
+        )
+        return _Part(0, 0, HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, {}, refused)
+    ranged_headers = {**headers, "Content-Range": f"bytes {first}-{last}/{size}"}
+    return _Part(first, last - first + 1, HTTPStatus.PARTIAL_CONTENT, ranged_headers)
+
+
+def _number(digits: str) -> int | None:
+    significant = digits.lstrip("0")
+    if not digits:
+        return None
+    return _FAR if len(significant) > 18 else int(significant or "0")
 
 
 def _chunks(path: Path, first: int, count: int) -> Iterator[bytes]:
@@ -104,7 +136,7 @@ def _stat(path: Path) -> os.stat_result:
     try:
         return path.stat()
     except OSError as error:
-        raise NotReadyError(f"{path.name} is not there: {error.strerror}") from error
+        raise NotReadyError(f"{path.name} does not exist: {error.strerror}") from error
 
 
 def _validators(tag: str) -> dict[str, str]:

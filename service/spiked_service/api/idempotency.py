@@ -1,6 +1,7 @@
-"""Idempotency keys: a POST that is sent again, because its answer was lost, does its work once.
+"""Idempotency keys: a POST that is sent again, because its response was lost, is carried out once.
 
-The answers are kept in the catalogue for a day. A key is bound to one request: method, path and body.
+Responses are kept in the catalogue for a day. A key is bound to one request: method, path and body. Status codes follow
+draft-ietf-httpapi-idempotency-key-header: 422 for a key of another request, 409 while the first one is carried out.
 """
 
 import hashlib
@@ -16,10 +17,13 @@ from fastapi import Header, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.routing import APIRoute
 
+from spiked_service.api.auth.scopes import authorise
 from spiked_service.api.problems import ConflictError, KeyReusedError
+from spiked_service.api.schemas.base import not_null
 from spiked_service.store.catalogue import Catalogue
 
-_KEPT = timedelta(days=1)
+KEPT = timedelta(days=1)
+"""Time for which the first answer to a key is stored."""
 _KEY = re.compile("[!-~]{1,255}")
 _HEADERS = ("location", "content-type", "etag")
 
@@ -29,15 +33,17 @@ IdempotencyKey = Annotated[
         min_length=1,
         max_length=255,
         pattern="^[!-~]+$",
-        description="Any text, new for each new request. Sent again with the same one, the request is not carried out "
-        "again: the first answer comes again, with `Idempotency-Replayed: true`. Remembered for a day.",
+        json_schema_extra=not_null,
+        description="Any text, new for each new request. A request that is sent again with its key is not carried out "
+        "again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request "
+        "has used is refused with 422, and one whose request is still carried out with 409.",
     ),
 ]
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What was answered."""
+    """A stored response."""
 
     status: int
     headers: dict[str, str]
@@ -45,7 +51,7 @@ class Answer:
 
 
 class IdempotencyKeys:
-    """Answers by key, in a table of the catalogue."""
+    """Responses by key, in a table of the catalogue."""
 
     def __init__(self, catalogue: Catalogue) -> None:
         self._catalogue = catalogue
@@ -54,17 +60,17 @@ class IdempotencyKeys:
                 "CREATE TABLE IF NOT EXISTS idempotency (key TEXT PRIMARY KEY, fingerprint TEXT NOT NULL, "
                 "at TEXT NOT NULL, status INTEGER, headers TEXT, body BLOB) WITHOUT ROWID"
             )
-            # What a service that died was doing is not being done any more.
+            # Requests that an earlier service did not finish.
             connection.execute("DELETE FROM idempotency WHERE status IS NULL")
 
     def begin(self, key: str, fingerprint: str) -> Answer | None:
-        """The answer given before, or None: carry it out, then `finish` or `abandon` it.
+        """The stored response, or None: then carry the request out and call `finish` or `abandon`.
 
-        Raises KeyReusedError for a key of another request, and ConflictError while the first is being carried out.
+        Raises KeyReusedError for a key of another request, ConflictError while the request is being carried out.
         """
         now = datetime.now(UTC)
         with self._catalogue.transaction() as connection:
-            connection.execute("DELETE FROM idempotency WHERE at < ?", ((now - _KEPT).isoformat(),))
+            connection.execute("DELETE FROM idempotency WHERE at < ?", ((now - KEPT).isoformat(),))
             known = connection.execute(
                 "SELECT fingerprint, status, headers, body FROM idempotency WHERE key = ?", (key,)
             ).fetchone()
@@ -75,13 +81,13 @@ class IdempotencyKeys:
                 )
                 return None
         if known[0] != fingerprint:
-            raise KeyReusedError(f"the idempotency key {key} came with another request before")
+            raise KeyReusedError(f"the idempotency key {key} was used for another request")
         if known[1] is None:
-            raise ConflictError(f"the request with the idempotency key {key} is being carried out; ask again for it")
+            raise ConflictError(f"the request with the idempotency key {key} is being carried out; send it again later")
         return Answer(known[1], json.loads(known[2]), known[3])
 
     def finish(self, key: str, answer: Answer) -> None:
-        """Keep the answer."""
+        """Store the response."""
         with self._catalogue.transaction() as connection:
             connection.execute(
                 "UPDATE idempotency SET status = ?, headers = ?, body = ? WHERE key = ?",
@@ -89,19 +95,20 @@ class IdempotencyKeys:
             )
 
     def abandon(self, key: str) -> None:
-        """It came to nothing; it may be tried again."""
+        """Release the key after a failure, so that the request can be repeated."""
         with self._catalogue.transaction() as connection:
             connection.execute("DELETE FROM idempotency WHERE key = ? AND status IS NULL", (key,))
 
 
 def idempotent(keys: IdempotencyKeys) -> type[APIRoute]:
-    """The class of routes whose POSTs heed `Idempotency-Key`. Only what went well is remembered."""
+    """The route class whose POSTs support `Idempotency-Key`. Only successful responses are stored."""
 
     class IdempotentRoute(APIRoute):
         def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
             carry_out = super().get_route_handler()
 
             async def handle(request: Request) -> Response:
+                await authorise(request)  # before a stored response is sent
                 key = request.headers.get("idempotency-key")
                 if key is None or request.method != "POST" or not _KEY.fullmatch(key):
                     return await carry_out(request)

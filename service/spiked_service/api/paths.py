@@ -1,4 +1,4 @@
-"""Kinds of path segments, so that an action is told from an id: `captures/ID:stop` is no capture named `ID:stop`."""
+"""Kinds of path segments, which separate ids from actions: `captures/ID:stop` is not a capture named `ID:stop`."""
 
 import re
 from functools import cache
@@ -10,7 +10,7 @@ _METHODS = frozenset({"get", "post", "put", "patch", "delete"})
 
 
 class _Id(Convertor[str]):
-    """An id: anything without slash and colon; whether there is such a thing is found out later."""
+    """An id: text without slash and colon."""
 
     regex = "[^/:]+"
 
@@ -22,7 +22,7 @@ class _Id(Convertor[str]):
 
 
 class _DeviceId(Convertor[str]):
-    """The id of a device, which may hold slashes and colons, up to the action."""
+    """The id of a device, which may contain slashes and colons, up to the action."""
 
     regex = "(?:(?!:(?:dis)?arm$).)+"
 
@@ -34,13 +34,13 @@ class _DeviceId(Convertor[str]):
 
 
 def register_path_kinds() -> None:
-    """Make `{name:id}` and `{name:device}` known; to be called before routes are made."""
+    """Register `{name:id}` and `{name:device}`. Call before any route is made."""
     register_url_convertor("id", _Id())
     register_url_convertor("device", _DeviceId())
 
 
 def allowed_methods(described: dict[str, Any], path: str) -> list[str]:
-    """The methods that an OpenAPI description has for a path, for an Allow header."""
+    """The methods of a path in an OpenAPI document, for an Allow header."""
     found = {
         method.upper()
         for template, methods in described["paths"].items()
@@ -48,7 +48,7 @@ def allowed_methods(described: dict[str, Any], path: str) -> list[str]:
         for method in methods
         if method in _METHODS
     }
-    return sorted(found)
+    return sorted({*found, "HEAD"} if "GET" in found else found)
 
 
 @cache

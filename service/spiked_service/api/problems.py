@@ -1,4 +1,4 @@
-"""Errors as RFC 9457 problem details that say what is wrong and what to do."""
+"""Errors as RFC 9457 problem details, with `what_to_do`."""
 
 from difflib import get_close_matches
 from http import HTTPStatus
@@ -12,11 +12,11 @@ from starlette.exceptions import HTTPException
 
 from spiked.errors import SpikedError
 from spiked_service.api.paths import allowed_methods
-from spiked_service.errors import BusyError
-from spiked_service.limits import OverloadedError
-from spiked_service.pictures import FrameNotRecordedError
+from spiked_service.base.errors import BusyError
+from spiked_service.base.limits import OverloadedError
+from spiked_service.captures.uploads import UploadBusyError, UploadError, UploadOffsetError, UploadTooLargeError
+from spiked_service.results.frame_images import FrameNotRecordedError
 from spiked_service.store.catalogue import StoreError, UnknownIdError
-from spiked_service.uploads import UploadBusyError, UploadError, UploadOffsetError, UploadTooLargeError
 
 MEDIA_TYPE = "application/problem+json"
 _RETRY_S = 1
@@ -35,46 +35,50 @@ class Problem(BaseModel):
                     "status": 404,
                     "detail": "there is no capture 01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10; GET captures lists them",
                     "instance": "/api/v1/captures/01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10",
-                    "what_to_do": "look for the id with the GET of the list",
+                    "what_to_do": "list the ids with GET",
                 }
             ]
         },
     )
 
-    type: str = Field(description="urn:spiked:problem: and the kind of problem.")
+    type: str = Field(description="urn:spiked:problem: followed by the kind of problem.")
     title: str
     status: int
-    detail: str = Field(description="What is wrong, in one sentence or a few.")
+    detail: str = Field(description="What is wrong, in one or more sentences.")
     instance: str | None = Field(None, description="Path of the request.")
-    what_to_do: str | None = Field(None, description="What will help, where something will.")
+    what_to_do: str | None = Field(None, description="How to correct it, if known.")
 
 
 class NotReadyError(SpikedError):
-    """What was asked for will exist later."""
+    """The requested data does not exist yet."""
 
 
 class NoPoseError(SpikedError):
-    """A time or frame has no pose, or none yet."""
+    """The requested time or frame has no pose, or none yet."""
 
 
 class NothingError(SpikedError):
-    """What was asked for is not there, and nothing is at work that would make it."""
+    """The requested data does not exist, and nothing that runs will create it."""
 
 
 class GoneError(SpikedError):
-    """What was asked for is not kept."""
+    """The requested data was removed."""
 
 
 class ConflictError(SpikedError):
-    """The request does not fit the state that things are in."""
+    """The request conflicts with the current state."""
+
+
+class ForbiddenError(SpikedError):
+    """The scope of the token does not allow the request."""
 
 
 class UnsupportedTypeError(SpikedError):
-    """A body of a type that is not taken."""
+    """The content type of the body is not supported."""
 
 
 class KeyReusedError(SpikedError):
-    """An idempotency key came with another request than before."""
+    """An idempotency key was used for another request."""
 
 
 _STATUS: dict[type[SpikedError], HTTPStatus] = {
@@ -84,6 +88,7 @@ _STATUS: dict[type[SpikedError], HTTPStatus] = {
     NothingError: HTTPStatus.NOT_FOUND,
     GoneError: HTTPStatus.NOT_FOUND,
     FrameNotRecordedError: HTTPStatus.NOT_FOUND,
+    ForbiddenError: HTTPStatus.FORBIDDEN,
     BusyError: HTTPStatus.CONFLICT,
     UploadBusyError: HTTPStatus.CONFLICT,
     UploadTooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
@@ -91,6 +96,7 @@ _STATUS: dict[type[SpikedError], HTTPStatus] = {
     UploadError: HTTPStatus.CONFLICT,
     UnsupportedTypeError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
     ConflictError: HTTPStatus.CONFLICT,
+    KeyReusedError: HTTPStatus.UNPROCESSABLE_ENTITY,
     OverloadedError: HTTPStatus.SERVICE_UNAVAILABLE,
     StoreError: HTTPStatus.INSUFFICIENT_STORAGE,
 }
@@ -106,28 +112,29 @@ _KINDS: dict[type[SpikedError], str] = {
 }
 
 _WHAT_TO_DO: dict[int, str] = {
-    400: "send a request as /openapi.json describes it",
-    401: "send Authorization: Bearer TOKEN; `spiked token create NAME` makes one",
-    404: "look for the id with the GET of the list",
-    405: "use a method that the Allow header names",
+    400: "send a request as described in /openapi.json",
+    401: "send Authorization: Bearer TOKEN; `spiked token create NAME` creates one",
+    403: "use a token with the scope named in detail",
+    404: "list the ids with GET",
+    405: "use a method of the Allow header",
     408: "send the request again, without long pauses in its body",
-    409: "look at the state of the thing with GET, and ask again when it fits",
+    409: "read the state with GET, and repeat the request when the state allows it",
     411: "send Content-Length",
-    413: "send less at a time; recordings go through uploads, in chunks",
-    415: "send the body with the Content-Type that /openapi.json names",
-    416: "ask for a range that begins inside the file",
-    422: "mend what the detail names; /openapi.json and /docs show what is expected",
-    429: "wait as long as Retry-After says",
-    503: "ask again in a moment, as Retry-After says",
-    507: "make room in the data folder, or remove captures",
+    413: "send a smaller body; upload recordings in chunks",
+    415: "use a Content-Type of /openapi.json",
+    416: "request a range that starts inside the file",
+    422: "fix the field named in detail; see /openapi.json or /docs",
+    429: "wait for the time in Retry-After",
+    503: "repeat the request after the time in Retry-After",
+    507: "free disk space in the data folder, or remove captures",
 }
 
 _MORE: dict[str, str] = {
-    "not-ready": "ask again in a moment, or wait for the event that tells of it",
-    "no-pose": "ask for a time or frame that the detail names, or again when more is tracked",
-    "nothing-there": "do as the detail says",
-    "gone": "ask for a newer version; GET versions lists those that are kept",
-    "not-recorded": "ask for a frame that the detail names",
+    "not-ready": "repeat the request later, or wait for its event",
+    "no-pose": "request a time or frame of the range in detail, or repeat the request when more is tracked",
+    "nothing-there": "follow the instruction in detail",
+    "gone": "request an available version; GET versions lists them",
+    "not-recorded": "request a frame of the range in detail",
     "idempotency-key-reused": "use a new key for a new request",
 }
 
@@ -141,7 +148,7 @@ def problem(
     instance: str | None = None,
     what_to_do: str | None = None,
 ) -> JSONResponse:
-    """A response that says what is wrong."""
+    """A response with problem details."""
     code = HTTPStatus(status)
     kind = kind or code.phrase.lower().replace(" ", "-").replace("'", "")
     body = Problem(
@@ -156,7 +163,7 @@ def problem(
 
 
 def problem_of(error: SpikedError, request: Request) -> JSONResponse:
-    """The response to one of our own errors."""
+    """The response to a SpikedError."""
     status = next((_STATUS[kind] for kind in type(error).__mro__ if kind in _STATUS), HTTPStatus.UNPROCESSABLE_ENTITY)
     headers = {"Retry-After": str(_RETRY_S)} if status is HTTPStatus.SERVICE_UNAVAILABLE else {}
     if isinstance(error, UploadOffsetError):
@@ -165,7 +172,7 @@ def problem_of(error: SpikedError, request: Request) -> JSONResponse:
 
 
 def install(app: FastAPI) -> None:
-    """Answer every error of the application with problem details."""
+    """Respond with problem details to every error of the application."""
 
     @app.exception_handler(SpikedError)
     async def _spiked(request: Request, error: SpikedError) -> JSONResponse:
@@ -173,17 +180,17 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:
-        told = "; ".join(_told(one, request) for one in error.errors()[:10])
-        return problem(HTTPStatus.UNPROCESSABLE_ENTITY, told, instance=request.url.path)
+        detail = "; ".join(_finding(one, request) for one in error.errors()[:10])
+        return problem(HTTPStatus.UNPROCESSABLE_ENTITY, detail, instance=request.url.path)
 
     @app.exception_handler(HTTPException)
     async def _http(request: Request, error: HTTPException) -> JSONResponse:
         code = HTTPStatus(error.status_code)
         detail, advice, headers = str(error.detail), None, {**(error.headers or {})}
         if detail == code.phrase and code is HTTPStatus.NOT_FOUND:
-            detail, advice = f"there is nothing at {request.url.path}", "/docs lists what there is"
+            detail, advice = f"there is no resource at {request.url.path}", "see /docs for all operations"
         elif detail == code.phrase and code is HTTPStatus.METHOD_NOT_ALLOWED:
-            detail = f"{request.url.path} does not take {request.method}"
+            detail = f"{request.url.path} does not support {request.method}"
             headers["Allow"] = ", ".join(allowed_methods(app.openapi(), request.url.path)) or headers.get(
                 "Allow", "GET"
             )
@@ -193,18 +200,18 @@ def install(app: FastAPI) -> None:
     async def _unexpected(request: Request, error: Exception) -> JSONResponse:
         return problem(
             HTTPStatus.INTERNAL_SERVER_ERROR,
-            "the service failed over this request; its log says more",
+            "the service failed to process the request; see its log",
             instance=request.url.path,
-            what_to_do="report it with the log lines of this moment",
+            what_to_do="report it with the lines of the log",
         )
 
 
-def _told(error: Any, request: Request) -> str:
-    """One finding of Pydantic: where, what, and what came, if that is short."""
+def _finding(error: Any, request: Request) -> str:
+    """One error of Pydantic: the field, the reason, and the given value if it is short."""
     given = error.get("input")
     if error["type"] == "json_invalid":
         return f"the body is not JSON: {error['ctx']['error']} (character {error['loc'][-1]})"
-    if isinstance(given, bytes):  # FastAPI does not look into a body that is not said to be JSON
+    if isinstance(given, bytes):  # FastAPI does not parse a body without a JSON content type
         sent = request.headers.get("content-type", "nothing")[:60]
         return f"the body was sent as {sent}, not as JSON: add the header content-type: application/json"
     where = ".".join(str(part) for part in error["loc"] if part != "body") or "body"
@@ -215,7 +222,7 @@ def _told(error: Any, request: Request) -> str:
 
 
 def _nearest(request: Request, place: tuple[str | int, ...]) -> str:
-    """The field of the route's body that was probably meant, for one that does not exist."""
+    """The field of the route's body with the most similar name, for a field that does not exist."""
     field = getattr(request.scope.get("route"), "body_field", None)
     schema = TypeAdapter(field.field_info.annotation).json_schema() if field is not None else {}
     node: Any = schema
@@ -226,7 +233,7 @@ def _nearest(request: Request, place: tuple[str | int, ...]) -> str:
 
 
 def _resolved(node: Any, schema: dict[str, Any]) -> dict[str, Any]:
-    """The object that a node of a JSON schema stands for, where it stands for one."""
+    """The object schema that a node of a JSON schema refers to; empty if it refers to none."""
     for choice in node.get("anyOf", [node]):
         name = choice.get("$ref", "").removeprefix("#/$defs/")
         found: dict[str, Any] = schema.get("$defs", {}).get(name, choice)
@@ -237,25 +244,26 @@ def _resolved(node: Any, schema: dict[str, Any]) -> dict[str, Any]:
 
 _SCHEMA = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
 _DESCRIPTIONS = {
-    400: "The request cannot be read.",
-    401: "A token is needed.",
-    404: "There is no such thing, or not yet.",
-    405: "It does not take this method.",
-    409: "It does not fit the state that things are in.",
+    400: "The request is malformed.",
+    401: "A token is required.",
+    403: "The scope of the token does not allow it.",
+    404: "It does not exist, or not yet.",
+    405: "The method is not supported.",
+    409: "It conflicts with the current state.",
     413: "The body is larger than allowed.",
-    415: "The body is of another type.",
+    415: "The content type is not supported.",
     416: "The range lies outside the file.",
-    422: "Something in the request cannot be.",
+    422: "A value of the request is invalid.",
     429: "Too many requests.",
-    503: "Too busy, or about to end.",
+    503: "The service is overloaded, or stops.",
     507: "The disk is full, or the catalogue cannot be written.",
 }
-_ALWAYS = (401, 422, 429, 503)
+_ALWAYS = (401, 403, 422, 429, 503)
 _Responses = dict[int | str, dict[str, Any]]
 
 
 def problems(*codes: int) -> _Responses:
-    """The responses of a route with these problems, and those that every route may have."""
+    """The documented problems of a route: these status codes, and those of every route."""
     return {
         code: {"description": _DESCRIPTIONS[code], "content": _SCHEMA} for code in sorted({*codes, *_ALWAYS, 400, 413})
     }

@@ -1,50 +1,44 @@
-"""What the routes work with: the parts of one running service."""
+"""The parts of a running service that the application uses."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from spiked_service.captures import Captures
-from spiked_service.events import Bus
-from spiked_service.health import Health
-from spiked_service.keeping import Keeping
-from spiked_service.limits import Gate
-from spiked_service.live import LiveSettings
-from spiked_service.metrics import Metrics
-from spiked_service.readings import readings_of
-from spiked_service.reconstructions import Reconstructions
-from spiked_service.tokens import Tokens
-from spiked_service.zmq import Endpoints
+from spiked_service.api.idempotency import IdempotencyKeys
+from spiked_service.api.results import Results
+from spiked_service.api.routes.devices import DeviceWatch
+from spiked_service.api.sources import Sources
+from spiked_service.api.zmq import Endpoints
+from spiked_service.base.health import Health
+from spiked_service.base.limits import ConcurrencyLimit
+from spiked_service.captures.captures import Captures
+from spiked_service.captures.uploads import Uploads
+from spiked_service.events.bus import Bus
+from spiked_service.operations.metrics import Metrics
+from spiked_service.reconstructions.queue import Reconstructions
+from spiked_service.results.view_renderer import ViewRenderer
+from spiked_service.settings.reload import ReloadableSettings
+from spiked_service.settings.tokens import Tokens
+from spiked_service.store.folder import DataFolder
 
 
 @dataclass(frozen=True)
 class Services:
-    """Made once, by whoever runs the service."""
+    """Built once by `spiked_service.daemon`."""
 
-    settings: LiveSettings
+    settings: ReloadableSettings
     tokens: Tokens
-    keeping: Keeping
     bus: Bus
-    health: Health = field(default_factory=Health)
-    renders: Gate = field(default_factory=lambda: Gate("renders", 1))
-    """Every rendering of a view goes through it."""
-    event_clients: Gate = field(default_factory=lambda: Gate("event clients", 1))
-    zmq: Endpoints | None = None
-    metrics: Metrics = field(init=False)
-
-    @property
-    def captures(self) -> Captures:
-        """All captures."""
-        return self.keeping.captures
-
-    @property
-    def reconstructions(self) -> Reconstructions:
-        """All reconstructions."""
-        return self.keeping.reconstructions
-
-    def __post_init__(self) -> None:
-        """The limits follow the settings."""
-        readings = readings_of(self.keeping)
-        metrics = Metrics(readings, self.bus, self.health, self.renders, self.event_clients)
-        object.__setattr__(self, "metrics", metrics)
-        self.settings.on_change(lambda now: setattr(self.renders, "limit", now.limit_renders))
-        self.settings.on_change(self.keeping.configure)
-        self.settings.on_change(lambda now: setattr(self.event_clients, "limit", now.limit_event_clients))
+    health: Health
+    metrics: Metrics
+    folder: DataFolder
+    captures: Captures
+    reconstructions: Reconstructions
+    uploads: Uploads
+    results: Results
+    views: ViewRenderer
+    sources: Sources
+    device_watch: DeviceWatch
+    idempotency_keys: IdempotencyKeys
+    event_clients: ConcurrencyLimit
+    """Limits concurrent clients of the events."""
+    zmq: Endpoints | None
+    """None if ZeroMQ is turned off."""

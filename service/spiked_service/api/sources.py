@@ -1,25 +1,25 @@
-"""Which sources a request may name: devices, and files in the folders that the settings open."""
+"""Sources allowed in requests: devices, and files in the folders of the settings."""
 
 from pathlib import Path
 
-from spiked.errors import SourceError
-from spiked_service.captures import unhurried
-from spiked_service.devices import Device, known_devices
-from spiked_service.live import LiveSettings
-from spiked_service.store.catalogue import UnknownIdError
+from spiked_driver.source_kind import Device, SourceSpec
+from spiked_driver.source_kinds import find_kind, known_devices
 
-_FILE_KINDS = ("replay", "pcie")
+from spiked.errors import SourceError
+from spiked_service.captures.sources import unpaced
+from spiked_service.settings.reload import ReloadableSettings
+from spiked_service.store.catalogue import UnknownIdError
 
 
 class Sources:
-    """Checks what requests say; the command line may name any file."""
+    """Validates the sources of requests; the command line may use any file."""
 
-    def __init__(self, settings: LiveSettings) -> None:
+    def __init__(self, settings: ReloadableSettings) -> None:
         self._settings = settings
         self._here = Path.cwd()
 
     def devices(self) -> list[Device]:
-        """What captures can be started from."""
+        """The devices."""
         return known_devices(self._settings.now.devices)
 
     def named(self, source: str | None, device: str | None) -> str:
@@ -31,21 +31,20 @@ class Sources:
             source = found
         elif source not in self._settings.now.devices:
             self._check(source)
-        return unhurried(source)
+        return unpaced(source)
 
     def _check(self, source: str) -> None:
-        kind, _, rest = source.partition(":")
-        if kind not in _FILE_KINDS:
+        kind, spec = find_kind(source), SourceSpec.parse(source)
+        if kind is None or not kind.takes_path:
             return
-        name = rest.partition("?")[0]
         folders = [Path(folder) for folder in self._settings.now.source_folders] or [self._here]
         try:
-            path = (self._here / name).resolve()
+            path = (self._here / (spec.target or "")).resolve()
             inside = any(path.is_relative_to(folder.resolve()) for folder in folders)
         except (OSError, ValueError, RuntimeError):  # too long, with a zero byte, links in a circle
             inside = False
         if not inside:
             raise SourceError(
-                f"{source.partition('?')[0]} is not in a folder whose files requests may name; start the service in "
+                f"{spec.address} is not in a folder whose files requests may name; start the service in "
                 "that folder, add it to source_folders, or upload the recording"
             )

@@ -8,12 +8,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from spiked.errors import SpikedError
+from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import CaptureRow, CaptureState, JobState, ReconstructionRow, UploadRow, VersionRow
 
 _WAIT_S = 5.0
+_CopyOf = Callable[[str], Path]
+_DAMAGED = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 _MIGRATIONS = (
     """
@@ -38,19 +41,23 @@ _MIGRATIONS = (
     ) WITHOUT ROWID;
     """,
 )
-"""Script n brings a catalogue from version n to n + 1; the file's user_version says where it stands."""
+"""Script n migrates a catalogue from version n to n + 1; the version is the file's user_version."""
 
 
 class StoreError(SpikedError):
     """The catalogue cannot be read or written: the disk is full, broken or read-only."""
 
 
+class DamagedError(StoreError):
+    """The file of the catalogue is not a database or is damaged."""
+
+
 class UnknownIdError(SpikedError):
-    """There is nothing with this id."""
+    """There is no row with this id."""
 
 
 class Row(Protocol):
-    """What has an id of its own."""
+    """A row with an id."""
 
     @property
     def id(self) -> str:
@@ -63,36 +70,63 @@ _Row = TypeVar("_Row", bound=Row)
 
 @dataclass(frozen=True)
 class Page(Generic[_Row]):
-    """Some rows, newest first, and where the next page begins."""
+    """A page of rows, newest first, and the cursor of the next page."""
 
     items: list[_Row]
     next_cursor: str | None
-    """None: there are no more."""
+    """None on the last page."""
 
 
 class Catalogue:
     """Rows by id. Every method may be called from any thread, raises StoreError, and is one short transaction.
 
-    A row is kept as one JSON document; columns made from it serve the queries. `synchronous = NORMAL`: a kill loses
-    nothing, a power cut at most the last moments, and what lies on disk then is put right when the service starts.
+    A row is kept as one JSON document; columns made from it serve the queries. In a data folder a copy of the document
+    lies beside the files that it is about: never older than the row, so it replaces a row that was lost.
+    `synchronous = NORMAL`: a kill loses nothing, a power cut at most the last moments, and what lies on disk then is
+    put right when the service starts.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, folder: DataFolder | None = None) -> None:
+        """Raises StoreError, DamagedError for a file that is no database."""
         self._path = path
         self._readers: list[sqlite3.Connection] = []
         self._writing = threading.RLock()
         with _told(path):
             self._writer = _connect(path)
-            self._writer.execute("PRAGMA journal_mode = WAL")
-            self._writer.execute("PRAGMA synchronous = NORMAL")
-        self._migrate()
-        self.captures = Table(self, "captures", CaptureRow)
-        self.reconstructions = Table(self, "reconstructions", ReconstructionRow)
-        self.uploads = Table(self, "uploads", UploadRow)
+        try:
+            with _told(path):
+                self._writer.execute("PRAGMA journal_mode = WAL")
+                self._writer.execute("PRAGMA synchronous = NORMAL")
+            self._migrate()
+        except StoreError:
+            self._writer.close()
+            raise
+        beside: tuple[_CopyOf | None, ...] = (None, None, None)
+        if folder is not None:
+            beside = (folder.capture_row, folder.reconstruction_row, folder.upload_row)
+        self.captures = Table(self, "captures", CaptureRow, beside[0])
+        self.reconstructions = Table(self, "reconstructions", ReconstructionRow, beside[1])
+        self.uploads = Table(self, "uploads", UploadRow, beside[2])
+
+    def damage(self) -> str | None:
+        """Check the whole file. Return the first problem, None if there is none."""
+        try:
+            ((found,),) = self.read("PRAGMA integrity_check(1)")
+            if found != "ok":
+                return str(found).replace("\n", ": ")
+            for table in (self.captures, self.reconstructions, self.uploads):
+                for row_id, document in table.documents().items():
+                    try:
+                        table.parse(document)
+                    except ValidationError as error:
+                        return f"{table.kind} {row_id} cannot be read: {error.errors()[0]['msg']}"
+        except DamagedError as error:
+            return str(error.__cause__)
+        return None
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
-        """The writer, alone; committed at the end, rolled back by an exception. May be nested in one thread."""
+        """The exclusive write connection; committed at the end, rolled back on an exception. Reentrant."""
         with self._writing, _told(self._path):
             if self._writer.in_transaction:
                 yield self._writer
@@ -108,7 +142,7 @@ class Catalogue:
             self._writer.execute("COMMIT")
 
     def read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-        """Rows of a query, by a connection that only reads."""
+        """Result of a query on a read-only connection."""
         with _told(self._path), self._reader() as connection:
             return list(connection.execute(query, values).fetchall())
 
@@ -145,11 +179,11 @@ class Catalogue:
         return self.reconstructions.page(where, values, limit, cursor)
 
     def reconstructions_of(self, capture_id: str) -> list[ReconstructionRow]:
-        """Oldest first."""
+        """Reconstructions of a capture, oldest first."""
         return self.reconstructions.where("capture_id = ? ORDER BY id", (capture_id,))
 
     def put_version(self, row: VersionRow, kept: set[int]) -> None:
-        """Note a version, and forget those that are not kept."""
+        """Save a version and delete those that are not kept."""
         with self.transaction() as connection:
             connection.execute(
                 "INSERT OR REPLACE INTO versions VALUES (?, ?, ?)",
@@ -165,14 +199,14 @@ class Catalogue:
                     )
 
     def versions(self, reconstruction_id: str) -> list[VersionRow]:
-        """The versions of a reconstruction that are still there, oldest first."""
+        """The available versions of a reconstruction, oldest first."""
         found = self.read(
             "SELECT document FROM versions WHERE reconstruction_id = ? ORDER BY version", (reconstruction_id,)
         )
         return [_VERSION.validate_json(document) for (document,) in found]
 
     def forget_versions(self, reconstruction_id: str) -> None:
-        """A reconstruction begins anew, or goes."""
+        """Delete the versions of a reconstruction."""
         with self.transaction() as connection:
             connection.execute("DELETE FROM versions WHERE reconstruction_id = ?", (reconstruction_id,))
 
@@ -219,20 +253,37 @@ class Catalogue:
 
 
 class Table(Generic[_Row]):
-    """Rows of one kind, by id."""
+    """A table of rows by id."""
 
-    def __init__(self, catalogue: Catalogue, name: str, kind: type[_Row]) -> None:
+    def __init__(self, catalogue: Catalogue, name: str, kind: type[_Row], beside: _CopyOf | None = None) -> None:
+        """`beside` returns the path of the copy of a row, which is written if its folder exists."""
         self._catalogue = catalogue
         self._name = name
         self._kind: TypeAdapter[_Row] = TypeAdapter(kind)
+        self._beside = beside
+
+    @property
+    def kind(self) -> str:
+        """Name of the kind of row, for messages."""
+        return self._name.removesuffix("s")
 
     def put(self, row: _Row) -> None:
         """Insert a row, or replace the one with its id."""
+        document = self._kind.dump_json(row)
         with self._catalogue.transaction() as connection:
             connection.execute(
-                f"INSERT OR REPLACE INTO {self._name} (id, document) VALUES (?, ?)",
-                (row.id, self._kind.dump_json(row).decode()),
+                f"INSERT OR REPLACE INTO {self._name} (id, document) VALUES (?, ?)", (row.id, document.decode())
             )
+            if self._beside is not None:
+                _write_copy(self._beside(row.id), document)
+
+    def documents(self) -> dict[str, str]:
+        """All rows as they are stored, by id."""
+        return dict(self._catalogue.read(f"SELECT id, document FROM {self._name}"))
+
+    def parse(self, document: str | bytes) -> _Row:
+        """The row of a document. Raises pydantic's ValidationError."""
+        return self._kind.validate_json(document)
 
     def find(self, row_id: str) -> _Row | None:
         """The row, or None."""
@@ -243,7 +294,7 @@ class Table(Generic[_Row]):
         """The row. Raises UnknownIdError."""
         row = self.find(row_id)
         if row is None:
-            raise UnknownIdError(f"there is no {self._name[:-1]} {row_id}; GET {self._name} lists them")
+            raise UnknownIdError(f"there is no {self.kind} {row_id}; GET {self._name} lists them")
         return row
 
     def change(self, row_id: str, change: Callable[[_Row], _Row]) -> _Row:
@@ -264,21 +315,23 @@ class Table(Generic[_Row]):
         with self._catalogue.transaction() as connection:
             found = connection.execute(f"SELECT document FROM {self._name} WHERE id = ?", (row_id,)).fetchone()
         if found is None:
-            raise UnknownIdError(f"there is no {self._name[:-1]} {row_id}; GET {self._name} lists them")
+            raise UnknownIdError(f"there is no {self.kind} {row_id}; GET {self._name} lists them")
         return self._kind.validate_json(found[0])
 
     def remove(self, row_id: str) -> None:
-        """Forget a row; fine if it is gone."""
+        """Delete a row and its copy, if they exist."""
         with self._catalogue.transaction() as connection:
             connection.execute(f"DELETE FROM {self._name} WHERE id = ?", (row_id,))
+            if self._beside is not None:
+                self._beside(row_id).unlink(missing_ok=True)
 
     def where(self, condition: str = "1", values: tuple[Any, ...] = ()) -> list[_Row]:
-        """Rows that fulfil an SQL condition, which may end in an order."""
+        """Rows that match an SQL condition, which may include ORDER BY."""
         found = self._catalogue.read(f"SELECT document FROM {self._name} WHERE {condition}", values)
         return [self._kind.validate_json(document) for (document,) in found]
 
     def page(self, where: list[str], values: list[Any], limit: int, cursor: str | None) -> Page[_Row]:
-        """Rows that fulfil all conditions, newest first, from before the cursor."""
+        """Rows that match all conditions and precede the cursor, newest first."""
         if cursor is not None:
             where, values = [*where, "id < ?"], [*values, cursor]
         rows = self.where(f"{' AND '.join(where) or '1'} ORDER BY id DESC LIMIT ?", (*values, limit + 1))
@@ -292,11 +345,23 @@ def _connect(path: Path) -> sqlite3.Connection:
     return sqlite3.connect(path, timeout=_WAIT_S, isolation_level=None, check_same_thread=False)
 
 
+def _write_copy(path: Path, document: bytes) -> None:
+    """Replace the copy of a row. If that fails, the copy is deleted rather than left outdated."""
+    part = path.with_name(path.name + ".part")
+    try:
+        if path.parent.is_dir():
+            part.write_bytes(document)
+            part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
+
+
 @contextmanager
 def _told(path: Path) -> Iterator[None]:
     try:
         yield
-    except sqlite3.DatabaseError as error:
-        raise StoreError(
-            f"the catalogue {path} cannot be used: {error}; look whether its disk is full or broken"
-        ) from error
+    except (sqlite3.DatabaseError, OSError) as error:
+        code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+        kind = DamagedError if code in _DAMAGED else StoreError
+        raise kind(f"the catalogue {path} cannot be used: {error}; look whether its disk is full or broken") from error

@@ -1,24 +1,36 @@
-"""The data folder: one owner at a time, one place that knows where everything lies."""
+"""The data folder: its lock and the paths of its files."""
 
 import fcntl
 import os
 import shutil
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 from spiked.errors import ConfigurationError
-from spiked_service.ids import is_id
+from spiked.sensor import Sensor
+from spiked_service.base.ids import is_id
 
 _LOCK = "lock"
 
 
 @dataclass(frozen=True)
 class Space:
-    """The disk below the data folder."""
+    """Space on the disk of the data folder."""
 
     free_bytes: int
-    """What a user may still write."""
+    """Bytes available to unprivileged users."""
     total_bytes: int
+
+    def recording_s(self, sensor: Sensor) -> float:
+        """Seconds of recording of this sensor that fit."""
+        return self.free_bytes / (sensor.compact().frame_bytes * sensor.frame_rate_hz)
+
+
+def space_at(path: Path) -> Space:
+    """Space on the disk of a folder."""
+    stat = os.statvfs(path)
+    return Space(stat.f_bavail * stat.f_frsize, stat.f_blocks * stat.f_frsize)
 
 
 class DataFolder:
@@ -28,7 +40,7 @@ class DataFolder:
     """
 
     def __init__(self, path: Path | None = None) -> None:
-        """Make it where it is not there, and own it. Raises ConfigurationError."""
+        """Create the folder if it does not exist, and lock it. Raises ConfigurationError."""
         self.path = (path or default_folder()).absolute()
         try:
             for folder in (self.path, self._captures, self._reconstructions, self._uploads):
@@ -52,40 +64,76 @@ class DataFolder:
         return self.path / "catalogue.sqlite"
 
     def capture(self, capture_id: str) -> Path:
-        """Folder of a capture. Raises ValueError for what is no id, so that no text from outside becomes a path."""
+        """Folder of a capture. Raises ValueError for text that is not an id, so that no client chooses a path."""
         return self._captures / _checked(capture_id)
 
     def recording(self, capture_id: str) -> Path:
-        """The `.dat` of a capture; its sidecar and index lie beside it."""
+        """The `.dat` of a capture; sidecar and index are beside it."""
         return self.capture(capture_id) / "recording.dat"
 
     def thumbnail(self, capture_id: str) -> Path:
-        """A small picture of a capture, WebP; not there before frames came."""
+        """Thumbnail of a capture, WebP; missing before the first frames."""
         return self.capture(capture_id) / "thumbnail.webp"
+
+    def capture_row(self, capture_id: str) -> Path:
+        """Copy of the catalogue's row of a capture."""
+        return self.capture(capture_id) / "capture.json"
 
     def reconstruction(self, reconstruction_id: str) -> Path:
         """Folder of a reconstruction: its versions, timeline and log."""
         return self._reconstructions / _checked(reconstruction_id)
 
+    def reconstruction_row(self, reconstruction_id: str) -> Path:
+        """Copy of the catalogue's row of a reconstruction."""
+        return self.reconstruction(reconstruction_id) / "reconstruction.json"
+
     def upload(self, upload_id: str) -> Path:
-        """What has come of an upload."""
+        """Received bytes of an upload."""
         return self._uploads / f"{_checked(upload_id)}.part"
 
+    def upload_row(self, upload_id: str) -> Path:
+        """Copy of the catalogue's row of an upload."""
+        return self._uploads / f"{_checked(upload_id)}.upload"
+
     def space(self) -> Space:
-        """How full the disk is."""
-        stat = os.statvfs(self.path)
-        return Space(stat.f_bavail * stat.f_frsize, stat.f_blocks * stat.f_frsize)
+        """Space on the disk."""
+        return space_at(self.path)
 
     def contents(self) -> tuple[set[str], set[str], set[str]]:
-        """Ids of the captures, reconstructions and uploads that have files, whatever the catalogue says."""
-        return (
-            {entry.name for entry in self._captures.iterdir() if is_id(entry.name)},
-            {entry.name for entry in self._reconstructions.iterdir() if is_id(entry.name)},
-            {entry.stem for entry in self._uploads.iterdir() if is_id(entry.stem)},
-        )
+        """Ids of the captures, reconstructions and uploads that have files, whatever the catalogue says.
+
+        Raises ConfigurationError.
+        """
+        try:
+            return (
+                {entry.name for entry in self._captures.iterdir() if is_id(entry.name)},
+                {entry.name for entry in self._reconstructions.iterdir() if is_id(entry.name)},
+                {entry.stem for entry in self._uploads.iterdir() if is_id(entry.stem)},
+            )
+        except OSError as error:
+            told = f"{error.filename} cannot be read: {error.strerror}; let the user of the service read it"
+            raise ConfigurationError(told) from error
+
+    def set_aside(self, *paths: Path) -> Path:
+        """Move files or folders to `lost+found`. Return the new place. Raises OSError."""
+        target = self.path / "lost+found"
+        target.mkdir(mode=0o700, exist_ok=True)
+        for path in paths:
+            names = (path.name, *(f"{path.name}.{number}" for number in range(2, 1000)))
+            path.rename(next(target / name for name in names if not (target / name).exists()))
+        return target
+
+    def set_catalogue_aside(self, why: str) -> Path:
+        """Rename the catalogue and its SQLite side files. Raises OSError."""
+        aside = self.catalogue.with_name(f"{self.catalogue.name}.{why}-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}")
+        for suffix in ("", "-wal", "-shm"):
+            part = self.path / (self.catalogue.name + suffix)
+            if part.exists():
+                part.rename(aside.with_name(aside.name + suffix))
+        return aside
 
     def remove(self, folder: Path) -> None:
-        """Remove a capture's or reconstruction's folder with all in it; fine if it is gone."""
+        """Delete the folder of a capture or reconstruction, if it exists."""
         # Renamed first, so that a kill in between never leaves half a capture under its name.
         doomed = folder.with_name(f".{folder.name}.removed")
         if folder.exists():
@@ -93,7 +141,7 @@ class DataFolder:
         shutil.rmtree(doomed, ignore_errors=True)
 
     def sweep(self) -> int:
-        """Remove what killed processes left half-done, and say how many files and folders that was."""
+        """Delete incomplete files of killed processes. Return their number."""
         removed = 0
         for base in (self._captures, self._reconstructions):
             for doomed in base.glob(".*.removed"):
@@ -105,7 +153,7 @@ class DataFolder:
         return removed
 
     def close(self) -> None:
-        """Let go of it."""
+        """Unlock the folder."""
         self._lock.close()
 
     @property

@@ -1,4 +1,4 @@
-"""What is removed when, so that the disk does not fill."""
+"""Retention: removes old captures so that the disk does not fill."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,30 +15,30 @@ _UPLOAD_DAYS = 1.0
 
 @dataclass(frozen=True)
 class Policy:
-    """Limits; None: none."""
+    """Limits; None: unlimited."""
 
     days: float | None = None
-    """Captures older than this are removed, and can still be restored."""
+    """Captures older than this are marked as deleted."""
     bytes: int | None = None
-    """Captures and reconstructions together; beyond it the oldest go for good, removed ones first."""
+    """Most bytes of captures and reconstructions; above it the oldest are purged, deleted ones first."""
     deleted_days: float = 7.0
-    """Removed captures go for good after this time."""
+    """Deleted captures are purged after this time."""
 
 
 class Removing(Protocol):
-    """What retention may do to captures."""
+    """Operations that retention needs."""
 
     def remove(self, capture_id: str) -> object:
-        """Hide it."""
+        """Mark it as deleted."""
         ...
 
     def purge(self, capture_id: str) -> None:
-        """Remove it for good."""
+        """Purge it."""
         ...
 
 
 class Retention:
-    """Applies a policy. A capture that is marked to be kept, or not over, is left alone, unless a person removed it."""
+    """Applies a policy. Captures that are kept or running are exempt unless a user deleted them."""
 
     def __init__(
         self, folder: DataFolder, catalogue: Catalogue, captures: Removing, log: Callable[[str], None]
@@ -51,7 +51,7 @@ class Retention:
         """May be changed at any time."""
 
     def apply(self, now: datetime | None = None) -> None:
-        """Remove what the policy does not let stay. Raises StoreError, and BusyError when a job is in the way."""
+        """Remove what exceeds the policy. Raises StoreError, and BusyError while a job runs."""
         now = now or datetime.now(UTC)
         policy = self.policy
         rows = [row for row in self._catalogue.captures.where("1 ORDER BY id") if row.state.over]
@@ -91,11 +91,9 @@ class Retention:
     def _drop_uploads(self, now: datetime) -> None:
         for row in self._catalogue.uploads.where():
             if row.capture_id is not None or now - row.updated_at > timedelta(days=_UPLOAD_DAYS):
+                for suffix in (".part", ".json"):
+                    self._folder.upload(row.id).with_suffix(suffix).unlink(missing_ok=True)
                 self._catalogue.uploads.remove(row.id)
-        known = {row.id for row in self._catalogue.uploads.where()}
-        for upload_id in self._folder.contents()[2] - known:
-            for suffix in (".part", ".json"):
-                self._folder.upload(upload_id).with_suffix(suffix).unlink(missing_ok=True)
 
 
 def _disposable(row: CaptureRow) -> bool:
@@ -107,7 +105,7 @@ def _age(row: CaptureRow, now: datetime) -> timedelta:
 
 
 def _size(folder: Path) -> int:
-    """Bytes that the files below take on the disk."""
+    """Bytes that the files below a folder occupy."""
     total = 0
     for path in folder.rglob("*"):
         try:

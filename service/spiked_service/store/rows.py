@@ -1,4 +1,4 @@
-"""What the catalogue remembers, row by row."""
+"""Row types of the catalogue."""
 
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -7,8 +7,17 @@ from enum import StrEnum
 from spiked.recon import State
 from spiked.ring import DeviceState, Policy, RingStatus
 from spiked.sensor import Intrinsics, Sensor
-from spiked_service.messages import Stage
-from spiked_service.reconstruction_options import ReconstructionOptions
+from spiked_service.settings.reconstruction_options import ReconstructionOptions
+
+
+class Stage(StrEnum):
+    """The phase of a reconstruction."""
+
+    WAITING = "waiting"
+    TRACKING = "tracking"
+    MAPPING = "mapping"
+    REFINING = "refining"
+    DONE = "done"
 
 
 class Origin(StrEnum):
@@ -16,43 +25,54 @@ class Origin(StrEnum):
 
     LIVE = "live"
     UPLOAD = "upload"
+    RECOVERED = "recovered"
+    """Found in the data folder without a row, which was rebuilt from its files."""
 
 
 class CaptureState(StrEnum):
-    """Where a capture stands."""
+    """State of a capture."""
 
     STARTING = "starting"
+    """No frame has been received yet."""
+    WAITING = "waiting"
+    """The camera is absent or sends nothing; the capture continues when it sends frames."""
     STREAMING = "streaming"
+    """Frames are received."""
     FINISHING = "finishing"
-    """The source has ended; the recording is closed, and the reconstruction refines what it has."""
+    """The source has ended; the recording is being closed, and the reconstruction is being refined."""
     COMPLETE = "complete"
     FAILED = "failed"
-    """Something died or was refused, the reason says what; what was recorded and published stays available."""
+    """See the reason. Recording and published versions are kept."""
+
+    @property
+    def acquiring(self) -> bool:
+        """Whether frames are received, or awaited."""
+        return self in (CaptureState.STARTING, CaptureState.WAITING, CaptureState.STREAMING)
 
     @property
     def over(self) -> bool:
-        """Whether nothing more will happen."""
+        """Whether the capture has ended; its state does not change any more."""
         return self in (CaptureState.COMPLETE, CaptureState.FAILED)
 
 
 class JobState(StrEnum):
-    """Where a reconstruction stands."""
+    """State of a reconstruction."""
 
     QUEUED = "queued"
     RUNNING = "running"
     COMPLETE = "complete"
     CANCELLED = "cancelled"
-    """Somebody asked for it; what was published stays available."""
+    """Cancelled by a user. Published versions are kept."""
     FAILED = "failed"
 
     @property
     def over(self) -> bool:
-        """Whether nothing more will happen unless it is restarted."""
+        """Whether the reconstruction has ended; it can be restarted."""
         return self not in (JobState.QUEUED, JobState.RUNNING)
 
 
 class Grade(StrEnum):
-    """What a recording is good for, as `spiked verify` says it."""
+    """Quality of a recording, as `spiked verify` prints it."""
 
     GOOD = "good"
     DEGRADED = "degraded"
@@ -60,27 +80,29 @@ class Grade(StrEnum):
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Quality:
     """The verdict on a recording."""
 
     grade: Grade
     reasons: tuple[str, ...] = ()
-    """Why it is not good, the worst first."""
+    """Reasons for a grade below good, the worst first."""
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """What lies on disk of a capture."""
+    """The recording of a capture on disk."""
 
     frames: int
     bytes: int
-    """Of the `.dat` alone."""
+    """Size of the `.dat` file."""
     first_frame: int = 0
     """Index in the capture of the first frame recorded."""
     lost: int = 0
-    """Frames missing between its first and its last."""
+    """Frames missing between its first and the end of the capture."""
+    lost_by_cause: dict[str, int] = field(default_factory=dict)
+    """The same by cause: device, usb, ring or disk."""
     sha256: str | None = None
-    """Of the `.dat`, in hex, where it was computed."""
+    """SHA-256 of the `.dat` in hex, if computed."""
 
 
 @dataclass(frozen=True)
@@ -104,17 +126,17 @@ class Counters:
     device_reason: str
     received: int
     lost: dict[str, int]
-    """By cause."""
+    """Lost frames by cause."""
     next_frame: int
     consumers: tuple[ConsumerCounters, ...]
 
     @classmethod
     def of(cls, status: RingStatus) -> "Counters":
-        """Of a ring at one moment."""
+        """Counters of a ring now."""
         writer = status.writer
         return cls(
-            writer.condition.state,
-            writer.condition.reason,
+            writer.device_status.state,
+            writer.device_status.reason,
             writer.committed,
             {str(cause): count for cause, count in writer.lost.items()},
             writer.next_frame,
@@ -135,27 +157,27 @@ class Counters:
 
 @dataclass(frozen=True)
 class Plan:
-    """What to capture, and what to do with it."""
+    """Source of a capture and how it is processed."""
 
     source: str
     frames: int | None = None
     """None: until the source ends or the capture is stopped."""
     seconds: float | None = None
-    """Instead of frames."""
+    """Alternative to `frames`."""
     pretrigger_s: float = 0.0
-    """Begin so long before now, with what the ring of an armed device still holds."""
+    """Start this long before now, from the ring of an armed device."""
     name: str = ""
     notes: str = ""
     record: bool = True
     reconstruct: bool = True
     options: ReconstructionOptions = field(default_factory=ReconstructionOptions)
     intrinsics: Intrinsics | None = None
-    """None: the source's own."""
+    """None: those of the source."""
 
 
 @dataclass(frozen=True)
 class CaptureRow:
-    """A capture, or an uploaded recording, which is one that took place elsewhere."""
+    """A capture or an uploaded recording."""
 
     id: str
     origin: Origin
@@ -165,24 +187,24 @@ class CaptureRow:
     name: str = ""
     notes: str = ""
     keep: bool = False
-    """Retention leaves it alone."""
+    """Exempt from retention."""
     reason: str = ""
     warnings: tuple[str, ...] = ()
     sensor: Sensor | None = None
     """None until the source is open; with the plan's intrinsics if it has any."""
     frames_planned: int | None = None
-    """Length of the capture if it is known."""
+    """Length of the capture, if known."""
     recording: Recorded | None = None
-    verdict: Judgement | None = None
+    verdict: Quality | None = None
     counters: Counters | None = None
-    """As they were at the end."""
+    """Counters at the end."""
     ended_at: datetime | None = None
     deleted_at: datetime | None = None
-    """It can be restored until retention removes it for good."""
+    """Can be restored until retention purges it."""
 
     @property
     def source(self) -> str:
-        """What it was captured from."""
+        """Source of the capture."""
         return self.plan.source
 
 
@@ -197,15 +219,15 @@ class ReconstructionRow:
     created_at: datetime
     options: ReconstructionOptions = field(default_factory=ReconstructionOptions)
     priority: int = 0
-    """Higher ones run earlier; equal ones in the order of their ids."""
+    """Higher values run first, equal ones in the order of their ids."""
     stage: Stage = Stage.WAITING
     progress: float = 0.0
-    """0 to 1."""
+    """Progress of the refinement, 0 to 1."""
     tracking_state: State = State.BOOT
     reason: str = ""
-    """Why it failed, waits or tracks badly."""
+    """Why it failed, waits or is degraded."""
     attempts: int = 0
-    """How often it was begun."""
+    """Number of attempts."""
     frames: int = 0
     poses: int = 0
     splats: int = 0
@@ -214,32 +236,35 @@ class ReconstructionRow:
     version: int = 0
     """Newest version published; 0: none yet."""
     white: float | None = None
-    """Radiance to be shown as white in that version."""
+    """Radiance shown as white in that version."""
+    queue_place: int | None = None
+    """Place in the queue, 1 is the next; None unless queued. Computed on reading."""
     eta_s: float | None = None
+    """Seconds to completion, waiting time included; None if unknown."""
     started_at: datetime | None = None
     ended_at: datetime | None = None
 
 
 @dataclass(frozen=True)
 class UploadRow:
-    """A recording on its way here."""
+    """An upload of a recording."""
 
     id: str
     name: str
     bytes: int
-    """What it will be."""
+    """Announced size."""
     created_at: datetime
     updated_at: datetime
     offset_bytes: int = 0
-    """What has come, and is on disk."""
+    """Bytes received and synced to disk."""
     sidecar: str | None = None
     """The text of its sidecar, as sent."""
     geometry: str | None = None
-    """What was said about its geometry, as JSON."""
+    """Stated geometry and notes, as JSON."""
     sha256: str | None = None
-    """What it shall be."""
+    """Announced SHA-256."""
     capture_id: str | None = None
-    """What it became."""
+    """Id of its capture, once complete."""
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,11 @@
 """What the models of the API share."""
 
 from datetime import UTC, datetime
+from itertools import combinations, permutations
 from typing import Annotated, Any, Generic, TypeVar
 
 from fastapi import Query
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StrictFloat
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StrictFloat, model_validator
 
 from spiked.sensor import Intrinsics
 
@@ -23,6 +24,12 @@ class In(BaseModel):
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _integers(cls, body: object) -> object:
+        """To JSON Schema 20.0 is an integer."""
+        return _integral(body)
+
 
 class Out(BaseModel):
     """What goes out. Every field is always there, null where nothing is known."""
@@ -35,9 +42,54 @@ def example(**fields: Any) -> ConfigDict:
     return ConfigDict(extra="forbid", allow_inf_nan=False, json_schema_extra={"examples": [fields]})
 
 
-def examples(*given: dict[str, Any]) -> ConfigDict:
-    """Configuration of an incoming model with worked examples."""
-    return ConfigDict(extra="forbid", allow_inf_nan=False, json_schema_extra={"examples": list(given)})
+def examples(*given: dict[str, Any], rules: list[dict[str, Any]] | None = None) -> ConfigDict:
+    """Configuration of an incoming model with worked examples, and rules between its fields as JSON Schema."""
+    extra: dict[str, Any] = {"examples": list(given)} | ({"allOf": rules} if rules else {})
+    return ConfigDict(extra="forbid", allow_inf_nan=False, json_schema_extra=extra)
+
+
+def exactly_one_of(**fields: str) -> list[dict[str, Any]]:
+    """Rules: one of the fields is given, and no other; each with its type in JSON.
+
+    All rules say what must not be: of other forms generators of clients make a type for each case.
+    """
+    return [_never(dict.fromkeys(fields, "null"), required=False), *at_most_one_of(**fields)]
+
+
+def at_most_one_of(**fields: str) -> list[dict[str, Any]]:
+    """Rules: no two of the fields are given."""
+    return [_never({one: fields[one], other: fields[other]}) for one, other in combinations(fields, 2)]
+
+
+def together(**fields: str) -> list[dict[str, Any]]:
+    """Rules: of two fields both are given, or none."""
+    return [
+        {"not": {"required": [one], "properties": {one: {"type": fields[one]}, other: {"type": "null"}}}}
+        for one, other in permutations(fields, 2)
+    ]
+
+
+def _never(types: dict[str, str], *, required: bool = True) -> dict[str, Any]:
+    rule: dict[str, Any] = {"properties": {name: {"type": kind} for name, kind in types.items()}}
+    return {"not": {"required": list(types), **rule} if required else rule}
+
+
+def not_null(schema: dict[str, Any]) -> None:
+    """A parameter that may be left out, but has no null: HTTP knows none."""
+    for choice in schema.pop("anyOf", []):
+        if choice.get("type") != "null":
+            schema.update(choice)
+
+
+def _integral(body: object) -> object:
+    match body:
+        case float() if body.is_integer():
+            return int(body)
+        case dict():
+            return {name: _integral(value) for name, value in body.items()}
+        case list():
+            return [_integral(value) for value in body]
+    return body
 
 
 def _printable(text: str) -> str:
@@ -52,8 +104,16 @@ def _one_line(text: str) -> str:
     return _printable(text)
 
 
-Name = Annotated[str, Field(max_length=200), AfterValidator(_one_line)]
-Notes = Annotated[str, Field(max_length=20_000), AfterValidator(_printable)]
+Name = Annotated[
+    str,
+    Field(max_length=200, json_schema_extra={"pattern": r"^[^\x00-\x1f]*$"}),
+    AfterValidator(_one_line),
+]
+Notes = Annotated[
+    str,
+    Field(max_length=20_000, json_schema_extra={"pattern": r"^[^\x00-\x08\x0b-\x1f]*$"}),
+    AfterValidator(_printable),
+]
 Id = Annotated[str, Field(description="UUID version 7: ids sort by time.", examples=[ID_EXAMPLE])]
 Finite = Annotated[StrictFloat, Field(allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]

@@ -17,14 +17,16 @@ from spiked_service.api.schemas.base import (
     Notes,
     Out,
     PageOut,
+    at_most_one_of,
+    exactly_one_of,
     example,
     examples,
 )
-from spiked_service.messages import PreviewTaken
-from spiked_service.pictures import Statistics
-from spiked_service.reconstruction_options import ReconstructionOptions
-from spiked_service.snapshot import Snapshot
-from spiked_service.store.rows import CaptureState, Counters, Grade, Judgement, Origin, Recorded
+from spiked_service.results.frame_images import Statistics
+from spiked_service.settings.reconstruction_options import ReconstructionOptions
+from spiked_service.store.rows import CaptureState, Counters, Grade, Origin, Quality, Recorded
+from spiked_service.store.snapshot import Snapshot
+from spiked_service.workers.messages import PreviewTaken
 
 
 class ConsumerOut(Out):
@@ -75,7 +77,7 @@ class DeviceOut(Out):
     """Something to capture from."""
 
     id: str = Field(description="Its name here; the same after a restart.", examples=["usb0", "sim:"])
-    kind: str = Field(description="usb, pcie, replay or sim.")
+    kind: str = Field(description="A name from `GET options/sources`.", examples=["usb", "sim"])
     source: str = Field(description="To be given as `source` of a capture.", examples=["sim:"])
     description: str
     state: DeviceState
@@ -96,6 +98,24 @@ class DevicesOut(Out):
     items: list[DeviceOut]
 
 
+class SourceKindOut(Out):
+    """A kind of source, and what can follow its question mark."""
+
+    name: str = Field(examples=["sim"])
+    usage: str = Field(description="How a source of this kind is written.", examples=["sim:"])
+    summary: str
+    is_camera: bool = Field(description="Hardware: frames that are not read in time are lost.")
+    can_block: bool = Field(description="With `pace=0` it waits for its consumers, so that no frame is lost.")
+    takes_path: bool = Field(description="A path on the service's machine follows the colon.")
+    options: dict[str, Any] = Field(description="JSON Schema of its options: types, limits, defaults and meaning.")
+
+
+class SourceKindsOut(Out):
+    """All kinds of sources."""
+
+    items: list[SourceKindOut]
+
+
 class ArmRequest(In):
     """Keep a device's newest frames at hand."""
 
@@ -112,13 +132,23 @@ class CaptureRequest(In):
     model_config = examples(
         {"source": "sim:?seed=1", "frames": 1280, "name": "desk, by hand"},
         {"source": "sim:", "seconds": 0.1, "reconstruct": False},
+        rules=[
+            *exactly_one_of(source="string", device="string"),
+            *at_most_one_of(frames="integer", seconds="number"),
+            {
+                "not": {
+                    "required": ["record", "reconstruct"],
+                    "properties": {"record": {"const": False}, "reconstruct": {"const": False}},
+                }
+            },
+        ],
     )
 
     source: str | None = Field(
         None,
         min_length=1,
         max_length=4096,
-        description="usb0, pcie0, sim: or replay:FILE, with options after a question mark. "
+        description="usb0, pcie:PATH, sim: or replay:FILE, with options after a question mark. "
         "A file or simulation without `pace` waits for its readers.",
     )
     device: str | None = Field(
@@ -191,7 +221,7 @@ class VerdictOut(Out):
     reasons: list[str] = Field(description="Why it is not good, the worst first.")
 
     @classmethod
-    def of(cls, verdict: Judgement | None) -> "VerdictOut | None":
+    def of(cls, verdict: Quality | None) -> "VerdictOut | None":
         """As it is shown."""
         return None if verdict is None else cls(grade=verdict.grade, reasons=list(verdict.reasons))
 
@@ -202,7 +232,10 @@ class RecordingOut(Out):
     bytes: int
     frames: int
     first_frame: int = Field(description="Index in the capture of the first frame recorded.")
-    lost: int = Field(description="Frames missing between its first and its last.")
+    lost: int = Field(description="Frames missing between its first and the end of the capture.")
+    lost_by_cause: dict[str, int] = Field(
+        description="By cause: device, usb, ring; disk, which took what had come too slowly or not at all."
+    )
     sha256: str | None
 
     @classmethod
@@ -238,6 +271,7 @@ class CaptureOut(Out):
                         "frames": 1280,
                         "first_frame": 0,
                         "lost": 0,
+                        "lost_by_cause": {},
                         "sha256": None,
                     },
                     "reconstruction_ids": ["01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e11"],
@@ -258,7 +292,10 @@ class CaptureOut(Out):
     name: str
     notes: str
     keep: bool = Field(description="Retention leaves it alone.")
-    origin: Origin = Field(description="live: captured here; upload: a recording from elsewhere.")
+    origin: Origin = Field(
+        description="live: captured here; upload: a recording from elsewhere; recovered: found in the data folder, its "
+        "row rebuilt from its files."
+    )
     source: str
     state: CaptureState
     reason: str = Field(

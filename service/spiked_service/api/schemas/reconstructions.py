@@ -6,15 +6,14 @@ from pydantic import Field, StrictInt
 
 from spiked.recon import State
 from spiked_service.api.schemas.base import ID_EXAMPLE, Id, In, Out, PageOut, example
-from spiked_service.messages import Stage
-from spiked_service.reconstruction_options import ReconstructionOptions
-from spiked_service.store.rows import JobState, ReconstructionRow, VersionRow
+from spiked_service.settings.reconstruction_options import ReconstructionOptions
+from spiked_service.store.rows import JobState, ReconstructionRow, Stage, VersionRow
 
 
 class ReconstructionRequest(In):
     """A recording to reconstruct."""
 
-    model_config = example(capture_id=ID_EXAMPLE, options={"steps": 4000, "seed": 1}, priority=0)
+    model_config = example(capture_id=ID_EXAMPLE, options={"steps": 2000, "seed": 1}, priority=0)
 
     capture_id: str = Field(min_length=1, max_length=64)
     options: ReconstructionOptions = Field(default_factory=ReconstructionOptions)
@@ -52,7 +51,10 @@ class ReconstructionOut(Out):
     psnr_db: float | None
     version: int = Field(description="Number of the newest published scene and trajectory; 0: none yet.")
     white: float | None = Field(description="Radiance shown as white in that version, spikes a frame.")
-    eta_s: float | None
+    queue_place: int | None = Field(description="1 is the next to begin; null unless it waits in the queue.")
+    eta_s: float | None = Field(
+        description="Seconds to its end, those before its turn included; null where that is not known."
+    )
 
     @classmethod
     def of(cls, row: ReconstructionRow) -> "ReconstructionOut":

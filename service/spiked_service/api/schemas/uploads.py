@@ -25,7 +25,7 @@ class GeometryModel(In):
 
 
 class UploadSidecar(Sidecar):
-    """A recording's sidecar, as `spiked record` writes it beside the `.dat`."""
+    """A recording's sidecar, as it stands beside the `.dat`."""
 
     model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
 

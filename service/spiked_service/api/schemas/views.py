@@ -1,20 +1,23 @@
 """What to look at a scene through."""
 
-from typing import Self
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, StrictFloat, StrictInt, model_validator
 
 from spiked.pose import rotation_of
-from spiked_service.api.schemas.base import Finite, In, IntrinsicsModel, Quaternion, Vector, examples
-from spiked_service.views import Output, Pose
+from spiked_service.api.schemas.base import Finite, In, IntrinsicsModel, Quaternion, exactly_one_of, examples, together
+from spiked_service.results.view_renderer import Output, Pose
 
 MAX_VIEWS = 100
 MAX_SIDE = 4096
 MAX_PIXELS = 32_000_000
 
-Row = tuple[Finite, Finite, Finite, Finite]
+_Length = Annotated[StrictFloat, Field(ge=-1e9, le=1e9)]
+_Light = Annotated[StrictFloat, Field(ge=0, le=1e6)]
+Row = tuple[Finite, Finite, Finite, _Length]
+Position = tuple[_Length, _Length, _Length]
 
 
 class CameraModel(In):
@@ -24,10 +27,14 @@ class CameraModel(In):
         {"position": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]},
         {"c2w": [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]},
         {"frame": 100},
+        rules=[
+            *exactly_one_of(c2w="array", position="array", frame="integer"),
+            *together(position="array", quaternion_wxyz="array"),
+        ],
     )
 
     c2w: tuple[Row, Row, Row, Row] | None = Field(None, description="4x4, rows.")
-    position: Vector | None = None
+    position: Position | None = None
     quaternion_wxyz: Quaternion | None = Field(None, description="Of any length but zero.")
     frame: StrictInt | None = Field(
         None, ge=0, le=2**53 - 1, description="As the reconstructed camera was at this frame."
@@ -53,11 +60,10 @@ class CameraModel(In):
                 raise ValueError("c2w is not a rotation and a position above a row 0 0 0 1")
         else:
             quaternion = np.array(self.quaternion_wxyz)
-            if not 1e-6 < np.linalg.norm(quaternion) < 1e6:
-                raise ValueError("quaternion_wxyz is zero, or far from a rotation")
-            rotation, centre = rotation_of(quaternion), np.array(self.position)
-        if np.abs(centre).max() > 1e9:
-            raise ValueError("the camera is farther away than 1e9")
+            largest = np.abs(quaternion).max()
+            if largest == 0:
+                raise ValueError("quaternion_wxyz is zero")
+            rotation, centre = rotation_of(quaternion / largest), np.array(self.position)
         return Pose(rotation, centre)
 
 
@@ -78,6 +84,10 @@ class ViewRequest(In):
         {"camera": {"position": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}},
         {"camera": {"frame": 100}, "output": "depth"},
         {"path": {"count": 12}, "width": 200, "height": 125, "background": [0.1, 0.1, 0.1]},
+        rules=[
+            *exactly_one_of(camera="object", cameras="array", path="object"),
+            *together(width="integer", height="integer"),
+        ],
     )
 
     camera: CameraModel | None = None
@@ -90,7 +100,7 @@ class ViewRequest(In):
         description="Optics of the pictures; if not given the capture's own, scaled to the width, the height taken "
         "from or added to the middle.",
     )
-    background: tuple[StrictFloat, StrictFloat, StrictFloat] = Field(
+    background: tuple[_Light, _Light, _Light] = Field(
         (0.0, 0.0, 0.0), description="Red, green and blue behind the scene; 1 is white."
     )
     output: Output = Field(
@@ -112,6 +122,4 @@ class ViewRequest(In):
             raise ValueError("give one of camera, cameras and path")
         if (self.width is None) != (self.height is None):
             raise ValueError("give width and height together")
-        if not all(0 <= part <= 1e6 for part in self.background):
-            raise ValueError("background is three numbers that are not negative")
         return self

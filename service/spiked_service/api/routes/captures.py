@@ -1,0 +1,94 @@
+"""Captures: start, list, change, stop and remove them."""
+
+from http import HTTPStatus
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.routing import APIRoute
+
+from spiked_service.api.idempotency import IdempotencyKey
+from spiked_service.api.problems import problems
+from spiked_service.api.schemas.base import Cursor, Limit
+from spiked_service.api.schemas.captures import CaptureChange, CaptureOut, CapturePage, CaptureRequest
+from spiked_service.api.sources import Sources
+from spiked_service.captures.captures import Captures
+from spiked_service.store.rows import CaptureState, Plan
+
+
+def capture_routes(captures: Captures, sources: Sources, route_class: type[APIRoute]) -> APIRouter:
+    """Routes below `captures`."""
+    router = APIRouter(prefix="/captures", tags=["captures"], route_class=route_class)
+
+    @router.post("", status_code=HTTPStatus.CREATED, responses=problems(404, 409, 507))
+    def start_capture(
+        body: CaptureRequest, request: Request, response: Response, idempotency_key: IdempotencyKey = None
+    ) -> CaptureOut:
+        """Start a capture. A device runs one capture at a time."""
+        snapshot = captures.start(_plan(body, sources))
+        response.headers["Location"] = request.url_for("get_capture", capture_id=snapshot.row.id).path
+        return CaptureOut.of(snapshot)
+
+    @router.get("", responses=problems())
+    def list_captures(
+        limit: Limit = 50,
+        cursor: Cursor = None,
+        q: Annotated[
+            str | None, Query(max_length=200, description="Text to search for in name, notes and source.")
+        ] = None,
+        state: CaptureState | None = None,
+        deleted: Annotated[bool, Query(description="List removed captures instead.")] = False,
+    ) -> CapturePage:
+        """Captures, newest first."""
+        page = captures.list(limit, cursor, q, state, deleted)
+        items = [CaptureOut.of(captures.snapshot(row)) for row in page.items]
+        return CapturePage(items=items, next_cursor=page.next_cursor)
+
+    @router.get("/{capture_id:id}", responses=problems(404))
+    def get_capture(capture_id: str) -> CaptureOut:
+        """State, counters and recording of a capture."""
+        return CaptureOut.of(captures.get(capture_id))
+
+    @router.patch("/{capture_id:id}", responses=problems(404))
+    def change_capture(capture_id: str, body: CaptureChange) -> CaptureOut:
+        """Change its name or notes, or exclude it from retention."""
+        captures.update(capture_id, name=body.name, notes=body.notes, keep=body.keep)
+        return CaptureOut.of(captures.get(capture_id))
+
+    _add_end_routes(router, captures)
+    return router
+
+
+def _add_end_routes(router: APIRouter, captures: Captures) -> None:
+    """Routes that stop, remove and restore a capture."""
+
+    @router.delete("/{capture_id:id}", status_code=HTTPStatus.NO_CONTENT, responses=problems(404, 409))
+    def remove_capture(capture_id: str) -> None:
+        """Remove it with its files and reconstructions; `:restore` undoes it for some days."""
+        captures.remove(capture_id)
+
+    @router.post("/{capture_id:id}:restore", responses=problems(404, 409))
+    def restore_capture(capture_id: str, idempotency_key: IdempotencyKey = None) -> CaptureOut:
+        """Undo its removal."""
+        captures.restore(capture_id)
+        return CaptureOut.of(captures.get(capture_id))
+
+    @router.post("/{capture_id:id}:stop", status_code=HTTPStatus.ACCEPTED, responses=problems(404, 409))
+    def stop_capture(capture_id: str, idempotency_key: IdempotencyKey = None) -> CaptureOut:
+        """End the acquisition; the reconstruction is refined. A second call ends the refinement too."""
+        captures.stop(capture_id)
+        return CaptureOut.of(captures.get(capture_id))
+
+
+def _plan(body: CaptureRequest, sources: Sources) -> Plan:
+    return Plan(
+        source=sources.named(body.source, body.device),
+        frames=body.frames,
+        seconds=body.seconds,
+        pretrigger_s=body.pretrigger_s,
+        name=body.name,
+        notes=body.notes,
+        record=body.record,
+        reconstruct=body.reconstruct,
+        options=body.options,
+        intrinsics=body.intrinsics.intrinsics() if body.intrinsics else None,
+    )

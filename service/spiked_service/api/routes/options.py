@@ -1,0 +1,69 @@
+"""`options`: the options of a reconstruction and of each kind of source, as JSON Schema."""
+
+from typing import Any
+
+from fastapi import APIRouter
+from spiked_driver.source_kinds import KINDS
+
+from spiked_service.api.problems import problems
+from spiked_service.api.schemas.captures import SourceKindOut, SourceKindsOut
+from spiked_service.settings.reconstruction_options import ReconstructionOptions
+
+
+def whole(schema: dict[str, Any]) -> dict[str, Any]:
+    """A JSON schema with its references resolved, because references do not work in examples of OpenAPI."""
+    definitions = schema.pop("$defs", {})
+
+    def resolved(node: Any) -> Any:
+        if isinstance(node, list):
+            return [resolved(one) for one in node]
+        if not isinstance(node, dict):
+            return node
+        name = str(node.get("$ref", "")).removeprefix("#/$defs/")
+        if name in definitions:
+            node = {**definitions[name], **{key: value for key, value in node.items() if key != "$ref"}}
+        return {key: resolved(value) for key, value in node.items()}
+
+    found: dict[str, Any] = resolved(schema)
+    return found
+
+
+_SCHEMA = whole(ReconstructionOptions.model_json_schema())
+_EXAMPLE = {"type": "object", "title": "JSON Schema", "additionalProperties": True, "examples": [_SCHEMA]}
+
+
+def option_routes() -> APIRouter:
+    """`options`."""
+    router = APIRouter()
+
+    @router.get(
+        "/options",
+        tags=["reconstructions"],
+        responses={
+            200: {"description": "JSON Schema 2020-12.", "content": {"application/json": {"schema": _EXAMPLE}}},
+            **problems(),
+        },
+    )
+    def get_options() -> dict[str, Any]:
+        """The options of a reconstruction as JSON Schema: names, types, limits, defaults and meaning."""
+        return _SCHEMA
+
+    @router.get("/options/sources", tags=["devices"], responses=problems())
+    def list_source_kinds() -> SourceKindsOut:
+        """The kinds of sources a capture can name, with their options as JSON Schema."""
+        return SourceKindsOut(
+            items=[
+                SourceKindOut(
+                    name=kind.name,
+                    usage=kind.usage,
+                    summary=kind.summary,
+                    is_camera=kind.is_camera,
+                    can_block=kind.can_block,
+                    takes_path=kind.takes_path,
+                    options=whole(kind.options.model_json_schema()),
+                )
+                for kind in KINDS
+            ]
+        )
+
+    return router

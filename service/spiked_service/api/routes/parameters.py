@@ -1,0 +1,18 @@
+"""Parameters and documented responses that several routes have in common."""
+
+from typing import Annotated, Any
+
+from fastapi import Query
+
+from spiked_service.api.schemas.base import LARGEST_INTEGER
+from spiked_service.results.image_encoding import ImageFormat
+
+Version = Annotated[
+    int | None, Query(ge=1, le=LARGEST_INTEGER, description="Default: the newest; `GET versions` lists them.")
+]
+WishedImage = Annotated[ImageFormat | None, Query(description="Takes precedence over Accept; the default is PNG.")]
+
+BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
+ETAG: dict[str, Any] = {"ETag": {"description": "Changes with the content.", "schema": {"type": "string"}}}
+NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "The content has not changed."}}
+PICTURES: dict[str, Any] = {kind.media_type: BINARY for kind in ImageFormat}

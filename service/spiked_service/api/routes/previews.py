@@ -1,0 +1,141 @@
+"""Images and statistics of a capture: of the newest frames, of recorded frames, or of its scene."""
+
+import base64
+import threading
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi.routing import APIRoute
+
+from spiked.recording import open_recording
+from spiked_service.api import files
+from spiked_service.api.problems import NotReadyError, problems
+from spiked_service.api.results import Result, Results
+from spiked_service.api.routes.parameters import BINARY, NOT_MODIFIED, PICTURES, WishedImage
+from spiked_service.api.schemas.base import LARGEST_INTEGER
+from spiked_service.api.schemas.captures import StatsOut
+from spiked_service.api.schemas.views import ViewRequest
+from spiked_service.api.views import image_format, views_response
+from spiked_service.captures.captures import Captures
+from spiked_service.results.frame_images import FrameWindow, PictureKind, frame_window_at, picture, statistics
+from spiked_service.results.image_encoding import ImageFormat, encode, thumbnail
+from spiked_service.results.versions import write_atomically
+from spiked_service.results.view_renderer import ViewRenderer
+from spiked_service.store.folder import DataFolder
+from spiked_service.workers.messages import PreviewKind
+
+Frame = Annotated[
+    int | None,
+    Query(ge=0, le=LARGEST_INTEGER, description="Absolute index of a recorded frame. Default: the newest frames."),
+]
+Gain = Annotated[float, Query(ge=0.001, le=1000, description="Factor of the brightness.")]
+White = Annotated[
+    float | None,
+    Query(
+        ge=1e-6, le=1e6, description="Value shown as white. Default: determined from the image and returned in X-White."
+    ),
+]
+_PICTURE: dict[int | str, dict[str, Any]] = {
+    200: {"description": "The image; X-Frame is its middle frame.", "content": PICTURES},
+    **problems(404),
+}
+_THUMBNAIL: dict[int | str, dict[str, Any]] = {
+    200: {"description": "The image.", "content": {"image/webp": BINARY}},
+    **NOT_MODIFIED,
+    **problems(404),
+}
+
+
+def preview_routes(
+    captures: Captures, folder: DataFolder, results: Results, views: ViewRenderer, route_class: type[APIRoute]
+) -> APIRouter:
+    """Preview, thumbnail and statistics below `captures/ID`."""
+    router = APIRouter(prefix="/captures/{capture_id:id}", tags=["captures"], route_class=route_class)
+    drawing = threading.Lock()
+
+    @router.get("/preview", responses=_PICTURE, response_class=Response)
+    def get_preview(
+        capture_id: str,
+        kind: PictureKind = PictureKind.INTERVAL,
+        frame: Frame = None,
+        gain: Gain = 1.0,
+        white: White = None,
+        format: WishedImage = None,
+        accept: Annotated[str, Header(include_in_schema=False)] = "",
+    ) -> Response:
+        """An image of the newest frames, of the frames around a recorded one, or of the scene from its pose."""
+        wished = image_format(format, accept)
+        if kind is PictureKind.RENDER:
+            result = results.of(results.newest(capture_id))
+            return views_response(result, _view_at(result, frame, white, gain), wished, views)
+        if frame is None and captures.get(capture_id).row.state.acquiring:
+            return _live_preview(captures, capture_id, PreviewKind(kind))
+        return _recorded_preview(_frame_window(captures, folder, capture_id, frame), kind, white, gain, wished)
+
+    @router.get("/thumbnail", responses=_THUMBNAIL, response_class=Response)
+    def get_thumbnail(capture_id: str, request: Request) -> Response:
+        """A small image: the last preview, else of its recording."""
+        row = captures.get(capture_id).row
+        path = folder.thumbnail(capture_id)
+        if not path.exists():
+            if not row.state.over:
+                raise NotReadyError(f"capture {capture_id} has no image yet")
+            with drawing:
+                if not path.exists():
+                    window = _frame_window(captures, folder, capture_id, None)
+                    write_atomically(path, thumbnail(picture(window, PictureKind.INTERVAL, None).image))
+        return files.content(request, path.read_bytes(), "image/webp", files.etag(files.stamp(path)))
+
+    @router.get("/stats", responses=problems(404))
+    def get_stats(capture_id: str, frame: Frame = None) -> StatsOut:
+        """Spike rates over a few frames: the newest, or those around a recorded frame."""
+        if frame is None and captures.get(capture_id).row.state.acquiring:
+            stats = captures.picture(capture_id)
+            if stats is None:
+                raise NotReadyError(f"capture {capture_id} has no frames yet")
+            return StatsOut.of(stats)
+        return StatsOut.of(statistics(_frame_window(captures, folder, capture_id, frame)))
+
+    return router
+
+
+def _live_preview(captures: Captures, capture_id: str, kind: PreviewKind) -> Response:
+    """The newest image of the preview worker."""
+    taken = captures.picture(capture_id)
+    if taken is None:
+        raise NotReadyError(f"capture {capture_id} has no image yet")
+    return Response(
+        base64.b64decode(taken.images[kind]), media_type="image/webp", headers=_headers(taken.white[kind], taken.frame)
+    )
+
+
+def _recorded_preview(
+    window: FrameWindow, kind: PictureKind, white: float | None, gain: float, wished: ImageFormat
+) -> Response:
+    """An image of recorded frames."""
+    shown = picture(window, kind, white)
+    limit = shown.white / gain
+    return Response(
+        encode(shown.image, wished, limit), media_type=wished.media_type, headers=_headers(limit, shown.frame)
+    )
+
+
+def _headers(white: float, frame: int) -> dict[str, str]:
+    return {"X-White": repr(white), "X-Frame": str(frame), "Cache-Control": "no-store"}
+
+
+def _view_at(result: Result, frame: int | None, white: float | None, gain: float) -> ViewRequest:
+    """The view from the pose of a frame, of the newest pose if None."""
+    rate = 1.0 if result.sensor is None else result.sensor.frame_rate_hz
+    pose = round(result.poses().time_s(-1) * rate - 0.5) if frame is None else frame
+    shown_white = (result.published.white if white is None else white) / gain
+    return ViewRequest.model_validate({"camera": {"frame": pose}, "white": shown_white})
+
+
+def _frame_window(captures: Captures, folder: DataFolder, capture_id: str, frame: int | None) -> FrameWindow:
+    """Recorded frames around `frame`. Raises UnknownIdError, NotReadyError without a recording."""
+    row = captures.get(capture_id).row
+    path = folder.recording(capture_id)
+    if not path.exists():
+        raise NotReadyError(f"capture {capture_id} has no recording")
+    return frame_window_at(open_recording(path), frame, 0 if row.recording is None else row.recording.first_frame)

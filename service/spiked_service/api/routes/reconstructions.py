@@ -1,0 +1,129 @@
+"""Reconstructions: start, list, cancel, restart and remove them; their versions, timeline and log."""
+
+from http import HTTPStatus
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import PlainTextResponse
+from fastapi.routing import APIRoute
+
+from spiked_service.api import files
+from spiked_service.api.idempotency import IdempotencyKey
+from spiked_service.api.problems import problems
+from spiked_service.api.schemas.base import Cursor, Limit
+from spiked_service.api.schemas.reconstructions import (
+    GapOut,
+    ReconstructionOut,
+    ReconstructionPage,
+    ReconstructionRequest,
+    RestartRequest,
+    TimelineOut,
+    VersionOut,
+    VersionsOut,
+)
+from spiked_service.reconstructions.queue import Reconstructions
+from spiked_service.reconstructions.repository import ReconstructionRepository
+from spiked_service.results.timeline import Timeline
+from spiked_service.store.rows import JobState
+
+_LOG_BYTES = 1 << 20
+"""The log is shown from this many bytes before its end."""
+
+
+def reconstruction_routes(reconstructions: Reconstructions, route_class: type[APIRoute]) -> APIRouter:
+    """Routes below `reconstructions`."""
+    rows = reconstructions.rows
+    router = APIRouter(prefix="/reconstructions", tags=["reconstructions"], route_class=route_class)
+
+    @router.post("", status_code=HTTPStatus.ACCEPTED, responses=problems(404, 409, 507))
+    def start_reconstruction(
+        body: ReconstructionRequest, request: Request, response: Response, idempotency_key: IdempotencyKey = None
+    ) -> ReconstructionOut:
+        """Queue a reconstruction of a recording; live captures precede the queue."""
+        row = reconstructions.submit(body.capture_id, body.options, body.priority)
+        response.headers["Location"] = request.url_for("get_reconstruction", reconstruction_id=row.id).path
+        return ReconstructionOut.of(row)
+
+    @router.get("", responses=problems())
+    def list_reconstructions(
+        limit: Limit = 50,
+        cursor: Cursor = None,
+        capture_id: Annotated[str | None, Query(min_length=1, max_length=64)] = None,
+        state: JobState | None = None,
+    ) -> ReconstructionPage:
+        """Reconstructions, newest first."""
+        page = rows.page(limit, cursor, capture_id, state)
+        return ReconstructionPage(items=[ReconstructionOut.of(row) for row in page.items], next_cursor=page.next_cursor)
+
+    @router.get("/{reconstruction_id:id}", responses=problems(404))
+    def get_reconstruction(reconstruction_id: str) -> ReconstructionOut:
+        """State and progress of a reconstruction."""
+        return ReconstructionOut.of(rows.get(reconstruction_id))
+
+    @router.post("/{reconstruction_id:id}:cancel", status_code=HTTPStatus.ACCEPTED, responses=problems(404, 409))
+    def cancel_reconstruction(reconstruction_id: str, idempotency_key: IdempotencyKey = None) -> ReconstructionOut:
+        """End it; published versions are kept."""
+        reconstructions.cancel(reconstruction_id)
+        return ReconstructionOut.of(rows.get(reconstruction_id))
+
+    @router.post("/{reconstruction_id:id}:restart", status_code=HTTPStatus.ACCEPTED, responses=problems(404, 409))
+    def restart_reconstruction(
+        reconstruction_id: str, body: RestartRequest | None = None, idempotency_key: IdempotencyKey = None
+    ) -> ReconstructionOut:
+        """Restart it from the recording, with new options if given; version numbers continue."""
+        reconstructions.restart(reconstruction_id, None if body is None else body.options)
+        return ReconstructionOut.of(rows.get(reconstruction_id))
+
+    @router.delete("/{reconstruction_id:id}", status_code=HTTPStatus.NO_CONTENT, responses=problems(404, 409))
+    def remove_reconstruction(reconstruction_id: str) -> None:
+        """Delete it with its published versions."""
+        reconstructions.remove(reconstruction_id)
+
+    return router
+
+
+def reconstruction_record_routes(rows: ReconstructionRepository, route_class: type[APIRoute]) -> APIRouter:
+    """Versions, timeline and log below `reconstructions/ID`."""
+    router = APIRouter(
+        prefix="/reconstructions/{reconstruction_id:id}", tags=["reconstructions"], route_class=route_class
+    )
+
+    @router.get("/versions", responses=problems(404))
+    def list_versions(reconstruction_id: str) -> VersionsOut:
+        """Available versions, oldest first."""
+        return VersionsOut(items=[VersionOut.of(row) for row in rows.versions(reconstruction_id)])
+
+    @router.get("/timeline", responses=problems(404))
+    def get_timeline(reconstruction_id: str) -> TimelineOut:
+        """Timeline: state, fit and loss over the frames."""
+        return _timeline(Timeline.read(rows.timeline(reconstruction_id)))
+
+    @router.get("/log", responses=problems(404), response_class=PlainTextResponse)
+    def get_log(reconstruction_id: str, request: Request) -> Response:
+        """The end of its log, as text."""
+        path = rows.log(reconstruction_id)
+        if not path.exists():
+            return PlainTextResponse("")
+        stamp = files.stamp(path)
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - _LOG_BYTES))
+            text = file.read(_LOG_BYTES).decode(errors="replace")
+        return files.content(request, text.encode(), "text/plain; charset=utf-8", files.etag("log", stamp))
+
+    return router
+
+
+def _timeline(timeline: Timeline) -> TimelineOut:
+    moments = timeline.moments
+    return TimelineOut(
+        time_s=[moment.time_s for moment in moments],
+        frame=[moment.frame for moment in moments],
+        state=[moment.state for moment in moments],
+        chi2=[moment.chi2 for moment in moments],
+        sigma_px=[moment.sigma_px for moment in moments],
+        rate=[moment.rate for moment in moments],
+        loss=[moment.loss for moment in moments],
+        psnr_db=[moment.psnr_db for moment in moments],
+        splats=[moment.splats for moment in moments],
+        gaps=[GapOut(first=gap.first, count=gap.count, cause=gap.cause) for gap in timeline.gaps],
+    )

@@ -1,0 +1,180 @@
+"""Trajectory, scene and views of a reconstruction, below `reconstructions` and below `captures`."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi.routing import APIRoute
+
+from spiked_service.api.auth.scopes import needs
+from spiked_service.api.problems import problems
+from spiked_service.api.results import Results, SceneFormat
+from spiked_service.api.routes.parameters import BINARY, ETAG, NOT_MODIFIED, PICTURES, Version, WishedImage
+from spiked_service.api.schemas.reconstructions import TrajectoryOut
+from spiked_service.api.schemas.views import ViewRequest
+from spiked_service.api.trajectories import Range, TrajectoryFormat
+from spiked_service.api.views import image_format, views_response
+from spiked_service.reconstructions.repository import ReconstructionRepository
+from spiked_service.results.view_renderer import ViewRenderer
+from spiked_service.settings.tokens import Scope
+from spiked_service.store.rows import ReconstructionRow
+
+FromS = Annotated[float | None, Query(ge=0, le=1e9, description="First time, seconds since the start of the capture.")]
+ToS = Annotated[float | None, Query(ge=0, le=1e9, description="End time, not included, in seconds.")]
+Step = Annotated[int, Query(ge=1, le=1_000_000, description="Every n-th pose.")]
+MaxSplats = Annotated[
+    int | None, Query(ge=1, le=10_000_000, description="Most splats: a fixed sample is returned. Default: all.")
+]
+
+_TEXT: dict[str, Any] = {"schema": {"type": "string"}}
+_VERSION: dict[str, Any] = {"X-Scene-Version": {"description": "Its version.", "schema": {"type": "integer"}}}
+_TRAJECTORY: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The trajectory.",
+        "headers": {**ETAG, **_VERSION},
+        "content": {
+            "application/json": {"schema": {"$ref": "#/components/schemas/TrajectoryOut"}},
+            "text/plain": _TEXT,
+            "application/vnd.nerfstudio+json": {"schema": {"type": "object", "additionalProperties": True}},
+            "application/zip": BINARY,
+        },
+    },
+    **NOT_MODIFIED,
+    **problems(404),
+}
+_SCENE: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The scene.",
+        "headers": {**ETAG, **_VERSION},
+        "content": {"application/octet-stream": BINARY},
+    },
+    206: {"description": "The requested range.", "content": {"application/octet-stream": BINARY}},
+    **NOT_MODIFIED,
+    **problems(404, 416),
+}
+_VIEWS: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The image; for several views a ZIP of images and views.json.",
+        "headers": _VERSION,
+        "content": {**PICTURES, "application/zip": BINARY},
+    },
+    **problems(404),
+}
+
+
+@dataclass(frozen=True)
+class _Operation:
+    """Name and description of an operation in the OpenAPI document."""
+
+    name: str
+    description: str
+
+
+def capture_result_routes(results: Results, views: ViewRenderer, route_class: type[APIRoute]) -> APIRouter:
+    """Results of the newest reconstruction of a capture."""
+
+    def newest(capture_id: str) -> ReconstructionRow:
+        return results.newest(capture_id)
+
+    return _result_routes(
+        APIRouter(prefix="/captures/{capture_id:id}", tags=["captures"], route_class=route_class),
+        newest,
+        results,
+        views,
+        trajectory=_Operation("get_trajectory", "The trajectory of its newest reconstruction."),
+        scene=_Operation("get_scene", "The scene of its newest reconstruction; its ETag changes with the version."),
+        render=_Operation(
+            "render_views",
+            "Images of its newest reconstruction: from one camera, from several, or along the path.",
+        ),
+    )
+
+
+def reconstruction_result_routes(
+    rows: ReconstructionRepository, results: Results, views: ViewRenderer, route_class: type[APIRoute]
+) -> APIRouter:
+    """Results of a reconstruction."""
+
+    def named(reconstruction_id: str) -> ReconstructionRow:
+        return rows.get(reconstruction_id)
+
+    return _result_routes(
+        APIRouter(prefix="/reconstructions/{reconstruction_id:id}", tags=["reconstructions"], route_class=route_class),
+        named,
+        results,
+        views,
+        trajectory=_Operation(
+            "get_reconstruction_trajectory",
+            "The trajectory of a version, or a part of it: JSON, TUM, KITTI, COLMAP or nerfstudio.",
+        ),
+        scene=_Operation(
+            "get_reconstruction_scene",
+            "The scene of a version as 3DGS PLY (RDF axes) or SPZ (RUB axes); X-White is the radiance of colour 1.",
+        ),
+        render=_Operation(
+            "render_reconstruction_views",
+            "Images of a version: from one camera, from several, or along the path; colour, depth or alpha.",
+        ),
+    )
+
+
+def _result_routes(
+    router: APIRouter,
+    find: Callable[..., ReconstructionRow],
+    results: Results,
+    views: ViewRenderer,
+    *,
+    trajectory: _Operation,
+    scene: _Operation,
+    render: _Operation,
+) -> APIRouter:
+    """Add the routes to `router`; `find` takes the id in its path and returns the reconstruction."""
+
+    @router.get(
+        "/trajectory",
+        name=trajectory.name,
+        description=trajectory.description,
+        responses=_TRAJECTORY,
+        response_model=TrajectoryOut,
+        response_class=Response,
+    )
+    def get_trajectory(
+        request: Request,
+        row: Annotated[ReconstructionRow, Depends(find)],
+        format: TrajectoryFormat = TrajectoryFormat.JSON,
+        version: Version = None,
+        from_s: FromS = None,
+        to_s: ToS = None,
+        step: Step = 1,
+    ) -> Response:
+        return results.trajectory(request, results.of(row, version), format, Range(from_s, to_s, step))
+
+    @router.get("/scene", name=scene.name, description=scene.description, responses=_SCENE, response_class=Response)
+    def get_scene(
+        request: Request,
+        row: Annotated[ReconstructionRow, Depends(find)],
+        format: SceneFormat = SceneFormat.PLY,
+        version: Version = None,
+        max_splats: MaxSplats = None,
+    ) -> Response:
+        return results.scenes.response(request, results.of(row, version), format, max_splats)
+
+    @router.post(
+        "/views",
+        name=render.name,
+        description=render.description,
+        responses=_VIEWS,
+        response_class=Response,
+        openapi_extra=needs(Scope.READ),
+    )
+    def render_views(
+        row: Annotated[ReconstructionRow, Depends(find)],
+        body: ViewRequest,
+        format: WishedImage = None,
+        version: Version = None,
+        accept: Annotated[str, Header(include_in_schema=False)] = "",
+    ) -> Response:
+        return views_response(results.of(row, version), body, image_format(format, accept), views)
+
+    return router

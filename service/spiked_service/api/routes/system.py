@@ -1,0 +1,90 @@
+"""`system`: version, uptime, disk and memory of the service."""
+
+import os
+import resource
+import time
+from datetime import UTC, datetime
+
+from fastapi import APIRouter, Request
+from pydantic import BaseModel, Field
+
+from spiked_service.api.problems import problems
+from spiked_service.api.services import Services
+from spiked_service.base.version import installed_version
+from spiked_service.operations.doctor import USB_CAMERA
+from spiked_service.settings.tokens import Scope
+
+
+class DiskOut(BaseModel):
+    """The disk below the data folder."""
+
+    free_bytes: int
+    total_bytes: int
+    recording_s: float = Field(
+        description="How long a recording there is room for, of the camera that runs at the rate that it states, or of "
+        "a USB camera if none runs."
+    )
+    recording_of: str = Field(description="That camera.", examples=["400x250 at 20 kHz"])
+
+
+class ZmqOut(BaseModel):
+    """Addresses of the ZeroMQ sockets, on this machine."""
+
+    events: str = Field(description="PUB: all but pictures.", examples=["tcp://127.0.0.1:8651"])
+    state: str = Field(description="REP: the newest message of each kind, or those after a number.")
+    previews: str = Field(description="PUB: pictures.")
+
+
+class SystemOut(BaseModel):
+    """The running service."""
+
+    version: str = Field(examples=["0.1.0"])
+    started_at: datetime
+    uptime_s: float
+    data_folder: str
+    disk: DiskOut
+    memory_bytes: int = Field(description="Resident memory of the service itself, without its workers.")
+    pid: int
+    events_seq: int = Field(description="Number of the newest event.")
+    event_clients: int = Field(description="Clients of the events now, WebSocket and server-sent events.")
+    zmq: ZmqOut | None = Field(description="null where ZeroMQ is turned off.")
+    scope: Scope = Field(description="Scope of the token of this request; admin where no token is required.")
+
+
+def system_routes(services: Services) -> APIRouter:
+    """`system`."""
+    router = APIRouter(tags=["operations"])
+    started_at, started_s = datetime.now(UTC), time.monotonic()
+
+    @router.get("/system", responses=problems())
+    def get_system(request: Request) -> SystemOut:
+        """Version, uptime, disk, memory, and what the token of the request allows."""
+        space = services.folder.space()
+        running = (one.row.sensor for one in services.captures.live() if one.row.sensor is not None)
+        sensor = next(running, USB_CAMERA)
+        return SystemOut(
+            version=installed_version(),
+            started_at=started_at,
+            uptime_s=time.monotonic() - started_s,
+            data_folder=str(services.folder.path),
+            disk=DiskOut(
+                free_bytes=space.free_bytes,
+                total_bytes=space.total_bytes,
+                recording_s=space.recording_s(sensor),
+                recording_of=f"{sensor.width}x{sensor.height} at {sensor.frame_rate_hz / 1e3:g} kHz",
+            ),
+            memory_bytes=resident_bytes(),
+            pid=os.getpid(),
+            events_seq=services.bus.seq,
+            event_clients=services.event_clients.active,
+            zmq=None if services.zmq is None else ZmqOut(**vars(services.zmq)),
+            scope=request.state.caller.scope,
+        )
+
+    return router
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process, from /proc."""
+    with open("/proc/self/statm") as file:  # noqa: PTH123 - read at every scrape
+        return int(file.read().split()[1]) * resource.getpagesize()

@@ -1,0 +1,232 @@
+"""Trajectories over HTTP: a range of the poses of a version in one of the formats, streamed in pieces."""
+
+import io
+import threading
+import zipfile
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fastapi import Request, Response
+from numpy.typing import NDArray
+from pydantic_core import to_json
+
+from spiked.errors import ConfigurationError, SceneError
+from spiked.pose import Array
+from spiked.poses import PoseFile, Records, convert_tum
+from spiked.sensor import Sensor
+from spiked.trajectory import (
+    Trajectory,
+    colmap_camera,
+    colmap_lines,
+    kitti_lines,
+    nerfstudio_lines,
+    tum_lines,
+)
+from spiked_service.api import files
+from spiked_service.api.problems import GoneError, NoPoseError
+from spiked_service.api.streams import GuardedStream
+from spiked_service.base.limits import ConcurrencyLimit
+from spiked_service.results.timeline import Timeline, frames_at
+from spiked_service.results.versions import Published, pose_file
+
+_PIECE = 4096
+"""Poses of a piece: between pieces other requests run and a disconnect of the client is noticed."""
+_KEPT = 16
+"""Pieces cached for all columns of JSON: with a large step every pose is on another page of the file."""
+_DECIMALS = 9
+_CONVERTING = threading.Lock()
+
+
+class TrajectoryFormat(StrEnum):
+    """How a trajectory is written."""
+
+    JSON = "json"
+    TUM = "tum"
+    KITTI = "kitti"
+    COLMAP = "colmap"
+    """A ZIP of cameras.txt, images.txt and an empty points3D.txt, as COLMAP's text model."""
+    NERFSTUDIO = "nerfstudio"
+
+
+TRAJECTORY_TYPES = {
+    TrajectoryFormat.JSON: ("application/json", "json"),
+    TrajectoryFormat.TUM: ("text/plain; charset=utf-8", "tum"),
+    TrajectoryFormat.KITTI: ("text/plain; charset=utf-8", "kitti.txt"),
+    TrajectoryFormat.COLMAP: ("application/zip", "colmap.zip"),
+    TrajectoryFormat.NERFSTUDIO: ("application/vnd.nerfstudio+json", "transforms.json"),
+}
+
+
+@dataclass(frozen=True)
+class Range:
+    """A part of a trajectory."""
+
+    from_s: float | None
+    to_s: float | None
+    step: int
+
+    def of(self, poses: PoseFile) -> range:
+        """The rows with from_s <= time < to_s, every step-th. Raises NoPoseError if there are none."""
+        rows = poses.between(
+            -np.inf if self.from_s is None else self.from_s, np.inf if self.to_s is None else self.to_s
+        )
+        if not rows:
+            raise NoPoseError(
+                f"no pose lies in this range; there are poses from {poses.time_s(0):.6f} to {poses.time_s(-1):.6f} s"
+                if len(poses)
+                else "this version has no poses"
+            )
+        return rows[:: self.step]
+
+
+def open_poses(folder: Path, published: Published, sensor: Sensor | None, timeline: Path) -> PoseFile:
+    """The poses of a version. The TUM files of older releases are converted at the first request.
+
+    Raises GoneError if the version has just been let go of, SceneError.
+    """
+    path, tum = pose_file(folder, published), folder / published.trajectory
+    if not path.exists():
+        with _CONVERTING:
+            if not path.exists():
+                _convert(tum, path, sensor, timeline)
+    return PoseFile(path)
+
+
+def _convert(tum: Path, poses: Path, sensor: Sensor | None, timeline: Path) -> None:
+    if not tum.exists() or tum == poses:
+        raise GoneError("this version was removed; request the newest one")
+
+    def states(times_s: Array) -> NDArray[np.bytes_]:
+        return known.states_at(frames_at(times_s, _rate_hz(sensor)))
+
+    known = Timeline.read(timeline)
+    try:
+        convert_tum(tum, poses, states)
+    except OSError as error:
+        raise SceneError(f"cannot convert {tum.name}: {error.strerror}; free disk space") from error
+
+
+def trajectory_response(
+    request: Request,
+    poses: PoseFile,
+    version: int,
+    sensor: Sensor | None,
+    kind: TrajectoryFormat,
+    part: Range,
+    concurrency: ConcurrencyLimit,
+) -> Response:
+    """A range of poses in one of the formats; `concurrency` limits concurrent responses.
+
+    Raises NoPoseError, ConfigurationError, OverloadedError.
+    """
+    tag = files.etag(version, kind, files.stamp(poses.path), part.from_s, part.to_s, part.step)
+    if files.unchanged(request, tag):
+        return files.not_modified(tag)
+    rows = part.of(poses)
+    if kind in (TrajectoryFormat.NERFSTUDIO, TrajectoryFormat.COLMAP) and (sensor is None or sensor.intrinsics is None):
+        raise ConfigurationError("this format needs the optics, which are unknown for this capture; use format=tum")
+    media_type, ending = TRAJECTORY_TYPES[kind]
+    headers = {**files.attached(tag, f"trajectory.{ending}"), "X-Scene-Version": str(version)}
+    concurrency.acquire()
+    return GuardedStream(_written(poses, rows, version, sensor, kind), media_type, headers, over=concurrency.release)
+
+
+def _written(
+    poses: PoseFile, rows: range, version: int, sensor: Sensor | None, kind: TrajectoryFormat
+) -> Iterator[str] | Iterator[bytes]:
+    parts = (poses.trajectory(piece) for piece in _pieces(rows))
+    match kind:
+        case TrajectoryFormat.TUM:
+            return tum_lines(parts)
+        case TrajectoryFormat.KITTI:
+            return kitti_lines(parts)
+        case TrajectoryFormat.JSON:
+            return _json(poses, rows, version, _rate_hz(sensor))
+        case TrajectoryFormat.NERFSTUDIO:
+            assert sensor is not None
+            return nerfstudio_lines(parts, sensor)
+        case TrajectoryFormat.COLMAP:
+            assert sensor is not None
+            return _colmap(parts, sensor)
+
+
+def _pieces(rows: range) -> Iterator[range]:
+    return (rows[first : first + _PIECE] for first in range(0, len(rows), _PIECE))
+
+
+def _rate_hz(sensor: Sensor | None) -> float:
+    return 1.0 if sensor is None else sensor.frame_rate_hz
+
+
+def _json(poses: PoseFile, rows: range, version: int, rate_hz: float) -> Iterator[bytes]:
+    """A `TrajectoryOut`, one column after the other."""
+    columns: dict[str, Callable[[Records], Array | NDArray[np.int64]]] = {
+        "frames": lambda found: frames_at(found["time_s"], rate_hz),
+        "times_s": lambda found: found["time_s"],
+        "positions": lambda found: np.round(found["position"], _DECIMALS),
+        "quaternions_wxyz": lambda found: np.round(found["quaternion_wxyz"], _DECIMALS),
+    }
+    kept: dict[range, Records] = {}
+
+    def found() -> Iterator[Records]:
+        for piece in _pieces(rows):
+            part = kept.get(piece)
+            part = poses.records(piece) if part is None else part
+            if len(kept) < _KEPT:
+                kept[piece] = part
+            yield part
+
+    yield b'{"version":%d' % version
+    for name, column in columns.items():
+        yield from _array(name, (column(part).tolist() for part in found()))
+    yield from _array("states", ([_state(one) for one in part["state"].tolist()] for part in found()))
+    yield b"}"
+
+
+def _array(name: str, parts: Iterable[list[Any]]) -> Iterator[bytes]:
+    begin = b',"%s":[' % name.encode()
+    for part in parts:
+        yield begin + to_json(part)[1:-1]
+        begin = b","
+    yield b"]"
+
+
+def _state(known: bytes) -> str | None:
+    return known.decode() or None
+
+
+def _colmap(parts: Iterable[Trajectory], sensor: Sensor) -> Iterator[bytes]:
+    """A ZIP of a text model without points."""
+    sent = _Sent()
+    with zipfile.ZipFile(sent, "w", zipfile.ZIP_STORED) as archive:
+        archive.writestr(zipfile.ZipInfo("cameras.txt"), colmap_camera(sensor))
+        with archive.open(zipfile.ZipInfo("images.txt"), "w", force_zip64=True) as images:
+            for text in colmap_lines(parts):
+                images.write(text.encode())
+                yield sent.taken()
+        archive.writestr(zipfile.ZipInfo("points3D.txt"), "# no points: the poses are from splats\n")
+    yield sent.taken()
+
+
+class _Sent(io.RawIOBase):
+    """A buffer that a ZIP file is written to and read from in pieces."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._parts: list[bytes] = []
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        self._parts.append(bytes(data))
+        return len(self._parts[-1])
+
+    def taken(self) -> bytes:
+        whole = b"".join(self._parts)
+        self._parts.clear()
+        return whole

@@ -1,0 +1,128 @@
+"""Requested views of a scene, rendered and encoded: one image, or a ZIP of several."""
+
+import io
+import json
+import zipfile
+
+import numpy as np
+from fastapi import Response
+
+from spiked.errors import ConfigurationError
+from spiked.pose import quaternion
+from spiked.poses import PoseFile
+from spiked.render import Camera
+from spiked.sensor import Intrinsics, Sensor
+from spiked_service.api.problems import NoPoseError, NotReadyError
+from spiked_service.api.results import Result
+from spiked_service.api.schemas.views import MAX_PIXELS, CameraModel, PathModel, ViewRequest
+from spiked_service.api.trajectories import Range
+from spiked_service.results.image_encoding import ImageFormat, encode
+from spiked_service.results.view_renderer import Output, Pose, ViewRenderer, shown
+
+
+def views_response(result: Result, request: ViewRequest, kind: ImageFormat, renderer: ViewRenderer) -> Response:
+    """One image, or a ZIP of several.
+
+    Raises NotReadyError, NoPoseError, ConfigurationError, SceneError, OverloadedError.
+    """
+    camera = _camera(result.sensor, request)
+    poses = _poses(result, request)
+    if len(poses) * camera.width * camera.height > MAX_PIXELS:
+        raise ConfigurationError(
+            f"{len(poses)} views of {camera.width}x{camera.height} are more than {MAX_PIXELS} pixels; request fewer, "
+            "or smaller ones"
+        )
+    white = result.published.white
+    red, green, blue = (part * white for part in request.background)
+    headers = {"X-Scene-Version": str(result.published.version), "Cache-Control": "no-store"}
+    pictures = []
+    for pose in poses:
+        plane = shown(renderer.render(result.scene, camera, pose), request.output, (red, green, blue))
+        limit = request.white or _white(request.output, white, plane)
+        pictures.append((encode(plane, kind, limit), limit))
+    if request.camera is not None:
+        picture, limit = pictures[0]
+        return Response(picture, media_type=kind.media_type, headers={**headers, "X-White": repr(limit)})
+    listed = [
+        {
+            "file": f"{i:03d}.{kind}",
+            "position": pose.centre.tolist(),
+            "quaternion_wxyz": quaternion(pose.rotation).tolist(),
+            "white": limit,
+        }
+        for i, (pose, (_, limit)) in enumerate(zip(poses, pictures, strict=True))
+    ]
+    content: dict[str, bytes | str] = {f"{i:03d}.{kind}": picture for i, (picture, _) in enumerate(pictures)}
+    k = camera.intrinsics
+    about = {"intrinsics": {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}, "output": request.output, "views": listed}
+    content["views.json"] = json.dumps(about, indent=1)
+    return Response(_zip(content), media_type="application/zip", headers=headers)
+
+
+def _white(output: Output, white: float, plane: np.ndarray) -> float:
+    match output:
+        case Output.COLOR:
+            return white
+        case Output.ALPHA:
+            return 1.0
+        case Output.DEPTH:
+            return max(float(plane.max()), 1e-9)
+
+
+def _camera(sensor: Sensor | None, request: ViewRequest) -> Camera:
+    if sensor is None and (request.width is None or request.intrinsics is None):
+        raise NotReadyError("the camera of this capture is not known yet; give width, height and intrinsics")
+    width = request.width or (sensor.width if sensor else 0)
+    height = request.height or (sensor.height if sensor else 0)
+    if request.intrinsics is not None:
+        return Camera(request.intrinsics.intrinsics(), width, height)
+    if sensor is None or sensor.intrinsics is None:
+        raise ConfigurationError("the optics of this capture are not known; give intrinsics")
+    k, scale = sensor.intrinsics, width / sensor.width
+    cy = scale * k.cy + (height - scale * sensor.height) / 2
+    return Camera(Intrinsics(scale * k.fx, scale * k.fy, scale * k.cx, cy), width, height)
+
+
+def _poses(result: Result, request: ViewRequest) -> list[Pose]:
+    cameras = [request.camera] if request.camera else request.cameras or []
+    if request.path is None and all(camera.frame is None for camera in cameras):
+        return [camera.pose() for camera in cameras]
+    known = result.poses()
+    if request.path is not None:
+        return _along(known, request.path)
+    return [_pose(known, result.sensor, camera) for camera in cameras]
+
+
+def _pose(poses: PoseFile, sensor: Sensor | None, camera: CameraModel) -> Pose:
+    if camera.frame is None:
+        return camera.pose()
+    rate = 1.0 if sensor is None else sensor.frame_rate_hz
+    row = poses.nearest((camera.frame + 0.5) / rate, 0.51 / rate)
+    if row is None:
+        first, last = (round(poses.time_s(row) * rate - 0.5) for row in (0, -1))
+        raise NoPoseError(f"frame {camera.frame} has no pose in this version; it has poses from {first} to {last}")
+    return _at(poses, row)
+
+
+def _along(poses: PoseFile, path: PathModel) -> list[Pose]:
+    part = Range(path.from_s, path.to_s, 1).of(poses)
+    times = np.linspace(poses.time_s(part[0]), poses.time_s(part[-1]), path.count)
+    return [_at(poses, min(poses.first_from(float(time_s)), part[-1])) for time_s in times]
+
+
+def _at(poses: PoseFile, row: int) -> Pose:
+    one = poses.trajectory(range(row, row + 1))
+    return Pose(one.rotations[0], one.centres[0])
+
+
+def _zip(content: dict[str, bytes | str]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name, body in content.items():
+            archive.writestr(zipfile.ZipInfo(name), body)
+    return buffer.getvalue()
+
+
+def image_format(wished: ImageFormat | None, accept: str) -> ImageFormat:
+    """By the query, else by the Accept header, else PNG."""
+    return wished or ImageFormat.accepted(accept) or ImageFormat.PNG

@@ -1,0 +1,1 @@
+"""What everything else of the service stands on."""

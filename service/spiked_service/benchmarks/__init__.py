@@ -1,1 +1,0 @@
-"""What `spiked bench` measures across modules; each module's own figures come from its own benchmark."""

@@ -1,0 +1,1 @@
+"""Captures: live ones, uploads, devices, and the data folder."""

@@ -1,0 +1,329 @@
+"""All captures: live, ended and uploaded."""
+
+import threading
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+from spiked_driver import open_source
+
+from spiked.errors import ConfigurationError
+from spiked_service.base.errors import BusyError
+from spiked_service.base.ids import new_id
+from spiked_service.captures.armed_device import ArmedDevice
+from spiked_service.captures.live_capture import LiveCapture
+from spiked_service.captures.recent import RecentCaptures
+from spiked_service.captures.sources import device_of, realtime
+from spiked_service.reconstructions.notifier import Notifier
+from spiked_service.reconstructions.queue import Reconstructions
+from spiked_service.store.catalogue import Catalogue, Page, StoreError
+from spiked_service.store.folder import DataFolder
+from spiked_service.store.room import Room, recording_bytes
+from spiked_service.store.rows import CaptureRow, CaptureState, Origin, Plan
+from spiked_service.store.snapshot import Snapshot
+from spiked_service.workers.messages import PreviewTaken
+
+_CLOSE_S = 1.0
+"""Workers exit within 0.8 s of their dismissal (`channel._EXIT_S`); later they are killed."""
+_TICK_S = 0.5
+"""Interval at which states follow the counters and live captures are published."""
+
+
+class Captures:
+    """Starts, lists and removes captures; one live capture per device. Thread-safe."""
+
+    def __init__(
+        self,
+        folder: DataFolder,
+        catalogue: Catalogue,
+        room: Room,
+        reconstructions: Reconstructions,
+        notifier: Notifier,
+    ) -> None:
+        self._room = room
+        self._folder = folder
+        self._catalogue = catalogue
+        self._reconstructions = reconstructions
+        self._notifier = notifier
+        self.limit = 4
+        """Most devices in use at a time; may be changed at any time."""
+        self._lock = threading.RLock()
+        self._live: dict[str, LiveCapture] = {}
+        self._armed: dict[str, ArmedDevice] = {}
+        self._recent = RecentCaptures()
+        self._closing = threading.Event()
+        self._ticker = threading.Thread(target=self._tick, name="counters", daemon=True)
+        self._ticker.start()
+
+    def start(self, plan: Plan) -> Snapshot:
+        """Start a capture; with a pre-trigger time it starts in the past of an armed device.
+
+        Raises BusyError if the device or as many devices as allowed are in use, or the service is stopping;
+        SourceError, RecordingError or ConfigurationError for a source that cannot be used; StoreError if the capture
+        cannot be saved.
+        """
+        if not (plan.record or plan.reconstruct):
+            raise ConfigurationError("the capture would neither record nor reconstruct: enable one of them")
+        device = device_of(plan.source)
+        with self._lock:
+            armed_device = self._armed.get(device)
+        size: int | None = None
+        if armed_device is not None:
+            armed_device.check(plan)
+            size = recording_bytes(plan, armed_device.sensor, None)
+        elif plan.pretrigger_s:
+            raise ConfigurationError(f"{device} is not armed, so it has no earlier frames: arm the device first")
+        else:
+            source = open_source(plan.source)
+            size = recording_bytes(plan, source.sensor, source.frames)
+        with self._lock:
+            self._refuse_if_busy(device)
+            capture = self._create(plan, size)
+            armed_device = self._armed.pop(device, None)
+            if armed_device is None:
+                try:
+                    capture.acquire()
+                except OSError as error:
+                    del self._live[capture.id]
+                    self._catalogue.captures.remove(capture.id)
+                    self._folder.remove(self._folder.capture(capture.id))
+                    self._room.release(self._folder.recording(capture.id))
+                    raise BusyError(f"no worker can be started: {error.strerror}; end other programs") from error
+        if armed_device is not None:
+            armed_device.trigger(capture, plan)
+        return self.publish(capture.id)
+
+    def _create(self, plan: Plan, size: int | None) -> LiveCapture:
+        """Create a capture with its row and folder, and reserve `size` bytes. Raises StoreError."""
+        now = datetime.now(UTC)
+        row = CaptureRow(new_id(), Origin.LIVE, plan, CaptureState.STARTING, now, name=plan.name, notes=plan.notes)
+        if plan.record:
+            self._room.reserve_recording(self._folder.recording(row.id), size)
+        try:
+            (self._folder.capture(row.id) / "logs").mkdir(parents=True)
+            self._catalogue.captures.put(row)
+        except (OSError, StoreError) as error:
+            self._room.release(self._folder.recording(row.id))
+            self._folder.remove(self._folder.capture(row.id))
+            if isinstance(error, StoreError):
+                raise
+            raise StoreError(f"{self._folder.path} cannot be written: {error.strerror}") from error
+        capture = LiveCapture(row, self._folder, self._catalogue, self._reconstructions, self._notifier, self._changed)
+        self._live[row.id] = capture
+        return capture
+
+    def arm(self, source: str, pretrigger_s: float) -> ArmedDevice:
+        """Run a device without recording; its ring holds the newest frames for a later capture.
+
+        Raises as `start`.
+        """
+        device = device_of(source)
+        open_source(source)  # errors are raised here rather than in the worker
+        with self._lock:
+            self._refuse_if_busy(device)
+            if device in self._armed:
+                raise BusyError(f"{device} is armed already: disarm it first to change its pre-trigger time")
+            armed_device = self._armed[device] = ArmedDevice(
+                realtime(source), pretrigger_s, self._folder, self._notifier, self._disarmed
+            )
+            return armed_device
+
+    def disarm(self, source: str) -> None:
+        """Stop an armed device. Does nothing if it is not armed."""
+        with self._lock:
+            armed_device = self._armed.pop(device_of(source), None)
+        if armed_device is not None:
+            armed_device.dismiss()
+            armed_device.join(_CLOSE_S)
+
+    def armed(self) -> dict[str, ArmedDevice]:
+        """The armed devices."""
+        with self._lock:
+            return dict(self._armed)
+
+    def get(self, capture_id: str) -> Snapshot:
+        """The capture as it is now. Raises UnknownIdError."""
+        with self._lock:
+            live = self._live.get(capture_id)
+        return self.snapshot(live.row if live is not None else self._catalogue.captures.get(capture_id))
+
+    def publish(self, capture_id: str) -> Snapshot:
+        """Publish the capture as it is now. Raises UnknownIdError."""
+        snapshot = self.get(capture_id)
+        self._notifier.capture(snapshot)
+        return snapshot
+
+    def snapshot(self, row: CaptureRow) -> Snapshot:
+        """A row with its current counters and reconstructions."""
+        with self._lock:
+            live = self._live.get(row.id)
+        row = row if live is None else live.row
+        counters = row.counters if live is None or row.state.over else live.counters()
+        return Snapshot(row, counters, self._reconstructions.rows.of(row.id))
+
+    def list(
+        self,
+        limit: int = 50,
+        cursor: str | None = None,
+        query: str | None = None,
+        state: CaptureState | None = None,
+        deleted: bool = False,
+    ) -> Page[CaptureRow]:
+        """Newest first."""
+        return self._catalogue.capture_page(limit, cursor, query, state, deleted)
+
+    def live(self) -> Sequence[Snapshot]:
+        """Captures that have not ended, oldest first."""
+        with self._lock:
+            captures = list(self._live.values())
+        return [self.snapshot(capture.row) for capture in captures if not capture.row.state.over]
+
+    def recent(self) -> Sequence[Snapshot]:
+        """Captures that have not ended, and the last ones that ended since the service started."""
+        with self._lock:
+            rows = [*self._recent.rows(), *(capture.row for capture in self._live.values())]
+        return [self.snapshot(row) for row in {row.id: row for row in rows}.values()]
+
+    def counts(self) -> dict[str, int]:
+        """Number of captures by state, without removed ones."""
+        found = self._catalogue.read("SELECT state, count(*) FROM captures WHERE deleted_at IS NULL GROUP BY state")
+        return dict(found)
+
+    def folder(self, capture_id: str) -> Path:
+        """Where its files lie. Raises UnknownIdError."""
+        return self._folder.capture(self._catalogue.captures.get(capture_id).id)
+
+    def recording(self, capture_id: str) -> Path:
+        """Path of its `.dat`, which may not exist or still grow. Raises UnknownIdError."""
+        return self._folder.recording(self._catalogue.captures.get(capture_id).id)
+
+    def picture(self, capture_id: str) -> PreviewTaken | None:
+        """The newest preview of a live capture, or the last of a recent one; None if there is none."""
+        with self._lock:
+            live = self._live.get(capture_id)
+        return self._recent.picture(capture_id) if live is None else live.picture
+
+    def stop(self, capture_id: str) -> Snapshot:
+        """End the acquisition; a second call ends the refinement as well. Raises UnknownIdError."""
+        with self._lock:
+            live = self._live.get(capture_id)
+        if live is not None:
+            live.stop()
+        return self.get(capture_id)
+
+    def update(
+        self, capture_id: str, *, name: str | None = None, notes: str | None = None, keep: bool | None = None
+    ) -> Snapshot:
+        """Change what a user may change; None leaves it. Raises UnknownIdError."""
+        fields = {"name": name, "notes": notes, "keep": keep}
+        return self._change(capture_id, **{key: value for key, value in fields.items() if value is not None})
+
+    def remove(self, capture_id: str) -> Snapshot:
+        """Mark a capture as deleted, until `restore` or retention. Raises UnknownIdError, BusyError."""
+        snapshot = self.get(capture_id)
+        if not snapshot.row.state.over:
+            raise BusyError(f"capture {capture_id} is still {snapshot.row.state}: stop it first")
+        for row in snapshot.reconstructions:
+            self._reconstructions.cancel(row.id)
+        return self._change(capture_id, deleted_at=snapshot.row.deleted_at or datetime.now(UTC))
+
+    def restore(self, capture_id: str) -> Snapshot:
+        """Undo `remove`. Raises UnknownIdError."""
+        return self._change(capture_id, deleted_at=None)
+
+    def purge(self, capture_id: str) -> None:
+        """Delete a capture with its files and reconstructions. Raises UnknownIdError, BusyError."""
+        snapshot = self.get(capture_id)
+        if not snapshot.row.state.over:
+            raise BusyError(f"capture {capture_id} is still {snapshot.row.state}: stop it first")
+        for row in snapshot.reconstructions:
+            self._reconstructions.remove(row.id)
+        self._folder.remove(self._folder.capture(capture_id))
+        self._catalogue.captures.remove(capture_id)
+        self._recent.drop_picture(capture_id)
+
+    def processes(self) -> dict[str, dict[str, int]]:
+        """Process ids of the running workers by capture and role, without reconstructions."""
+        with self._lock:
+            captures = list(self._live.values())
+        return {capture.id: capture.processes() for capture in captures}
+
+    def dismiss(self) -> None:
+        """Ask every worker to exit at once; no capture can be started afterwards."""
+        self._closing.set()
+        for one in self._all():
+            one.dismiss()
+        self._reconstructions.dismiss()
+
+    def close(self) -> None:
+        """End every worker within `_CLOSE_S`."""
+        self.dismiss()
+        for one in self._all():
+            one.join(_CLOSE_S)
+        self._reconstructions.join(_CLOSE_S)
+        self._ticker.join()
+
+    def retry_saving(self) -> None:
+        """Save rows that could not be saved on a full disk."""
+        with self._lock:
+            captures = list(self._live.values())
+        for capture in captures:
+            if capture.row.state.over and capture.save():
+                with self._lock:
+                    self._live.pop(capture.id, None)
+
+    def _all(self) -> Sequence[LiveCapture | ArmedDevice]:
+        with self._lock:
+            return [*self._live.values(), *self._armed.values()]
+
+    def _refuse_if_busy(self, device: str) -> None:
+        if self._closing.is_set():
+            raise BusyError("the service is stopping; restart it to capture")
+        for other in self._live.values():
+            if device_of(other.row.source) == device and not other.row.state.over and other.holds_device:
+                raise BusyError(f"capture {other.id} is still running on {device}: stop it, or wait for its end")
+        in_use = {device_of(other.row.source) for other in self._live.values() if other.holds_device} | set(self._armed)
+        if len(in_use - {device}) >= self.limit:
+            raise BusyError(
+                f"{len(in_use)} devices are in use, the most that are allowed: stop a capture, disarm a device, "
+                "or raise the setting limit_captures"
+            )
+
+    def _disarmed(self, armed_device: ArmedDevice) -> None:
+        """An armed device has failed."""
+        with self._lock:
+            for device, one in list(self._armed.items()):
+                if one is armed_device:
+                    del self._armed[device]
+
+    def _change(self, capture_id: str, **fields: object) -> Snapshot:
+        with self._lock:
+            live = self._live.get(capture_id)
+        if live is not None:  # without the lock, because the capture calls back and takes it
+            live.edit(**fields)
+        else:
+            self._catalogue.captures.set(capture_id, **fields)
+        return self.publish(capture_id)
+
+    def _changed(self, capture: LiveCapture) -> None:
+        self._notifier.capture(self.snapshot(capture.row))
+        if not capture.row.state.over:
+            return
+        self._room.release(self._folder.recording(capture.id))
+        with self._lock:
+            self._recent.add(capture.row, capture.picture)
+            saved = self._catalogue.captures.find(capture.id)
+            if saved is not None and saved.state.over:
+                self._live.pop(capture.id, None)
+
+    def _tick(self) -> None:
+        while not self._closing.wait(_TICK_S):
+            with self._lock:
+                captures = list(self._live.values())
+            try:
+                for capture in captures:
+                    capture.update_state()
+                for snapshot in self.live():
+                    self._notifier.capture(snapshot)
+            except StoreError as error:  # the next tick repeats it
+                self._notifier.log("error", f"the states of live captures are not up to date: {error}")

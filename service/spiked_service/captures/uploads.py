@@ -1,0 +1,290 @@
+"""Uploads of recordings: chunks are appended to a file and synced to disk before they are confirmed."""
+
+import json
+import os
+import threading
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from fastapi.concurrency import run_in_threadpool
+from pydantic import TypeAdapter
+from starlette.exceptions import HTTPException
+
+from spiked.errors import RecordingError, SpikedError
+from spiked.recording import RecordingGeometry, sidecar_path
+from spiked.recording.sidecar import Sidecar
+from spiked.sensor import Sensor
+from spiked_service.base.ids import new_id
+from spiked_service.captures.captures import Captures
+from spiked_service.store.catalogue import Catalogue, StoreError
+from spiked_service.store.folder import DataFolder
+from spiked_service.store.room import Room
+from spiked_service.store.rows import CaptureRow, CaptureState, Grade, Origin, Plan, Quality, Recorded, UploadRow
+from spiked_service.workers.messages import UploadChecked, UploadCommand, WorkerError, WorkerEvent
+from spiked_service.workers.process import WorkerProcess
+
+_WRITE_BYTES = 1 << 20
+"""Most bytes per write."""
+_CHECK_S = 3600.0
+"""Time for the check of an upload."""
+
+
+class UploadError(SpikedError):
+    """A chunk or an upload does not match the announced size or state."""
+
+
+class UploadOffsetError(UploadError):
+    """A chunk does not start at the end of the previous one."""
+
+    def __init__(self, message: str, offset_bytes: int) -> None:
+        super().__init__(message)
+        self.offset_bytes = offset_bytes
+
+
+class UploadTooLargeError(UploadError):
+    """The upload is larger than `limit_upload_bytes`."""
+
+
+class UploadBusyError(UploadError):
+    """Another request uses the same upload."""
+
+
+class Uploads:
+    """Stores uploads and makes captures of them. Thread-safe; `append` is called from an event loop."""
+
+    def __init__(self, folder: DataFolder, catalogue: Catalogue, room: Room, limit_bytes: Callable[[], int]) -> None:
+        """`limit_bytes` returns the current maximum size of a recording."""
+        self._room = room
+        self._limit_bytes = limit_bytes
+        self._folder = folder
+        self._catalogue = catalogue
+        self._lock = threading.Lock()
+        self._busy: set[str] = set()
+
+    def create(
+        self, name: str, notes: str, size: int, sidecar: str | None, geometry: str | None, sha256: str | None
+    ) -> UploadRow:
+        """Create an upload of `size` bytes and reserve the space. Raises UploadTooLargeError, NoRoomError."""
+        if size > self._limit_bytes():
+            raise UploadTooLargeError(f"{size} bytes exceed the limit of {self._limit_bytes()} for an upload")
+        now = datetime.now(UTC)
+        stated = json.dumps({"notes": notes, "geometry": json.loads(geometry) if geometry else None})
+        row = UploadRow(new_id(), name, size, now, now, sidecar=sidecar, geometry=stated, sha256=sha256)
+        with self._room.for_upload(size):
+            with _store_errors(row.id):
+                self._folder.upload(row.id).touch(mode=0o600)
+            self._catalogue.uploads.put(row)
+        return row
+
+    def get(self, upload_id: str) -> UploadRow:
+        """Raises UnknownIdError."""
+        return self._catalogue.uploads.get(upload_id)
+
+    def list(self) -> list[UploadRow]:
+        """Uploads that are not captures yet, newest first."""
+        return [row for row in self._catalogue.uploads.where("1 ORDER BY id DESC") if row.capture_id is None]
+
+    async def append(
+        self, upload_id: str, offset_bytes: int, chunks: AsyncIterator[bytes], length: int | None = None
+    ) -> UploadRow:
+        """Append a chunk at `offset_bytes`, of `length` bytes if that is known.
+
+        Bytes received before an interruption are kept; a chunk that is too long is dropped. Raises UnknownIdError,
+        UploadOffsetError, UploadError for more bytes than announced, UploadBusyError, StoreError.
+        """
+        row = await run_in_threadpool(self.get, upload_id)
+        with self._exclusive(upload_id):
+            if row.capture_id is not None:
+                raise UploadError(f"upload {upload_id} is complete: it is capture {row.capture_id}")
+            row = await run_in_threadpool(self.get, upload_id)
+            if offset_bytes != row.offset_bytes:
+                raise UploadOffsetError(
+                    f"upload {upload_id} continues at byte {row.offset_bytes}, not {offset_bytes}", row.offset_bytes
+                )
+            if length is not None and offset_bytes + length > row.bytes:
+                raise _too_much(row)
+            file = await run_in_threadpool(_Tail, self._folder.upload(upload_id), row)
+            try:
+                async for chunk in chunks:
+                    await run_in_threadpool(file.write, chunk)
+            except (UploadError, HTTPException):  # longer than announced or than the limit of a request
+                await run_in_threadpool(file.truncate)
+                raise
+            finally:
+                # Also if the client has disconnected: bytes on disk need not be sent again.
+                end = await run_in_threadpool(file.close)
+                row = await run_in_threadpool(self._confirm, upload_id, end)
+        return row
+
+    def complete(self, upload_id: str, captures: Captures) -> UploadRow:
+        """Verify a whole upload in a worker and make a capture of it. Does nothing to a completed upload.
+
+        Raises UnknownIdError, UploadError while bytes are missing, UploadBusyError, StoreError, and RecordingError if
+        it is not a recording: the upload is kept and can be completed with another geometry.
+        """
+        self.get(upload_id)
+        with self._exclusive(upload_id):
+            row = self.get(upload_id)
+            if row.capture_id is not None:
+                return row
+            if row.offset_bytes != row.bytes:
+                raise UploadError(f"{row.offset_bytes} of {row.bytes} bytes were received; send the rest first")
+            stated = json.loads(row.geometry or "{}")
+            checked = _checked(self._folder.upload(upload_id), row, stated.get("geometry"))
+            recorded = Recorded(checked.frames, checked.bytes, lost=checked.lost, sha256=checked.sha256)
+            verdict = Quality(Grade(checked.grade), checked.reasons)
+            capture_id = self._move_to_capture(row, checked.sensor, recorded, verdict, stated.get("notes", ""))
+            captures.publish(capture_id)
+            return self.get(upload_id)
+
+    def remove(self, upload_id: str) -> None:
+        """Remove an upload and its bytes; a capture made of it is kept. Raises UnknownIdError."""
+        self.get(upload_id)
+        with self._exclusive(upload_id):
+            self._folder.upload(upload_id).unlink(missing_ok=True)
+            self._folder.upload(upload_id).with_suffix(".json").unlink(missing_ok=True)
+            self._catalogue.uploads.remove(upload_id)
+
+    def _move_to_capture(
+        self, upload: UploadRow, sensor: Sensor, recorded: Recorded, verdict: Quality, notes: str
+    ) -> str:
+        """Make a capture of an upload that was verified and has a sidecar, and return its id. Raises StoreError."""
+        part = self._folder.upload(upload.id)
+        now = datetime.now(UTC)
+        row = CaptureRow(
+            new_id(),
+            Origin.UPLOAD,
+            Plan(f"upload:{upload.name}", name=upload.name, reconstruct=False),
+            CaptureState.COMPLETE,
+            now,
+            name=upload.name,
+            notes=notes,
+            sensor=sensor,
+            recording=recorded,
+            verdict=verdict,
+            ended_at=now,
+        )
+        try:
+            self._folder.capture(row.id).mkdir()
+            data = self._folder.recording(row.id)
+            part.with_suffix(".json").replace(sidecar_path(data))
+            part.replace(data)
+        except OSError as error:
+            self._folder.remove(self._folder.capture(row.id))
+            raise StoreError(f"upload {upload.id} cannot be moved to its capture: {error.strerror}") from error
+        with self._catalogue.transaction():
+            self._catalogue.captures.put(row)
+            self._catalogue.uploads.set(upload.id, capture_id=row.id)
+        return row.id
+
+    def _confirm(self, upload_id: str, offset_bytes: int) -> UploadRow:
+        return self._catalogue.uploads.set(upload_id, offset_bytes=offset_bytes, updated_at=datetime.now(UTC))
+
+    @contextmanager
+    def _exclusive(self, upload_id: str) -> Iterator[None]:
+        with self._lock:
+            if upload_id in self._busy:
+                raise UploadBusyError(f"another request is writing to upload {upload_id}; wait for its end")
+            self._busy.add(upload_id)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._busy.discard(upload_id)
+
+
+class _Tail:
+    """Appends to the file of an upload. Bytes after the confirmed offset, from a killed service, are cut off."""
+
+    def __init__(self, path: Path, row: UploadRow) -> None:
+        self._row = row
+        self._id = row.id
+        self._offset = row.offset_bytes
+        with _store_errors(row.id):
+            self._file = os.open(path, os.O_WRONLY)
+            os.ftruncate(self._file, row.offset_bytes)
+            os.lseek(self._file, row.offset_bytes, os.SEEK_SET)
+
+    def write(self, chunk: bytes) -> None:
+        if self._offset + len(chunk) > self._row.bytes:
+            raise _too_much(self._row)
+        view = memoryview(chunk)
+        with _store_errors(self._id):
+            while view:
+                written = os.write(self._file, view[:_WRITE_BYTES])
+                self._offset += written
+                view = view[written:]
+
+    def truncate(self) -> None:
+        """Truncate the file to the confirmed offset."""
+        with _store_errors(self._id):
+            os.ftruncate(self._file, self._row.offset_bytes)
+        self._offset = self._row.offset_bytes
+
+    def close(self) -> int:
+        """Sync the file and return its size."""
+        try:
+            with _store_errors(self._id):
+                os.fsync(self._file)
+        finally:
+            with suppress(OSError):
+                os.close(self._file)
+        return self._offset
+
+
+def _too_much(row: UploadRow) -> UploadError:
+    return UploadError(
+        f"upload {row.id} was announced with {row.bytes} bytes and more were received; this chunk was dropped"
+    )
+
+
+def _checked(path: Path, row: UploadRow, geometry: dict[str, Any] | None) -> UploadChecked:
+    """Verify the file in a worker, so that the service never parses uploaded data."""
+    command = UploadCommand(
+        path=path,
+        sha256=row.sha256,
+        sidecar=None if row.sidecar is None else Sidecar.model_validate_json(row.sidecar),
+        geometry=TypeAdapter(RecordingGeometry).validate_python(geometry or {}),
+    )
+    found: list[UploadChecked] = []
+    errors: list[str] = []
+    trouble: list[str | None] = []
+    exited = threading.Event()
+
+    def handle(event: WorkerEvent) -> None:
+        match event:
+            case UploadChecked():
+                found.append(event)
+            case WorkerError():
+                errors.append(event.reason)
+
+    def on_exit(reason: str | None) -> None:
+        trouble.append(reason)
+        exited.set()
+
+    log = path.with_suffix(".log")
+    worker = WorkerProcess(command, log, handle, on_exit)
+    try:
+        if not exited.wait(_CHECK_S):
+            worker.dismiss()
+            raise UploadError(f"the check of upload {row.id} took more than {_CHECK_S:.0f} s; try again")
+    finally:
+        worker.kill_after(1.0)
+        log.unlink(missing_ok=True)
+    if not found:
+        why = (errors or [trouble[0] or "its worker exited without output"])[0].replace(str(path), row.name)
+        raise RecordingError(f"upload {row.id} cannot be used as a recording: {why}")
+    return found[0]
+
+
+@contextmanager
+def _store_errors(upload_id: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(
+            f"upload {upload_id} cannot be written: {error.strerror}; free disk space and continue the upload"
+        ) from error

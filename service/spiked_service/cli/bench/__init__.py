@@ -1,0 +1,1 @@
+"""The measurements of `spiked bench` that span several modules."""

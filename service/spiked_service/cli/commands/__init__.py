@@ -1,0 +1,1 @@
+"""The commands of `spiked`, one per file; `cli.main` registers them."""

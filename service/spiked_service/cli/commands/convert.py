@@ -1,0 +1,316 @@
+"""`spiked convert`: write the frames of a recording in another format."""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, Any, Protocol
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from spiked_driver.framing import USB_HEIGHT, USB_WIDTH, Framing, UsbFraming, encode_usb
+from spiked_driver.pcie import PCIE_SIZE, PcieFraming, encode_pcie
+from spiked_driver.source import Chunk
+
+from spiked.errors import ConfigurationError, RecordingError
+from spiked.recording import (
+    ClockPair,
+    Gap,
+    Recording,
+    RecordingGeometry,
+    RecordingWriter,
+    open_recording,
+    read_sidecar,
+    sidecar_path,
+)
+from spiked.sensor import Layout, Sensor
+from spiked_service.cli import outputs
+from spiked_service.cli import recording_flags as g
+from spiked_service.cli.console import output, report_warning
+
+_BLOCK_BYTES = 1 << 20
+_CHUNK_FRAMES = 64
+
+
+class Form(StrEnum):
+    """How frames are stored in a file."""
+
+    COMPACT = "compact"
+    ROW_TAGGED = "row_tagged"
+    USB = "usb"
+    PCIE = "pcie"
+
+
+def _form(text: str) -> Form:
+    """`row-tagged` is read as `row_tagged`."""
+    try:
+        return Form(text.replace("-", "_"))
+    except ValueError as error:
+        raise typer.BadParameter(f"{text!r} is not one of {', '.join(Form)}") from error
+
+
+_FORMS = f"<{'|'.join(Form)}>"
+
+
+Item = NDArray[np.uint8] | Gap
+"""Compact frames, uint8 [n, frame_bytes], LSB first, or a loss between them."""
+
+
+@dataclass(frozen=True)
+class Content:
+    """What an input holds: compact frames and gaps in the order of the capture, of this camera."""
+
+    sensor: Sensor
+    items: Iterator[Item]
+    sidecar: dict[str, Any]
+    """Further fields for a sidecar."""
+    clock: tuple[ClockPair, ...] = ()
+
+
+class Writer(Protocol):
+    """The file that is written."""
+
+    def frames(self, frames: NDArray[np.uint8]) -> None: ...
+    def gap(self, gap: Gap) -> None: ...
+    def close(self) -> None: ...
+
+
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="A recording, or the raw bytes of a camera.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="A new file.")],
+    to: Annotated[Form, typer.Option(help="The form to write.", parser=_form, metavar=_FORMS)] = Form.COMPACT,
+    source_form: Annotated[
+        Form | None,
+        typer.Option("--from", help="The form of IN. Default: detected.", parser=_form, metavar=_FORMS),
+    ] = None,
+    width: g.Width = None,
+    height: g.Height = None,
+    rate: g.Rate = None,
+    layout: g.FrameLayout = None,
+    bit_order: g.Bits = None,
+    flipped: g.Flipped = None,
+    mosaic: g.Colours = None,
+) -> None:
+    """Convert between recordings (compact, row_tagged) and raw camera bytes (usb 400x250, pcie 1000x1000).
+
+    The bits of every frame are kept. Raw usb and pcie bytes have no sidecar: give rate, orientation and colour again
+    when reading such a file. Raw pcie bytes do not record lost frames.
+
+    Examples:
+
+    - `spiked convert endpoint82.bin rec.dat`
+
+    - `spiked convert rec.dat rec.usb --to usb`
+    """
+    outputs.try_file("OUT", out)
+    given = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic)
+    content = read_content(source, source_form, given)
+    count, lost = write_content(content, out, to)
+    output.print(f"{out}: {count} frames, {lost} lost, {to}", markup=False)
+
+
+def read_content(path: Path, form: Form | None, given: RecordingGeometry) -> Content:
+    """Open any form. Raises RecordingError or ConfigurationError."""
+    form = form or _sniff(path)
+    match form:
+        case Form.USB:
+            return _wire_content(path, UsbFraming, _wire_sensor(given, USB_WIDTH, USB_HEIGHT))
+        case Form.PCIE:
+            return _wire_content(path, PcieFraming, _wire_sensor(given, PCIE_SIZE, PCIE_SIZE))
+        case Form.COMPACT | Form.ROW_TAGGED:
+            given = replace(given, layout=Layout.COMPACT if form is Form.COMPACT else Layout.ROW_TAGGED)
+    recording = open_recording(path, **given.stated())
+    for warning in recording.warnings:
+        report_warning(warning)
+    return Content(recording.sensor, _recorded(recording), _sidecar_fields(recording), recording.clock)
+
+
+def write_content(content: Content, out: Path, to: Form) -> tuple[int, int]:
+    """Write frames and gaps to a new file; returns the numbers of frames and of lost frames."""
+    first = next(content.items, None)
+    if first is None:
+        raise RecordingError("the input holds no whole frame; if its form was detected wrongly, give it with --from")
+    count = lost = 0
+    with ExitStack() as stack:
+        writer = _writer(content, out, to)
+        stack.callback(writer.close)
+        for item in chain([first], content.items):
+            if isinstance(item, Gap):
+                writer.gap(item)
+                lost += item.count
+            else:
+                writer.frames(item)
+                count += len(item)
+    return count, lost
+
+
+def _sniff(path: Path) -> Form | None:
+    """The wire format of a file of raw camera bytes; None for a recording."""
+    if sidecar_path(path).exists() or not path.is_file():
+        return None
+    head = np.zeros(0, np.uint8)
+    try:
+        head = np.fromfile(path, np.uint8, _BLOCK_BYTES)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}; check its permissions") from error
+    framings: dict[Form, Callable[[], Framing]] = {Form.USB: UsbFraming, Form.PCIE: PcieFraming}
+    for form, make in framings.items():
+        if next(_parsed(make(), [head], _frame_bytes(form)), None) is not None:
+            return form
+    return None
+
+
+def _frame_bytes(form: Form) -> int:
+    return (USB_WIDTH * USB_HEIGHT if form is Form.USB else PCIE_SIZE * PCIE_SIZE) // 8
+
+
+def _wire_sensor(given: RecordingGeometry, width: int, height: int) -> Sensor:
+    if given.width not in (None, width) or given.height not in (None, height) or given.layout or given.bit_order:
+        raise ConfigurationError(
+            f"raw bytes of this camera are always {width}x{height}, in a fixed layout: leave out size, layout and "
+            "bit order, or give the form of the file with --from"
+        )
+    flipped = True if given.flipped is None else given.flipped
+    return Sensor(width, height, given.frame_rate_hz or 20_000.0, flipped=flipped, mosaic=given.mosaic)
+
+
+def _wire_content(path: Path, make: Callable[[], Framing], sensor: Sensor) -> Content:
+    if not path.is_file() or path.stat().st_size == 0:
+        raise RecordingError(f"{path}: not a file, or empty; check the path")
+    data = np.memmap(path, np.uint8, "r")
+    blocks = (np.asarray(data[start : start + _BLOCK_BYTES]) for start in range(0, data.size, _BLOCK_BYTES))
+    return Content(sensor, _reported(make(), blocks, sensor.frame_bytes), {})
+
+
+def _reported(framing: Framing, blocks: Iterator[NDArray[np.uint8]], frame_bytes: int) -> Iterator[Item]:
+    yield from _parsed(framing, blocks, frame_bytes)
+    c = framing.counters
+    if c.skipped_bytes or c.duplicates:
+        report_warning(
+            f"{c.skipped_bytes} bytes belong to no frame ({c.resyncs} resynchronisations); {c.duplicates} repeated "
+            "frames were left out"
+        )
+
+
+def _parsed(
+    framing: Framing, blocks: Iterator[NDArray[np.uint8]] | list[NDArray[np.uint8]], frame_bytes: int
+) -> Iterator[Item]:
+    view = np.empty((_CHUNK_FRAMES, frame_bytes), np.uint8)
+    for block in chain(blocks, [None]):
+        if block is None:
+            framing.finish()
+        else:
+            framing.feed(block)
+        while (item := framing.read_into(view)) is not None:
+            if isinstance(item, Chunk):
+                yield view[: item.frames]
+            else:
+                yield Gap(first=item.first, count=item.count, cause=str(item.cause))
+
+
+def _recorded(recording: Recording) -> Iterator[Item]:
+    stored = lost = 0
+    for gap in sorted(recording.gaps, key=lambda gap: gap.first):
+        yield from _stretch(recording, stored, gap.first - lost)
+        stored = min(gap.first - lost, recording.frames)
+        lost += gap.count
+        yield gap
+    yield from _stretch(recording, stored, recording.frames)
+
+
+def _stretch(recording: Recording, first: int, stop: int) -> Iterator[Item]:
+    stop = min(stop, recording.frames)
+    for start in range(first, stop, _CHUNK_FRAMES):
+        yield recording.compact(start, min(_CHUNK_FRAMES, stop - start))
+
+
+def _sidecar_fields(recording: Recording) -> dict[str, Any]:
+    beside = sidecar_path(recording.path)
+    if not beside.exists():
+        return {}
+    sidecar = read_sidecar(beside)
+    fields: dict[str, Any] = {**(sidecar.model_extra or {}), "note": sidecar.note}
+    if sidecar.device is not None:
+        fields["device"] = sidecar.device
+    if sidecar.calibration is not None:
+        fields["calibration"] = str((beside.parent / sidecar.calibration).resolve())
+    return fields
+
+
+class _RecordingFile:
+    def __init__(self, content: Content, out: Path, layout: Layout) -> None:
+        fields = dict(content.sidecar)
+        if "calibration" in fields:
+            fields["calibration"] = os.path.relpath(fields["calibration"], out.resolve().parent)
+        self._writer = RecordingWriter(out, replace(content.sensor, layout=layout), **fields)
+        for pair in content.clock:
+            self._writer.clock_pair(pair.frame, pair.unix_ns)
+
+    def frames(self, frames: NDArray[np.uint8]) -> None:
+        self._writer.append(frames)
+
+    def gap(self, gap: Gap) -> None:
+        self._writer.gap(gap.first, gap.count, gap.cause)
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+class _WireFile:
+    """Raw bytes of a camera. The usb counters show gaps between frames; pcie has no counters."""
+
+    def __init__(self, sensor: Sensor, out: Path, form: Form) -> None:
+        size = (USB_WIDTH, USB_HEIGHT) if form is Form.USB else (PCIE_SIZE, PCIE_SIZE)
+        if (sensor.width, sensor.height) != size:
+            raise ConfigurationError(
+                f"{form} bytes are {size[0]}x{size[1]}, but the input is {sensor.width}x{sensor.height}; "
+                "choose another --to"
+            )
+        self._form = form
+        self._next = 0
+        self._written = 0
+        self._pending = 0  # lost since the last frame
+        self._unmarked = 0
+        try:
+            self._file = out.open("xb")
+        except FileExistsError as error:
+            raise RecordingError(f"{out} exists; choose another name or remove it") from error
+        except OSError as error:
+            raise RecordingError(f"{out} cannot be written: {error.strerror}; choose another place") from error
+
+    def frames(self, frames: NDArray[np.uint8]) -> None:
+        encoded = encode_usb(frames, first=self._next) if self._form is Form.USB else encode_pcie(frames)
+        try:
+            self._file.write(encoded.data)
+            self._file.flush()
+        except OSError as error:
+            raise RecordingError(f"{self._file.name}: cannot be written: {error.strerror}; free some space") from error
+        if self._form is Form.PCIE or not self._written:
+            self._unmarked += self._pending
+        self._pending = 0
+        self._written += len(frames)
+        self._next += len(frames)
+
+    def gap(self, gap: Gap) -> None:
+        self._pending += gap.count
+        self._next += gap.count
+
+    def close(self) -> None:
+        self._file.close()
+        unmarked = self._unmarked + self._pending
+        if unmarked:
+            report_warning(f"{unmarked} lost frames cannot be marked in {self._form} bytes")
+
+
+def _writer(content: Content, out: Path, to: Form) -> Writer:
+    match to:
+        case Form.COMPACT:
+            return _RecordingFile(content, out, Layout.COMPACT)
+        case Form.ROW_TAGGED:
+            return _RecordingFile(content, out, Layout.ROW_TAGGED)
+        case Form.USB | Form.PCIE:
+            return _WireFile(content.sensor, out, to)

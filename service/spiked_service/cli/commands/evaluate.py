@@ -1,0 +1,100 @@
+"""`spiked evaluate`: errors of a reconstruction against ground truth."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from spiked.errors import SceneError
+from spiked.evaluate import ViewScore, score_trajectory, score_views, similarity_of_trajectories
+from spiked.recording import Recording, open_recording
+from spiked.render import Camera
+from spiked.render.cpu import Rasteriser
+from spiked.scene import Scene
+from spiked.trajectory import Trajectory
+from spiked_service.cli import outputs
+from spiked_service.cli.console import output
+
+_LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)  # the weights by which the truth's grey pictures were made
+
+
+def evaluate(
+    result: Annotated[Path, typer.Argument(help="Output folder of `spiked reconstruct`.")],
+    recording: Annotated[Path, typer.Option(help="The recording, with groundtruth.tum and views.json beside it.")],
+    json_out: Annotated[Path | None, typer.Option("--json", help="Also write the figures to this file.")] = None,
+) -> None:
+    """Print coverage, ATE and RPE of a trajectory, and PSNR and SSIM of held-out views.
+
+    ATE is in percent of the RMS radius of the true path, after alignment by a similarity. RPE is over 32 frames.
+
+    Example: `spiked simulate -o room && spiked reconstruct room/simulated.dat -o out &&
+    spiked evaluate out --recording room/simulated.dat`
+    """
+    if json_out is not None:
+        outputs.try_file("--json", json_out)
+    source = open_recording(recording)
+    rate_hz = source.sensor.frame_rate_hz
+    truth = Trajectory.read_tum(recording.parent / "groundtruth.tum")
+    estimate = Trajectory.read_tum(result / "trajectory.tum")
+    score = score_trajectory(truth=truth, estimate=estimate, frame_rate_hz=rate_hz)
+    figures: dict[str, float] = {"coverage": score.coverage}
+    if score.errors is not None:
+        figures |= vars(score.errors)
+        views = _score_views(source, truth, estimate, Scene.read_ply(result / "scene.ply"))
+        if views is not None:
+            figures |= {"psnr_db": views.mean_psnr_db, "ssim": views.mean_ssim}
+    for name, value in figures.items():
+        output.print(f"{name:14s} {value:.4f}")
+    if json_out is not None:
+        with outputs.writing("--json", json_out):
+            json_out.write_text(json.dumps(figures, indent=1), encoding="utf-8")
+
+
+def _score_views(recording: Recording, truth: Trajectory, estimate: Trajectory, scene: Scene) -> ViewScore | None:
+    """The held-out views, with their true poses in the frame of the estimate; None if there are none."""
+    sensor, folder = recording.sensor, recording.path.parent
+    if sensor.intrinsics is None:
+        raise SceneError(f"{recording.path} has no intrinsics in its sidecar, so its views cannot be rendered")
+    held_out = _read_views(folder / "views.json")
+    if not held_out.views:
+        return None
+    similarity = similarity_of_trajectories(truth=truth, estimate=estimate, frame_rate_hz=sensor.frame_rate_hz)
+    matrices = [np.array(view.c2w) for view in held_out.views]
+    poses = [similarity.poses(matrix[:3, :3], matrix[:3, 3]) for matrix in matrices]
+    pictures = [_read_picture(folder / view.file, colour=sensor.mosaic is not None) for view in held_out.views]
+    rasteriser = Rasteriser(Camera(sensor.intrinsics, sensor.width, sensor.height))
+
+    def render(rotation: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float32]:
+        values = rasteriser.forward(scene, rotation[None], centre[None]).values
+        return values @ _LUMINANCE if values.ndim == 3 and sensor.mosaic is None else values
+
+    return score_views(render, poses=poses, truths=pictures, length=similarity.scale * held_out.median_depth)
+
+
+class _View(BaseModel):
+    file: str
+    c2w: list[list[float]]
+
+
+class _Views(BaseModel):
+    median_depth: float
+    views: list[_View]
+
+
+def _read_views(path: Path) -> _Views:
+    try:
+        return _Views.model_validate_json(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise SceneError(f"cannot read the held-out views {path}: {error}") from error
+
+
+def _read_picture(path: Path, *, colour: bool) -> NDArray[np.float32]:
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB if colour else cv2.IMREAD_GRAYSCALE)
+    if picture is None:
+        raise SceneError(f"cannot read the held-out view {path}")
+    return np.asarray(picture, np.float32) / np.float32(255)

@@ -1,0 +1,71 @@
+"""`spiked info`: properties of a recording."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from spiked.recording import Recording, RecordingGeometry, open_recording
+from spiked_service.cli import recording_flags as g
+from spiked_service.cli.console import output, report_warning
+
+_SAMPLED_FRAMES = 4096
+
+
+def info(
+    file: Annotated[Path, typer.Argument(help="A recording.", readable=False)],
+    width: g.Width = None,
+    height: g.Height = None,
+    rate: g.Rate = None,
+    layout: g.FrameLayout = None,
+    bit_order: g.Bits = None,
+    flipped: g.Flipped = None,
+    mosaic: g.Colours = None,
+) -> None:
+    """Print geometry, length, spike rate and gaps of a recording, and the origin of the geometry.
+
+    Examples:
+
+    - `spiked info rec.dat`
+
+    - `spiked info rec.dat --width 640 --height 360 --rate 40000 --mosaic BGGR`
+    """
+    recording = open_recording(
+        file, **RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic).stated()
+    )
+    for warning in recording.warnings:
+        report_warning(warning)
+    for name, value in rows(recording):
+        output.print(f"{name:10s} {value}", markup=False)
+
+
+def rows(recording: Recording) -> list[tuple[str, str]]:
+    """Names and values to print."""
+    sensor = recording.sensor
+    seconds = sensor.seconds(recording.frames)
+    sampled = min(recording.frames, _SAMPLED_FRAMES)
+    rate = _spike_rate(recording, sampled)
+    part = "" if sampled == recording.frames else f" (first {sampled} frames)"
+    k = sensor.intrinsics
+    order = "bottom-up" if sensor.flipped else "top-down"
+    gaps = f"{len(recording.gaps)}, {sum(gap.count for gap in recording.gaps)} frames" if recording.gaps else "none"
+    return [
+        ("file", str(recording.path)),
+        ("geometry", f"{sensor.width}x{sensor.height}, {recording.origin.sentence}"),
+        ("layout", f"{sensor.layout}, rows {order}, {sensor.bit_order} first, {sensor.frame_bytes} bytes a frame"),
+        ("colour", str(sensor.mosaic) if sensor.mosaic else "grey"),
+        ("frames", f"{recording.frames} at {sensor.frame_rate_hz:g} Hz, {seconds:.4f} s"),
+        ("spikes", f"{rate:.4f} a pixel and frame, {rate * sensor.frame_rate_hz:.0f} a pixel and second{part}"),
+        ("optics", f"fx {k.fx:.2f} fy {k.fy:.2f} cx {k.cx:.2f} cy {k.cy:.2f} px" if k else "not known"),
+        ("gaps", gaps),
+    ]
+
+
+def _spike_rate(recording: Recording, frames: int) -> float:
+    """Spikes a pixel and frame over the first frames."""
+    sensor, spikes, chunk = recording.sensor, 0, 512
+    for first in range(0, frames, chunk):
+        count = min(chunk, frames - first)
+        spikes += int(np.bitwise_count(recording.compact(first, count)).sum())
+    return spikes / (frames * sensor.width * sensor.height)

@@ -1,0 +1,66 @@
+"""`spiked noise-report`: noise of spike counts and of the charge between spikes."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from spiked.noise import NoiseReport, measure_noise
+from spiked.recording import RecordingGeometry, open_recording
+from spiked_service.cli import outputs
+from spiked_service.cli import recording_flags as g
+from spiked_service.cli.console import output, report_warning
+
+
+def noise_report(
+    file: Annotated[Path, typer.Argument(help="A recording in which nothing moves.", readable=False)],
+    frames: Annotated[int, typer.Option(min=80, max=60_000, help="Maximum number of frames to read.")] = 2048,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Also write the figures to this file.")] = None,
+    width: g.Width = None,
+    height: g.Height = None,
+    rate: g.Rate = None,
+    layout: g.FrameLayout = None,
+    bit_order: g.Bits = None,
+    flipped: g.Flipped = None,
+    mosaic: g.Colours = None,
+) -> None:
+    """Measure the noise of a camera from a recording of a static scene.
+
+    A count of spikes in a window is off by up to half a spike at each end. The charge between two spikes is known to
+    one frame. The report compares the two for this camera.
+
+    Examples:
+
+    - `spiked noise-report still.dat`
+
+    - `spiked noise-report still.dat --width 400 --height 250 --rate 20000 --json noise.json`
+    """
+    if json_file is not None:
+        outputs.try_file("--json", json_file)
+    recording = open_recording(
+        file, **RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic).stated()
+    )
+    for warning in recording.warnings:
+        report_warning(warning)
+    report = measure_noise(recording, frames)
+    for line in text(report):
+        output.print(line, markup=False)
+    if json_file is not None:
+        with outputs.writing("--json", json_file):
+            json_file.write_text(json.dumps(asdict(report), indent=2) + "\n")
+
+
+def text(report: NoiseReport) -> list[str]:
+    """The report as lines."""
+    head = f"{'window':>8s} {'variance of counts':>19s} {'binomial':>9s} {'error by count':>15s} {'by charge':>10s}"
+    return [
+        f"{report.frames} frames, {report.rate:.4f} spikes a pixel and frame; "
+        f"{report.interval:.2f} +- {report.jitter:.2f} frames from spike to spike",
+        head,
+        *(
+            f"{row.frames:8d} {row.variance:19.3f} {row.binomial_variance:9.3f} {row.counted:15.2%} {row.charge:10.2%}"
+            for row in report.windows
+        ),
+    ]

@@ -1,0 +1,268 @@
+"""`spiked reconstruct`: reconstructs a recording; writes scene, trajectory, report and overview."""
+
+import json
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+from spiked.calibration import Calibration
+from spiked.errors import SpikedError
+from spiked.recon import Reconstructor, State, Status
+from spiked.recon.frontend.mosaic_check import detect
+from spiked.recon.frontend.windowing import Windows
+from spiked.recording import Recording, RecordingGeometry, open_recording
+from spiked.sensor import Mosaic, Sensor
+from spiked.trajectory import Trajectory
+from spiked_service.cli import outputs
+from spiked_service.cli import recording_flags as g
+from spiked_service.cli.console import messages, output, report_error, report_warning
+from spiked_service.results.recording_feed import reconstruct_recording
+from spiked_service.settings.reconstruction_options import ReconstructionOptions
+
+if TYPE_CHECKING:
+    from spiked_service.cli.watch import Watch
+
+INTERRUPTED = 130
+_STDERR = 2
+_FEED_SHARE = 0.3
+"""Part of the progress bar for feeding; the refinement has the rest."""
+
+
+_DEFAULTS = ReconstructionOptions()
+
+
+def _option(name: str) -> Any:
+    """A command-line option with limits and description of `ReconstructionOptions`."""
+    described = ReconstructionOptions.model_fields[name]
+    limits = {kind: getattr(part, kind) for part in described.metadata for kind in ("ge", "le") if hasattr(part, kind)}
+    return typer.Option(help=described.description, min=limits.get("ge"), max=limits.get("le"))
+
+
+# Longer than 60 lines, because each option is a parameter.
+def reconstruct(
+    file: Annotated[Path, typer.Argument(help="A recording.", readable=False)],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; created if missing.")],
+    poses: Annotated[Path | None, typer.Option(help="TUM file of known camera-to-world poses.")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Time budget; reduces the number of steps.", min=0.0)] = None,
+    steps: Annotated[int, _option("steps")] = _DEFAULTS.steps,
+    seed: Annotated[int, _option("seed")] = _DEFAULTS.seed,
+    window_frames: Annotated[int | None, _option("window_frames")] = _DEFAULTS.window_frames,
+    threads: Annotated[int | None, _option("threads")] = _DEFAULTS.threads,
+    max_views: Annotated[int, _option("max_views")] = _DEFAULTS.max_views,
+    refine_poses: Annotated[bool, _option("refine_poses")] = _DEFAULTS.refine_poses,
+    watch: Annotated[bool, typer.Option("--watch", help="Serve a progress page.")] = False,
+    watch_port: Annotated[int, typer.Option(help="Port of the progress page; 0: any free port.", min=0)] = 8660,
+    fov: g.Fov = None,
+    intrinsics: g.IntrinsicsText = None,
+    width: g.Width = None,
+    height: g.Height = None,
+    rate: g.Rate = None,
+    layout: g.FrameLayout = None,
+    bit_order: g.Bits = None,
+    flipped: g.Flipped = None,
+    mosaic: g.ColoursOrAuto = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Gains, dark rates and dead pixels, from `spiked calibrate`.")
+    ] = None,
+) -> None:
+    """Reconstruct the camera's trajectory and a Gaussian scene from a recording.
+
+    Writes scene.ply (3DGS fields), trajectory.tum (a pose for every tracked frame), report.json and overview.png to
+    OUT. Ctrl-C writes the current state and exits with code 130. If no path is found, the exit code is 1, report.json
+    gives the reason, and overview.png shows the observed views.
+
+    Examples:
+
+    - `spiked reconstruct rec.dat -o out`
+
+    - `spiked reconstruct rec.dat -o out --fov 60 --seconds 120`
+
+    - `spiked reconstruct rec.dat -o out --poses known.tum`
+    """
+    outputs.try_folder("--out", out, ("scene.ply", "trajectory.tum", "report.json", "overview.png"))
+    colours = None if mosaic in (None, g.MosaicChoice.AUTO) else Mosaic(mosaic)
+    geometry = RecordingGeometry(width, height, rate, layout, bit_order, flipped, colours)
+    recording = open_recording(file, **geometry.stated())
+    for warning in recording.warnings:
+        report_warning(warning)
+    sensor = g.with_optics(recording.sensor, fov, intrinsics)
+    if mosaic is g.MosaicChoice.AUTO:
+        sensor = _by_pixels(recording, sensor)
+    chosen = ReconstructionOptions(
+        steps=steps,
+        seed=seed,
+        window_frames=window_frames,
+        threads=threads,
+        max_views=max_views,
+        refine_poses=refine_poses,
+    )
+    known = None if poses is None else Trajectory.read_tum(poses)
+    measured = None if calibration is None else Calibration.read(calibration)
+    reconstructor = Reconstructor(sensor, replace(chosen.options(), poses=known, calibration=measured))
+    page = _watched(file.name, watch_port) if watch else None
+    interrupted, curve = _run(recording, reconstructor, page, seconds)
+    _write(reconstructor, out, file.name, curve)
+    _report(reconstructor, out)
+    if interrupted:
+        raise typer.Exit(INTERRUPTED)
+    if reconstructor.failure is not None:
+        raise typer.Exit(1)
+
+
+def _run(
+    recording: Recording, reconstructor: Reconstructor, page: "Watch | None", budget_s: float | None
+) -> tuple[bool, list[tuple[float, float]]]:
+    """Feed and refine with a progress display. Return whether it was interrupted, and the curve of the loss."""
+    total = recording.capture_index(recording.frames - 1) + 1
+    with _interruptible() as interrupt, ProgressDisplay(total) as display:
+
+        def show(status: Status) -> None:
+            display.show(status)
+            if page is not None:
+                page.show(reconstructor, status)
+
+        reconstruct_recording(recording, reconstructor, progress=show, cancelled=interrupt.is_set, budget_s=budget_s)
+    if page is not None:
+        page.close()
+    return interrupt.is_set(), display.curve
+
+
+def _report(reconstructor: Reconstructor, out: Path) -> None:
+    """Print the warnings and the outcome."""
+    for warning in reconstructor.warnings:
+        report_warning(warning)
+    status, failure = reconstructor.status(), reconstructor.failure
+    doubt = "" if status.state is State.TRACK else f": {status.reason}"
+    outcome = f"{status.splats} splats, {status.state}{doubt}" if failure is None else "failed"
+    poses = len(reconstructor.trajectory())
+    output.print(f"{out}: {poses} poses for {status.frames} frames, {outcome}", markup=False)
+    if failure is not None:
+        report_error(SpikedError(f"no path was found: {failure}"))
+
+
+def _by_pixels(recording: Recording, sensor: Sensor) -> Sensor:
+    """The sensor with the mosaic detected from the first 160 frames."""
+    frames = recording.read(0, min(recording.frames, 160))
+    windows = Windows(sensor, min(32, len(frames)))
+    view = next(iter([*windows.feed(0, frames), *windows.flush()]))
+    found = detect(view.rate, sensor.mosaic)
+    if found is not sensor.mosaic:
+        report_warning(
+            f"the mosaic detected from the pixels is {found}, not {sensor.mosaic}; red and blue may be exchanged"
+        )
+    return replace(sensor, mosaic=found)
+
+
+def _watched(title: str, port: int) -> "Watch":
+    from spiked_service.cli.watch import Watch  # imports a web server
+
+    page = Watch(title, port)
+    messages.print(f"progress page: {page.url}", markup=False)
+    return page
+
+
+class _Interrupt:
+    """Set by the first Ctrl-C or SIGTERM; a second one ends the program."""
+
+    def __init__(self) -> None:
+        self._set = False
+
+    def is_set(self) -> bool:
+        return self._set
+
+    def handle(self, number: int, frame: FrameType | None) -> None:
+        if self._set:
+            raise KeyboardInterrupt
+        self._set = True
+        # Not through Python's buffers: the signal may interrupt a write to them.
+        os.write(_STDERR, b"stopping; writing what there is (Ctrl-C again to leave at once)\n")
+
+
+@contextmanager
+def _interruptible() -> Iterator[_Interrupt]:
+    interrupt = _Interrupt()
+    before = {number: signal.signal(number, interrupt.handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield interrupt
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class ProgressDisplay:
+    """Two live lines: stage, bar and time left; frames, state, loss, splats.
+
+    Without a terminal, a plain line every 5 s and at each change of stage.
+    """
+
+    def __init__(self, frames: int, console: Console = messages) -> None:
+        self._frames = frames
+        self._console = console
+        self._bar = Progress(
+            TextColumn("{task.description:9s}"),
+            BarColumn(bar_width=28),
+            TaskProgressColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=console,
+        )
+        self._task = self._bar.add_task("waiting", total=1.0)
+        self._figures = Text()
+        self._live = Live(Group(self._bar, self._figures), console=console)
+        self._begin = self._last = time.monotonic()
+        self._stage = ""
+        self.curve: list[tuple[float, float]] = []
+        """Seconds since the start and loss, in the order of the updates."""
+
+    def __enter__(self) -> "ProgressDisplay":
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._live.stop()
+
+    def show(self, status: Status) -> None:
+        """Show the status."""
+        if status.loss is not None:
+            self.curve.append((time.monotonic() - self._begin, status.loss))
+        loss = "" if status.loss is None else f"  loss {status.loss:.2e}"
+        figures = f"{status.frames}/{self._frames} frames  {status.state}{loss}  {status.splats} splats"
+        fed = min(1.0, status.frames / max(self._frames, 1))
+        done = _FEED_SHARE * fed + (1 - _FEED_SHARE) * status.progress
+        self._bar.update(self._task, description=status.stage, completed=1.0 if status.stage == "done" else done)
+        self._figures.plain = figures
+        if not self._console.is_terminal and (status.stage != self._stage or time.monotonic() - self._last > 5):
+            self._last, self._stage = time.monotonic(), status.stage
+            self._console.print(f"{status.stage}: {figures}  {100 * status.progress:.0f} % refined", markup=False)
+
+
+def _write(reconstructor: Reconstructor, out: Path, title: str, curve: list[tuple[float, float]]) -> None:
+    from spiked_service.cli.overview import draw_overview  # matplotlib takes longer to load than most commands run
+
+    with outputs.writing("--out", out):
+        out.mkdir(parents=True, exist_ok=True)
+        reconstructor.scene().write_ply(out / "scene.ply", reconstructor.white)
+        reconstructor.trajectory().write_tum(out / "trajectory.tum")
+        (out / "report.json").write_text(json.dumps(reconstructor.report(), indent=1), encoding="utf-8")
+        draw_overview(reconstructor, title, curve, out / "overview.png")

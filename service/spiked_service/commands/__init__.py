@@ -1,1 +1,0 @@
-"""The commands of `spiked`, one a file; `cli` puts them together."""

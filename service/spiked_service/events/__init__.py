@@ -1,0 +1,1 @@
+"""The event bus, its messages, and the log."""

@@ -1,0 +1,202 @@
+"""Runs one reconstruction in a worker process.
+
+The only module of the package that starts processes. Another executor has to take a `ReconstructionCommand`, deliver
+`WorkerEvent`s and one exit, and support `stop`, `dismiss` and `kill_after`, as `WorkerProcess` does.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+
+from spiked.recon import State
+from spiked_service.reconstructions.notifier import Notifier
+from spiked_service.reconstructions.repository import ReconstructionRepository
+from spiked_service.store.rows import JobState, ReconstructionRow, Stage
+from spiked_service.workers.messages import (
+    FramesSkipped,
+    PoseEstimated,
+    ReconstructionCommand,
+    ReconstructionStatus,
+    VersionPublished,
+    WorkerError,
+    WorkerEvent,
+)
+from spiked_service.workers.process import StandbyWorker, WorkerProcess
+
+_SAVE_S = 5.0
+"""Interval at which the row of a running job is saved; changes of stage or version are saved at once."""
+
+
+class JobRunner:
+    """A reconstruction with its worker: applies the events of the worker to the row and determines the outcome.
+
+    Events and the exit arrive on one thread of the worker. `cancel`, `finish_early`, `dismiss` and `kill_after` may be
+    called from any thread.
+    """
+
+    def __init__(
+        self,
+        row: ReconstructionRow,
+        rows: ReconstructionRepository,
+        notifier: Notifier,
+        must_yield: Callable[[ReconstructionRow], bool],
+        on_exit: Callable[["JobRunner", str | None], None],
+    ) -> None:
+        """`must_yield` decides at the start of the refinement whether the job returns to the queue.
+
+        `on_exit` is called once, with the reason as a sentence if the worker failed.
+        """
+        self.row = row
+        """The newest row."""
+        self._rows = rows
+        self._notifier = notifier
+        self._must_yield = must_yield
+        self._on_exit = on_exit
+        self._worker: WorkerProcess | None = None
+        self._cancelled = False
+        self._early = False
+        self._yielded = False
+        self._error: str | None = None
+        self._frames_skipped: FramesSkipped | None = None
+        self._again_of: int | None = None
+        self._saved_s = time.monotonic()
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the worker, None before it runs."""
+        return None if self._worker is None else self._worker.pid
+
+    def start(self, command: ReconstructionCommand, standby: StandbyWorker | None) -> None:
+        """Save the row and start the worker, or use a standby worker. Raises OSError."""
+        command.folder.mkdir(exist_ok=True)
+        self._rows.save(self.row)
+        self._worker = WorkerProcess(
+            command,
+            command.folder / "log",
+            self._handle,
+            lambda trouble: self._on_exit(self, trouble),
+            standby,
+        )
+
+    def cancel(self) -> None:
+        """Stop the worker; published versions are kept."""
+        self._cancelled = True
+        self._stop()
+
+    def finish_early(self) -> None:
+        """End the refinement; the reconstruction counts as complete."""
+        self._early = True
+        self._stop()
+
+    def dismiss(self) -> None:
+        """Ask the worker to exit at once."""
+        if self._worker is not None:
+            self._worker.dismiss()
+
+    def kill_after(self, timeout_s: float) -> None:
+        """Wait for the worker to exit; kill it after `timeout_s`."""
+        if self._worker is not None:
+            self._worker.kill_after(timeout_s)
+
+    def outcome(self, trouble: str | None) -> ReconstructionRow | None:
+        """The row after the exit: over, or queued again from the recording; None if the worker died unexpectedly."""
+        row = replace(self.row, ended_at=datetime.now(UTC), eta_s=None)
+        if self._cancelled:
+            return replace(row, state=JobState.CANCELLED, stage=Stage.DONE if trouble is None else row.stage, reason="")
+        if trouble is not None:
+            return None if self._error is None else replace(row, state=JobState.FAILED, reason=self._error)
+        if self._frames_skipped is not None and not self._early:
+            seen, skipped = self._frames_skipped.frames, self._frames_skipped.skipped
+            reason = f"{skipped} of {seen} frames were skipped live; restarted from the recording with all of them"
+            return queued_again(row, reason)
+        if self._yielded and row.progress < 1 and not self._early:
+            return queued_again(row, "")
+        if not row.frames:
+            reason = "no frames were received, so there is nothing to reconstruct"
+            return replace(row, state=JobState.CANCELLED, stage=Stage.DONE, reason=reason)
+        if not row.poses:
+            return replace(row, state=JobState.FAILED, stage=Stage.DONE, reason=row.reason or "no path was found")
+        progress = row.progress if self._early else 1.0
+        return replace(row, state=JobState.COMPLETE, stage=Stage.DONE, progress=progress, reason=self._remarks())
+
+    def _stop(self) -> None:
+        if self._worker is not None:
+            self._worker.stop()
+
+    def _handle(self, event: WorkerEvent) -> None:
+        match event:
+            case ReconstructionStatus():
+                self._advance(event)
+            case PoseEstimated():
+                self._notifier.pose(self.row, event.pose)
+            case VersionPublished():
+                self._publish(event)
+            case FramesSkipped():
+                self._frames_skipped = event
+            case WorkerError():
+                self._error = event.reason
+
+    def _advance(self, event: ReconstructionStatus) -> None:
+        before = self.row
+        self.row = replace(
+            before,
+            stage=event.stage,
+            progress=event.progress,
+            tracking_state=event.state,
+            reason=event.reason,
+            frames=event.frames,
+            poses=max(event.poses, before.poses) if not event.version else event.poses,
+            splats=event.splats,
+            loss=event.loss,
+            psnr_db=event.psnr_db,
+            eta_s=event.eta_s,
+        )
+        if event.stage is Stage.REFINING and before.stage is not Stage.REFINING and self._must_yield(self.row):
+            self._yielded = True
+            self._stop()
+        if event.stage is not before.stage or time.monotonic() - self._saved_s > _SAVE_S:
+            self._save()
+        else:
+            self._rows.update(self.row)
+
+    def _publish(self, event: VersionPublished) -> None:
+        self._again_of, published = event.again_of, event.published
+        self.row = replace(
+            self.row,
+            version=published.version,
+            white=published.white,
+            poses=published.poses,
+            splats=published.splats,
+        )
+        self._rows.add_version(self.row, published, set(event.kept))
+        self._save()
+        self._notifier.scene(self.row, published)
+
+    def _save(self) -> None:
+        self._saved_s = time.monotonic()
+        self._rows.save(self.row)
+
+    def _remarks(self) -> str:
+        """Remarks on a complete reconstruction; empty if it tracked and refined all frames."""
+        remarks = [] if self.row.tracking_state is State.TRACK else [self.row.reason]
+        if self._early:
+            remarks.append(f"the refinement was ended at {self.row.progress:.0%}")
+        if self._again_of is not None:
+            remarks.append(
+                f"version {self._again_of} matches the recording better than the last one and is published again"
+            )
+        return "; ".join(remarks)
+
+
+def queued_again(row: ReconstructionRow, reason: str) -> ReconstructionRow:
+    """The row of a reconstruction that is to restart from the recording."""
+    return replace(
+        row,
+        live=False,
+        state=JobState.QUEUED,
+        stage=Stage.WAITING,
+        progress=0.0,
+        reason=reason,
+        ended_at=None,
+    )

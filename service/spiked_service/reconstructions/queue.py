@@ -1,0 +1,323 @@
+"""All reconstructions: live ones start at once, others from a queue; failed workers are retried."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+
+from spiked.errors import ConfigurationError
+from spiked.sensor import Intrinsics
+from spiked_service.base.errors import BusyError
+from spiked_service.base.ids import new_id
+from spiked_service.reconstructions.job_runner import JobRunner, queued_again
+from spiked_service.reconstructions.notifier import Notifier
+from spiked_service.reconstructions.queue_policy import QueuePolicy
+from spiked_service.reconstructions.repository import ReconstructionRepository
+from spiked_service.settings.reconstruction_options import ReconstructionOptions
+from spiked_service.store.catalogue import Catalogue, StoreError
+from spiked_service.store.folder import DataFolder
+from spiked_service.store.rows import CaptureRow, JobState, ReconstructionRow, Stage
+from spiked_service.workers.messages import ReconstructionCommand, RingOpened
+from spiked_service.workers.process import StandbyWorker
+
+_LOOK_S = 0.5
+"""Interval at which the queue is checked while a retry is delayed."""
+
+
+class Reconstructions:
+    """Starts, queues and ends reconstructions, as `QueuePolicy` decides. Thread-safe.
+
+    Rows, versions and files are read from `rows`; the limit of `policy` may be changed at any time.
+    """
+
+    def __init__(
+        self,
+        folder: DataFolder,
+        catalogue: Catalogue,
+        notifier: Notifier,
+        policy: QueuePolicy,
+        rows: ReconstructionRepository,
+    ) -> None:
+        self._folder = folder
+        self._catalogue = catalogue
+        self._notifier = notifier
+        self.policy = policy
+        self.rows = rows
+        self._lock = threading.RLock()
+        self._wake = threading.Condition(self._lock)
+        self._jobs: dict[str, JobRunner] = {}
+        self._least_poses: dict[str, int] = {}
+        """Poses of the published trajectory of a queued reconstruction, which a restart has to reach."""
+        self._closing = False
+        self._thread: threading.Thread | None = None
+        self._requeue_interrupted()
+
+    def start(self) -> None:
+        """Start the queue. Call once, after interrupted recordings have been recovered."""
+        with self._lock:
+            if self._closing:  # the service has stopped meanwhile
+                return
+            thread = threading.Thread(target=self._run_queue, name="queue", daemon=True)
+            thread.start()
+            self._thread = thread
+
+    def begin_live(
+        self,
+        capture: CaptureRow,
+        opened: RingOpened,
+        on_end: Callable[[ReconstructionRow], None],
+        *,
+        first_frame: int = 0,
+        stop_frame: int | None = None,
+        standby: StandbyWorker | None = None,
+    ) -> ReconstructionRow:
+        """Reconstruct a capture while it runs. `on_end` is called once, when its worker no longer reads the ring."""
+        options = capture.plan.options
+        now = datetime.now(UTC)
+        row = ReconstructionRow(
+            new_id(), capture.id, True, JobState.RUNNING, now, options=options, attempts=1, started_at=now
+        )
+        command = ReconstructionCommand(
+            capture_id=capture.id,
+            reconstruction_id=row.id,
+            ring=opened.name,
+            recording=None,
+            folder=self._folder.reconstruction(row.id),
+            can_block=opened.can_block,
+            options=options,
+            intrinsics=_intrinsics(options, capture),
+            first_frame=first_frame,
+            stop_frame=stop_frame,
+            recorded=capture.plan.record,
+        )
+        with self._lock:
+            self._begin(row, command, standby, on_end)
+        return row
+
+    def submit(
+        self, capture_id: str, options: ReconstructionOptions | None = None, priority: int = 0
+    ) -> ReconstructionRow:
+        """Queue a reconstruction from the recording of a capture; it waits while the capture runs.
+
+        Raises UnknownIdError, and ConfigurationError for a capture without a recording.
+        """
+        capture = self._catalogue.captures.get(capture_id)
+        chosen = options or ReconstructionOptions()
+        _check(capture)
+        row = ReconstructionRow(
+            new_id(), capture_id, False, JobState.QUEUED, datetime.now(UTC), options=chosen, priority=priority
+        )
+        with self._lock:
+            added = self.rows.add(row)
+            self._wake.notify_all()
+        return added
+
+    def cancel(self, reconstruction_id: str) -> ReconstructionRow:
+        """End a queued or running reconstruction; published versions are kept. Does nothing to one that has ended."""
+        with self._lock:
+            job = self._jobs.get(reconstruction_id)
+            if job is not None:
+                job.cancel()
+                return job.row
+            row = self.rows.get(reconstruction_id)
+            if row.state is JobState.QUEUED:
+                self.policy.reset_retries(row.id)
+                ended = replace(row, state=JobState.CANCELLED, reason="", eta_s=None, ended_at=datetime.now(UTC))
+                row = self.rows.save(ended)
+            return row
+
+    def finish_early(self, reconstruction_id: str) -> None:
+        """End the refinement of a running reconstruction; it counts as complete."""
+        with self._lock:
+            job = self._jobs.get(reconstruction_id)
+            if job is not None:
+                job.finish_early()
+
+    def restart(self, reconstruction_id: str, options: ReconstructionOptions | None = None) -> ReconstructionRow:
+        """Queue an ended reconstruction again; version numbers continue. Raises BusyError if it has not ended."""
+        with self._lock:
+            row = self.rows.get(reconstruction_id)
+            if not row.state.over:
+                raise BusyError(f"reconstruction {row.id} is {row.state}: cancel it, or wait for its end")
+            _check(self._catalogue.captures.get(row.capture_id))
+            self.policy.reset_retries(row.id)
+            begun = ReconstructionRow(
+                row.id,
+                row.capture_id,
+                False,
+                JobState.QUEUED,
+                row.created_at,
+                options=options or row.options,
+                priority=row.priority,
+                version=row.version,
+                white=row.white,
+                poses=row.poses,
+                splats=row.splats,
+            )
+            self.rows.save(begun)
+            self._wake.notify_all()
+            return begun
+
+    def remove(self, reconstruction_id: str) -> None:
+        """Delete a reconstruction with its versions. Raises BusyError while its worker runs."""
+        with self._lock:
+            row = self.rows.get(reconstruction_id)
+            if row.state is JobState.RUNNING:
+                raise BusyError(f"reconstruction {row.id} is running: cancel it first")
+            self.rows.remove(row.id)
+
+    def wake_queue(self) -> None:
+        """Check the queue: the recording of a capture has been closed, or will not exist."""
+        with self._lock:
+            self._wake.notify_all()
+
+    def processes(self) -> dict[str, int]:
+        """Process ids of the running workers, by reconstruction."""
+        with self._lock:
+            return {key: job.pid for key, job in self._jobs.items() if job.pid is not None}
+
+    def dismiss(self) -> None:
+        """Ask every worker to exit at once, and start no other."""
+        with self._lock:
+            self._closing = True
+            jobs = list(self._jobs.values())
+            self._wake.notify_all()
+        for job in jobs:
+            job.dismiss()
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for dismissed workers; kill those that have not exited after `timeout_s`."""
+        with self._lock:
+            jobs, thread = list(self._jobs.values()), self._thread
+        for job in jobs:
+            job.kill_after(timeout_s)
+        if thread is not None:
+            thread.join()
+
+    def _requeue_interrupted(self) -> None:
+        """Queue the jobs that an earlier service left running; they restart from the recording."""
+        for row in self.rows.interrupted():
+            if row.attempts >= QueuePolicy.MOST_ATTEMPTS:
+                reason = (
+                    f"failed after {row.attempts} attempts, the last of which was interrupted by the end of the service"
+                )
+                self.rows.save(replace(row, state=JobState.FAILED, reason=reason, ended_at=datetime.now(UTC)))
+                continue
+            reason = "restarted from the recording, because the service ended while it ran"
+            self.rows.save(queued_again(row, reason))
+
+    def _run_queue(self) -> None:
+        while True:
+            with self._lock:
+                if self._closing:
+                    return
+                try:
+                    self._begin_next()
+                except (StoreError, OSError) as error:
+                    self._notifier.log("error", f"no reconstruction can be started: {error}")
+                self._wake.wait(_LOOK_S if self.policy.delays else None)
+
+    def _begin_next(self) -> None:
+        for row in self.rows.queued():
+            if len(self._jobs) >= self.policy.limit:
+                return
+            if not self.policy.due(row.id):
+                continue
+            capture = self._catalogue.captures.find(row.capture_id)
+            recorded = capture is not None and capture.recording is not None and capture.recording.frames > 0
+            if capture is None or (capture.state.over and not recorded):
+                why = row.reason or "the capture has no recording"
+                self.rows.save(replace(row, state=JobState.FAILED, reason=why, ended_at=datetime.now(UTC)))
+            elif recorded:
+                self._begin_from_recording(row, capture)
+
+    def _begin_from_recording(self, row: ReconstructionRow, capture: CaptureRow) -> None:
+        command = ReconstructionCommand(
+            capture_id=capture.id,
+            reconstruction_id=row.id,
+            ring=None,
+            recording=self._folder.recording(capture.id),
+            folder=self._folder.reconstruction(row.id),
+            can_block=True,
+            options=row.options,
+            intrinsics=_intrinsics(row.options, capture),
+            least_poses=self._least_poses.pop(row.id, 0),
+        )
+        now = datetime.now(UTC)
+        begun = replace(
+            row, state=JobState.RUNNING, stage=Stage.WAITING, started_at=now, ended_at=None, attempts=row.attempts + 1
+        )
+        self._begin(begun, command)
+
+    def _begin(
+        self,
+        row: ReconstructionRow,
+        command: ReconstructionCommand,
+        standby: StandbyWorker | None = None,
+        on_end: Callable[[ReconstructionRow], None] | None = None,
+    ) -> None:
+        job = JobRunner(
+            row,
+            self.rows,
+            self._notifier,
+            self._must_yield,
+            lambda job, trouble: self._ended(job, trouble, on_end),
+        )
+        self._jobs[row.id] = job
+        try:
+            job.start(command, standby)
+        except OSError as error:
+            del self._jobs[row.id]
+            reason = f"its worker cannot be started: {error.strerror}"
+            self.rows.save(replace(row, state=JobState.FAILED, reason=reason, ended_at=datetime.now(UTC)))
+            raise
+
+    def _must_yield(self, row: ReconstructionRow) -> bool:
+        """Whether a job that begins to refine must return to the queue, from which it restarts with its recording."""
+        with self._lock:
+            capture = self._catalogue.captures.find(row.capture_id)
+            if capture is None or not capture.plan.record:
+                return False
+            others = [job.row for job in self._jobs.values() if job.row.id != row.id]
+            return self.policy.must_yield(row, others, bool(self.rows.queued()))
+
+    def _ended(self, job: JobRunner, trouble: str | None, on_end: Callable[[ReconstructionRow], None] | None) -> None:
+        with self._lock:
+            row = job.row
+            del self._jobs[row.id]
+            # A job that is interrupted by the end of the service stays "running": the next start queues it again.
+            if not self._closing or (trouble is None and row.stage is Stage.DONE):
+                row = self.rows.save(self._outcome(job, trouble))
+            self._wake.notify_all()
+        if on_end is not None:
+            on_end(row)
+
+    def _outcome(self, job: JobRunner, trouble: str | None) -> ReconstructionRow:
+        row = job.outcome(trouble)
+        if row is None:
+            return self._after_crash(job.row, f"{trouble}")
+        if row.state is JobState.QUEUED:
+            self._least_poses[row.id] = row.poses
+        return row
+
+    def _after_crash(self, row: ReconstructionRow, trouble: str) -> ReconstructionRow:
+        """The row of a job whose worker died: queued again while retries are left and there is a recording."""
+        row = replace(row, ended_at=datetime.now(UTC), eta_s=None)
+        capture = self._catalogue.captures.find(row.capture_id)
+        if capture is not None and capture.plan.record and self.policy.retry(row.id):
+            return queued_again(row, f"{trouble}; restarted from the recording (attempt {row.attempts + 1})")
+        tried = f", the last of {row.attempts} attempts" if row.attempts > 1 else ""
+        return replace(row, state=JobState.FAILED, reason=f"{trouble}{tried}")
+
+
+def _check(capture: CaptureRow) -> None:
+    if capture.deleted_at is not None:
+        raise ConfigurationError(f"capture {capture.id} is deleted: restore it first")
+    if not capture.plan.record or (capture.state.over and (capture.recording is None or not capture.recording.frames)):
+        raise ConfigurationError(f"capture {capture.id} has no recording to reconstruct from")
+
+
+def _intrinsics(options: ReconstructionOptions, capture: CaptureRow) -> Intrinsics | None:
+    if options.intrinsics is not None:
+        return options.intrinsics.intrinsics()
+    return capture.plan.intrinsics or (None if capture.sensor is None else capture.sensor.intrinsics)

@@ -1,0 +1,164 @@
+"""Rows, versions and files of reconstructions."""
+
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from spiked_service.reconstructions.notifier import Notifier
+from spiked_service.reconstructions.queue_estimates import NEXT, QueueEstimates
+from spiked_service.reconstructions.queue_policy import QueuePolicy
+from spiked_service.results.timeline_writer import NAME as TIMELINE
+from spiked_service.results.versions import Published, version_row
+from spiked_service.store.catalogue import Catalogue, Page, StoreError
+from spiked_service.store.folder import DataFolder
+from spiked_service.store.rows import JobState, ReconstructionRow, VersionRow
+
+
+class ReconstructionRepository:
+    """Reads, saves and publishes reconstructions. Thread-safe.
+
+    The catalogue holds the rows; rows of running reconstructions and rows that could not be saved on a full disk are
+    newer in memory. Queued rows are read with their place in the queue and the expected seconds to completion.
+    """
+
+    def __init__(self, folder: DataFolder, catalogue: Catalogue, notifier: Notifier, policy: QueuePolicy) -> None:
+        self._folder = folder
+        self._catalogue = catalogue
+        self._notifier = notifier
+        self._policy = policy
+        self._estimates = QueueEstimates(catalogue)
+        self._lock = threading.RLock()
+        self._running: dict[str, ReconstructionRow] = {}
+        self._unsaved: dict[str, ReconstructionRow] = {}
+
+    def get(self, reconstruction_id: str) -> ReconstructionRow:
+        """The reconstruction as it is now. Raises UnknownIdError."""
+        return self._current([self._catalogue.reconstructions.get(reconstruction_id)])[0]
+
+    def page(
+        self,
+        limit: int = 50,
+        cursor: str | None = None,
+        capture_id: str | None = None,
+        state: JobState | None = None,
+    ) -> Page[ReconstructionRow]:
+        """A page of reconstructions, newest first."""
+        page = self._catalogue.reconstruction_page(limit, cursor, capture_id, state)
+        return Page(self._current(page.items), page.next_cursor)
+
+    def of(self, capture_id: str) -> tuple[ReconstructionRow, ...]:
+        """Reconstructions of a capture, oldest first."""
+        return tuple(self._current(self._catalogue.reconstructions_of(capture_id)))
+
+    def queued(self) -> list[ReconstructionRow]:
+        """Queued reconstructions, the next one first, without those that could not be saved."""
+        rows = self._catalogue.reconstructions.where(NEXT, (str(JobState.QUEUED),))
+        with self._lock:
+            return [row for row in rows if row.id not in self._unsaved]
+
+    def interrupted(self) -> list[ReconstructionRow]:
+        """Reconstructions that an earlier service left running."""
+        return self._catalogue.reconstructions.where("state = ?", (str(JobState.RUNNING),))
+
+    def counts(self) -> dict[JobState, int]:
+        """Number of reconstructions by state."""
+        found = self._catalogue.read("SELECT state, count(*) FROM reconstructions GROUP BY state")
+        return dict.fromkeys(JobState, 0) | {JobState(state): count for state, count in found}
+
+    def folder(self, reconstruction_id: str) -> Path:
+        """Folder of its versions. Raises UnknownIdError."""
+        return self._folder.reconstruction(self._catalogue.reconstructions.get(reconstruction_id).id)
+
+    def log(self, reconstruction_id: str) -> Path:
+        """Log file of its workers, which may not exist. Raises UnknownIdError."""
+        return self.folder(reconstruction_id) / "log"
+
+    def timeline(self, reconstruction_id: str) -> Path:
+        """File of its timeline, which may not exist; see `timeline.Timeline`. Raises UnknownIdError."""
+        return self.folder(reconstruction_id) / TIMELINE
+
+    def versions(self, reconstruction_id: str) -> Sequence[VersionRow]:
+        """Available versions, oldest first. Raises UnknownIdError."""
+        return self._catalogue.versions(self._catalogue.reconstructions.get(reconstruction_id).id)
+
+    def add(self, row: ReconstructionRow) -> ReconstructionRow:
+        """Save a new row. Raises StoreError, and then there is none."""
+        with self._lock:
+            self._catalogue.reconstructions.put(row)
+            self._publish_queue()
+            return self._current([row])[0]
+
+    def save(self, row: ReconstructionRow) -> ReconstructionRow:
+        """Save and publish a row. A row that cannot be saved is kept in memory and retried."""
+        row = replace(row, queue_place=None)
+        with self._lock:
+            self._set_running(row)
+            try:
+                self._catalogue.reconstructions.put(row)
+                self._unsaved.pop(row.id, None)
+            except StoreError as error:
+                if row.id not in self._unsaved:
+                    self._notifier.log("error", str(error), row.capture_id, row.id)
+                self._unsaved[row.id] = row
+            if row.state is JobState.QUEUED and row.id not in self._unsaved:
+                self._estimates.forget(row.id)  # published with its place by `_publish_queue`
+            else:
+                self._notifier.job(row)
+            self._publish_queue()
+        return row
+
+    def update(self, row: ReconstructionRow) -> None:
+        """Publish the row of a running reconstruction without saving it."""
+        with self._lock:
+            self._set_running(row)
+            self._notifier.job(row)
+
+    def retry_saving(self) -> None:
+        """Save rows that could not be saved on a full disk."""
+        with self._lock:
+            for row in list(self._unsaved.values()):
+                self.save(self._running.get(row.id, row))
+
+    def add_version(self, row: ReconstructionRow, published: Published, kept: set[int]) -> None:
+        """Save a published version and forget those that are not in `kept`. Errors are logged."""
+        try:
+            self._catalogue.put_version(version_row(row.id, published), kept)
+        except StoreError as error:
+            self._notifier.log("error", str(error), row.capture_id, row.id)
+
+    def remove(self, reconstruction_id: str) -> None:
+        """Delete a reconstruction with its versions and files."""
+        with self._lock:
+            self._folder.remove(self._folder.reconstruction(reconstruction_id))
+            with self._catalogue.transaction():
+                self._catalogue.forget_versions(reconstruction_id)
+                self._catalogue.reconstructions.remove(reconstruction_id)
+            self._unsaved.pop(reconstruction_id, None)
+
+    def _set_running(self, row: ReconstructionRow) -> None:
+        if row.state is JobState.RUNNING:
+            self._running[row.id] = row
+        else:
+            self._running.pop(row.id, None)
+
+    def _current(self, rows: Sequence[ReconstructionRow]) -> list[ReconstructionRow]:
+        with self._lock:
+            found = [self._running.get(row.id) or self._unsaved.get(row.id, row) for row in rows]
+            waits = any(row.state is JobState.QUEUED for row in found)
+            placed = {row.id: row for row in self._placed()} if waits else {}
+            return [placed.get(row.id, row) for row in found]
+
+    def _placed(self) -> Sequence[ReconstructionRow]:
+        """Queued rows with their places and times."""
+        return self._estimates.queued([*self._running.values()], self._policy.limit)
+
+    def _publish_queue(self) -> None:
+        """Publish changed places and times of the queue."""
+        try:
+            placed = self._placed()
+        except StoreError as error:
+            self._notifier.log("error", str(error))
+            return
+        for row in self._estimates.changed(placed):
+            self._notifier.job(row)

@@ -1,0 +1,1 @@
+"""Results: published versions, timelines, rendered views and images of frames."""

@@ -1,0 +1,197 @@
+"""Versions of a scene and its trajectory: one process publishes them, others read them at any time."""
+
+import os
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from spiked.poses import PoseAppender
+from spiked.scene import Scene
+from spiked.sensor import Intrinsics
+from spiked.trajectory import Trajectory
+from spiked_service.store.rows import VersionRow
+
+_NEWEST = 3
+"""Newest versions, always kept, so that the files exist for readers that have just read the index."""
+_EARLIER = 16
+"""Earlier versions kept, spread over time; at twice as many, every second one is removed."""
+_INDEX = "published.json"
+
+
+class Published(BaseModel):
+    """Metadata of a version, whose files are beside the index."""
+
+    version: int
+    white: float
+    """Radiance shown as white, spikes per frame."""
+    scene: str
+    trajectory: str
+    """Name of a pose file; of a TUM file in folders of older releases."""
+    at: datetime
+    splats: int
+    poses: int
+    scene_bytes: int
+    psnr_db: float | None = None
+    intrinsics: tuple[float, float, float, float] | None = None
+    """fx, fy, cx, cy (px), given or estimated."""
+
+
+class _Index(BaseModel):
+    versions: list[Published]
+    """Oldest first; never empty."""
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file in one step: readers see the old or the new content, also after a power cut. Raises OSError."""
+    part = path.with_name(path.name + ".part")
+    with part.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fdatasync(file.fileno())
+    part.replace(path)
+
+
+class Publisher:
+    """Writes numbered versions into a folder; numbers continue after those in the folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._versions = versions(folder)
+        self._held: set[int] = set()
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the versions."""
+        return self._folder
+
+    @property
+    def version(self) -> int:
+        """Number of the newest version; 0: none yet."""
+        return self._versions[-1].version if self._versions else 0
+
+    @property
+    def kept(self) -> list[int]:
+        """Numbers of the available versions."""
+        return [published.version for published in self._versions]
+
+    @property
+    def versions(self) -> list[Published]:
+        """The available versions, oldest first."""
+        return self._versions
+
+    def hold(self) -> None:
+        """Keep the current newest version for the life of this process."""
+        if self._versions:
+            self._held.add(self.version)
+
+    def again(self, earlier: Published) -> Published:
+        """Publish the files of an earlier version under the next number. Raises OSError as `publish` does."""
+        version = self.version + 1
+        names = {"scene": f"scene-{version:06d}.ply", "trajectory": f"trajectory-{version:06d}.poses"}
+        published = earlier.model_copy(update={"version": version, "at": datetime.now(UTC), **names})
+        write_atomically(self._folder / published.scene, (self._folder / earlier.scene).read_bytes())
+        write_atomically(self._folder / published.trajectory, pose_file(self._folder, earlier).read_bytes())
+        self._list(published)
+        return published
+
+    def publish(
+        self,
+        scene: Scene,
+        trajectory: Trajectory,
+        white: float,
+        psnr_db: float | None = None,
+        intrinsics: Intrinsics | None = None,
+        states: NDArray[np.bytes_] | None = None,
+    ) -> Published:
+        """Publish the next version and remove old ones; `states` [n] is the tracking state at each pose.
+
+        Raises OSError if it cannot be written.
+        """
+        version = self.version + 1
+        content = scene.ply(white)
+        published = Published(
+            version=version,
+            white=white,
+            scene=f"scene-{version:06d}.ply",
+            trajectory=f"trajectory-{version:06d}.poses",
+            at=datetime.now(UTC),
+            splats=len(scene),
+            poses=len(trajectory),
+            scene_bytes=len(content),
+            psnr_db=psnr_db,
+            intrinsics=None if intrinsics is None else (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy),
+        )
+        write_atomically(self._folder / published.scene, content)
+        _write_poses(self._folder / published.trajectory, trajectory, states)
+        self._list(published)
+        return published
+
+    def _list(self, published: Published) -> None:
+        kept = _thinned([*self._versions, published], self._held)
+        write_atomically(self._folder / _INDEX, _Index(versions=kept).model_dump_json().encode())
+        gone = {one.version: one for one in self._versions}.keys() - {one.version for one in kept}
+        for one in self._versions:
+            if one.version in gone:
+                (self._folder / one.scene).unlink(missing_ok=True)
+                (self._folder / one.trajectory).unlink(missing_ok=True)
+                pose_file(self._folder, one).unlink(missing_ok=True)
+        self._versions = kept
+
+
+def pose_file(folder: Path, published: Published) -> Path:
+    """The pose file of a version; for one of an older release it is written at the first read."""
+    return (folder / published.trajectory).with_suffix(".poses")
+
+
+def version_row(reconstruction_id: str, published: Published) -> VersionRow:
+    """The catalogue row of a version."""
+    return VersionRow(
+        reconstruction_id,
+        published.version,
+        published.at,
+        published.splats,
+        published.poses,
+        published.white,
+        published.scene_bytes,
+        published.psnr_db,
+    )
+
+
+def _write_poses(path: Path, trajectory: Trajectory, states: NDArray[np.bytes_] | None) -> None:
+    part = path.with_name(path.name + ".part")
+    part.unlink(missing_ok=True)
+    with PoseAppender(part) as file:
+        file.append(trajectory, states)
+        file.sync()
+    part.replace(path)
+
+
+def _thinned(published: list[Published], held: set[int]) -> list[Published]:
+    earlier, newest = published[:-_NEWEST], published[-_NEWEST:]
+    if len(earlier) >= 2 * _EARLIER:
+        earlier = [one for n, one in enumerate(earlier) if n % 2 == 0 or one.version in held]
+    return earlier + newest
+
+
+def versions(folder: Path) -> list[Published]:
+    """The versions in a folder, oldest first."""
+    try:
+        return _Index.model_validate_json((folder / _INDEX).read_bytes()).versions
+    except FileNotFoundError:
+        return []
+
+
+def newest(folder: Path) -> Published | None:
+    """The newest version in a folder, None before the first."""
+    found = versions(folder)
+    return found[-1] if found else None
+
+
+def at(folder: Path, version: int | None) -> Published | None:
+    """The version with this number, the newest if None. Return None if it does not exist yet or was removed."""
+    if version is None:
+        return newest(folder)
+    return next((one for one in versions(folder) if one.version == version), None)

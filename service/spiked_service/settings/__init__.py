@@ -1,0 +1,1 @@
+"""Settings, their origins and their reload."""

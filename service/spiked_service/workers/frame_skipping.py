@@ -1,0 +1,81 @@
+"""Skips backlog when tracking cannot keep up with the camera.
+
+The tracker takes windows of the newest frames and skips those between. Skipped frames are not lost: they are recorded,
+and the reconstruction runs again from the recording with all frames.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.ring import End, Frames, Gap, RingReader
+
+LATE_FRAMES = 2000
+"""Backlog, in frames, beyond which the tracker skips: fast motion is tracked at some hundred frames a second.
+Captures of fewer frames are tracked completely."""
+REACH_PX = (20.0, 60.0)
+"""Image motion between windows, pixels: feature tracks survive the first, and most survive the second."""
+_STRIDE_S = 0.05
+"""Time over which the motion model predicts, about."""
+_LATE_S = 0.2
+"""Lateness at which the second `REACH_PX` applies; in between, the reach is interpolated."""
+
+
+def next_window(at: int, newest: int, count: int, speed_px: float | None, rate_hz: float) -> int:
+    """First frame of the next window of `count` frames, at or after frame `at`.
+
+    The window ends at `newest` unless the motion from `at` exceeds the reach of the tracks. `speed_px` is the image
+    motion in pixels a frame, None if unknown.
+    """
+    latest = newest - count
+    if speed_px:
+        late_s = max(latest - at, 0) / rate_hz
+        reach_px = np.interp(late_s, (0, _LATE_S), REACH_PX)
+        latest = min(latest, int(at + min(reach_px / speed_px, max(_STRIDE_S, late_s / 2) * rate_hz)))
+    return max(at, latest)
+
+
+class LatestFrames:
+    """Reads windows of frames from a ring and skips the frames between them."""
+
+    def __init__(self, reader: RingReader, at: int) -> None:
+        """Start at frame `at`."""
+        self._reader = reader
+        self._parts: list[NDArray[np.uint8]] = []
+        self._first = self._wanted = at
+        self._count = 0
+        self.at = at
+        """Index of the next frame of the ring."""
+        self.skipped = 0
+        """Frames that were skipped."""
+
+    def track_latest(self, first: int, count: int) -> None:
+        """Select the next window. Frames collected for an earlier one and not taken count as skipped."""
+        self.skipped += sum(len(part) for part in self._parts)
+        self._parts, self._wanted, self._count = [], max(first, self.at), count
+
+    def take(self, wait_s: float) -> tuple[int, NDArray[np.uint8]] | Gap | End | None:
+        """The selected window with the index of its first frame, or a gap or the end of the ring that precedes it.
+
+        None if the window is not complete within `wait_s`.
+        """
+        while (item := self._reader.next(wait_s)) is not None:
+            if not isinstance(item, Frames):
+                self.track_latest(self._wanted, self._count)
+                self.at = item.first + item.count if isinstance(item, Gap) else self.at
+                return item
+            stop = item.first + item.count
+            wanted = stop > self._wanted
+            copied = np.array(item.data) if wanted else None
+            if not item.release():
+                continue  # overwritten: the next item is a gap
+            self.at = stop
+            if copied is None:
+                self.skipped += item.count
+                continue
+            if not self._parts:
+                self._first = item.first
+            self._parts.append(copied)
+            if stop - self._first >= self._count:
+                frames, self._parts = np.concatenate(self._parts), []
+                return self._first, frames
+        return None

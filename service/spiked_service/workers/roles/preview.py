@@ -1,0 +1,128 @@
+"""The preview worker: renders images of the newest frames, at most one set every `_PERIOD_S`."""
+
+import base64
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.blocks import Window, aligned_window
+from spiked.recon.frontend.demosaic import fill_mosaic
+from spiked.ring import End, Frames, Gap, Policy, RingReader
+from spiked.sensor import Sensor
+from spiked_service.results.image_encoding import display_white, thumbnail
+from spiked_service.results.versions import write_atomically
+from spiked_service.workers.channel import WorkerChannel
+from spiked_service.workers.messages import PreviewCommand, PreviewKind, PreviewTaken
+
+_BLOCKS = 4
+"""Blocks per image; the window excludes one at either end, whose spikes complete the intervals."""
+_PERIOD_S = 0.15
+_WAIT_S = 0.1
+_BINS = 64
+_HOT_RATE = 0.3
+"""Spikes a frame by which a hot pixel exceeds the median of its neighbours."""
+_HOT_MOST = 64
+_MEMORY = 0.85
+"""Weight of the accumulated image when another is added."""
+_QUALITY = 85
+
+Image = NDArray[np.float32]
+
+
+def run_preview(command: PreviewCommand, channel: WorkerChannel) -> None:
+    """Render images until the capture ends."""
+    with RingReader.attach(command.ring, Policy.LATEST, "preview") as reader:
+        renderer = PreviewRenderer(reader.geometry.sensor, command.thumbnail)
+        block = reader.geometry.block_frames
+        blocks: list[NDArray[np.uint8]] = []
+        first = 0
+        while not channel.stop.is_set():
+            item = reader.next(_WAIT_S)
+            match item:
+                case End():
+                    break
+                case Gap():
+                    blocks.clear()
+                case Frames():
+                    copied = np.array(item.data)
+                    if not item.release() or (blocks and item.count < block):
+                        blocks.clear()
+                        continue
+                    first = first if blocks else item.first
+                    blocks.append(copied)
+                case None:
+                    continue
+            if len(blocks) == _BLOCKS:
+                frames = np.concatenate(blocks)
+                if len(frames) > 2 * block:
+                    channel.send(renderer.render(frames, first, block))
+                blocks.clear()
+                channel.leave.wait(_PERIOD_S)
+        renderer.keep(replace=True)
+
+
+class PreviewRenderer:
+    def __init__(self, sensor: Sensor, thumbnail: Path | None) -> None:
+        self._sensor = sensor
+        self._channels = sensor.mosaic.channels(sensor.height, sensor.width) if sensor.mosaic else None
+        self._thumbnail = thumbnail
+        self._accumulated: Image | None = None
+        self._newest: Image | None = None
+        self._kept_s: float | None = None
+
+    def render(self, frames: NDArray[np.uint8], first: int, block: int) -> PreviewTaken:
+        """Images of compact frames uint8 [n, frame_bytes] starting at index `first`."""
+        window = aligned_window(frames, self._sensor, first, first + block, first + len(frames) - block)
+        interval = window.rate(fill=True)
+        rate = window.count.astype(np.float32) / np.float32(window.end - window.begin)
+        old = rate if self._accumulated is None else self._accumulated
+        accumulated = (_MEMORY * old + (1 - _MEMORY) * rate).astype(np.float32)
+        self._accumulated = accumulated
+        self._newest = interval
+        self.keep(replace=False)
+        pictures: dict[PreviewKind, Image] = {
+            PreviewKind.INTERVAL: interval,
+            PreviewKind.RATE: rate,
+            PreviewKind.ACCUMULATION: accumulated,
+        }
+        shown = {kind: fill_mosaic(picture, self._channels) for kind, picture in pictures.items()}
+        white = {kind: display_white(picture) for kind, picture in shown.items()}
+        return PreviewTaken(
+            frame=(window.begin + window.end) // 2,
+            width=self._sensor.width,
+            height=self._sensor.height,
+            white=white,
+            images={kind: base64.b64encode(_webp(shown[kind], white[kind])).decode() for kind in shown},
+            mean_rate=float(rate.mean()),
+            rate_histogram=np.histogram(rate, _BINS, (0, 1))[0].tolist(),
+            hot_pixels=_hot(window),
+        )
+
+    def keep(self, *, replace: bool) -> None:
+        """Write a thumbnail of the first image, and at the end of the last one."""
+        if self._newest is None or self._thumbnail is None or (self._kept_s is not None and not replace):
+            return
+        self._kept_s = time.monotonic()
+        write_atomically(self._thumbnail, thumbnail(fill_mosaic(self._newest, self._channels)))
+
+
+def _webp(image: Image, white: float) -> bytes:
+    """Radiance [H, W] or [H, W, C], C 1 or 3 (RGB), as lossy WebP."""
+    pixels = (np.clip(np.nan_to_num(image) / white, 0, 1) * 255 + 0.5).astype(np.uint8)
+    if pixels.ndim == 3 and pixels.shape[2] == 3:
+        pixels = pixels[..., ::-1]
+    _, encoded = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
+    return encoded.tobytes()
+
+
+def _hot(window: Window) -> list[tuple[int, int]]:
+    """x, y of pixels that fire far more often than the median of their neighbours."""
+    frames = window.end - window.begin
+    rate = (window.count * (255.0 / frames)).clip(0, 255).astype(np.uint8)
+    excess = rate.astype(np.int16) - cv2.medianBlur(rate, 5)
+    rows, columns = np.nonzero(excess > _HOT_RATE * 255)
+    worst = np.argsort(-excess[rows, columns])[:_HOT_MOST]
+    return [(int(columns[k]), int(rows[k])) for k in worst]

@@ -16,16 +16,22 @@ export default defineConfig({
     assetsInlineLimit: 0,
     modulePreload: { polyfill: false },
     rollupOptions: {
+      input: ["index.html", "docs/index.html"],
       output: {
         manualChunks: (id) => {
           if (id.includes("@sparkjsdev")) return "spark";
           if (id.includes("/three/")) return "three";
           if (id.includes("uplot")) return "plots";
+          if (id.includes("swagger-ui-dist")) return "swagger";
+          // Shared by every page: not inside the chunk of one of them.
+          if (id.includes("commonjsHelpers") || id.includes("vite/preload-helper")) return "helpers";
           return undefined;
         },
       },
     },
   },
-  server: { proxy: { "/api": { target: DAEMON, ws: true }, "/healthz": DAEMON, "/metrics": DAEMON, "/docs": DAEMON } },
+  server: {
+    proxy: { "/api": { target: DAEMON, ws: true }, "/healthz": DAEMON, "/metrics": DAEMON, "/openapi.json": DAEMON },
+  },
   test: { environment: "jsdom", include: ["src/**/*.test.ts", "src/**/*.test.tsx"] },
 });

@@ -1,16 +1,16 @@
-import "./styles/palette.css";
-import "./styles/base.css";
-import "./styles/parts.css";
-import "./styles/live.css";
-import "./styles/scene.css";
-import "./styles/captures.css";
+import "./shared/styles/palette.css";
+import "./shared/styles/base.css";
+import "./shared/styles/parts.css";
+import "./shared/styles/live.css";
+import "./shared/styles/scene.css";
+import "./shared/styles/captures.css";
 
 import { StrictMode } from "react";
 import { createRoot } from "react-dom/client";
 
 import { App } from "./app/App";
-import { dropToken } from "./state/route";
-import { applyTheme } from "./state/theme";
+import { dropToken } from "./shared/state/route";
+import { applyTheme } from "./shared/state/theme";
 
 applyTheme();
 dropToken();

@@ -1,20 +1,21 @@
-/** The frame around every page. */
+/** Navigation, connection status and the current page. */
 
 import { type JSX, lazy, Suspense, useEffect, useState } from "react";
 
-import { LivePage } from "../live/LivePage";
-import { go, type PageName, useRoute } from "../state/route";
-import { follow, useService } from "../state/store";
-import { choose, type Theme, useTheme } from "../state/theme";
-import { Icon, type IconName } from "../ui/icons";
-import { Loading } from "../ui/parts";
-import { Toasts } from "../ui/Toasts";
-import { Guard } from "./Guard";
+import { LivePage } from "../features/live/LivePage";
+import { go, type PageName, useRoute } from "../shared/state/route";
+import { follow, useService } from "../shared/state/store";
+import { choose, type Theme, useTheme } from "../shared/state/theme";
+import { Icon, type IconName } from "../shared/ui/icons";
+import { PageLink } from "../shared/ui/PageLink";
+import { Loading } from "../shared/ui/parts";
+import { Toasts } from "../shared/ui/Toasts";
+import { ErrorBoundary } from "./ErrorBoundary";
 import { SignIn } from "./SignIn";
 
-const ScenePage = lazy(() => import("../scene/ScenePage").then((m) => ({ default: m.ScenePage })));
-const CapturesPage = lazy(() => import("../captures/CapturesPage").then((m) => ({ default: m.CapturesPage })));
-const SetupPage = lazy(() => import("../setup/SetupPage").then((m) => ({ default: m.SetupPage })));
+const ScenePage = lazy(() => import("../features/scene/ScenePage").then((m) => ({ default: m.ScenePage })));
+const CapturesPage = lazy(() => import("../features/captures/CapturesPage").then((m) => ({ default: m.CapturesPage })));
+const SetupPage = lazy(() => import("../features/setup/SetupPage").then((m) => ({ default: m.SetupPage })));
 
 const TABS: readonly { page: PageName; label: string; icon: IconName; key: string }[] = [
   { page: "live", label: "Live", icon: "live", key: "1" },
@@ -23,7 +24,7 @@ const TABS: readonly { page: PageName; label: string; icon: IconName; key: strin
   { page: "setup", label: "Set-up", icon: "setup", key: "4" },
 ];
 const THEMES: Record<Theme, { next: Theme; icon: IconName; label: string }> = {
-  system: { next: "dark", icon: "auto", label: "Theme: as the system" },
+  system: { next: "dark", icon: "auto", label: "Theme: system" },
   dark: { next: "light", icon: "moon", label: "Theme: dark" },
   light: { next: "system", icon: "sun", label: "Theme: light" },
 };
@@ -60,23 +61,18 @@ export function App(): JSX.Element {
         </span>
         <nav aria-label="Pages">
           {TABS.map((tab) => (
-            <a
+            <PageLink
               key={tab.page}
-              href={tab.page === "live" ? "./" : `./?page=${tab.page}`}
+              to={{ page: tab.page }}
               aria-current={page === tab.page ? "page" : undefined}
               aria-keyshortcuts={tab.key}
-              onClick={(event) => {
-                if (event.ctrlKey || event.metaKey || event.shiftKey) return;
-                event.preventDefault();
-                go({ page: tab.page });
-              }}
             >
               <Icon name={tab.icon} />
               {tab.label}
-            </a>
+            </PageLink>
           ))}
         </nav>
-        {!signedOut && <LinkSign />}
+        {!signedOut && <LinkStatus />}
         <ThemeSwitch />
       </header>
       {!signedOut && <Disconnected />}
@@ -84,14 +80,14 @@ export function App(): JSX.Element {
         {signedOut ? (
           <SignIn />
         ) : (
-          <Guard key={page}>
+          <ErrorBoundary key={page}>
             <Suspense fallback={<Loading what="the page" />}>
               {page === "live" && <LivePage />}
               {page === "scene" && <ScenePage />}
               {page === "captures" && <CapturesPage />}
               {page === "setup" && <SetupPage />}
             </Suspense>
-          </Guard>
+          </ErrorBoundary>
         )}
       </main>
       <Toasts />
@@ -99,21 +95,21 @@ export function App(): JSX.Element {
   );
 }
 
-/** Whether news arrive, in a word. */
-function LinkSign(): JSX.Element {
+/** Connection status. */
+function LinkStatus(): JSX.Element {
   const link = useService((state) => state.link.state);
-  const trouble = useService((state) => state.trouble);
+  const connectionError = useService((state) => state.connectionError);
   const [tone, text] =
     link === "open"
       ? (["good", "connected"] as const)
-      : trouble === null
+      : connectionError === null
         ? (["quiet", "polling"] as const)
         : (["problem", "disconnected"] as const);
   return (
     <span
       className={`link ${tone}`}
       role="status"
-      title={link === "open" ? "News arrive as they happen" : "No news arrive by WebSocket"}
+      title={link === "open" ? "Live updates by WebSocket" : "No WebSocket connection"}
     >
       <i className="dot" aria-hidden="true" />
       {text}
@@ -136,12 +132,12 @@ function ThemeSwitch(): JSX.Element {
   );
 }
 
-/** What is shown is old: a band says so, and when the next attempt is made. */
+/** Banner while there is no connection, with the time of the next attempt. */
 function Disconnected(): JSX.Element | null {
   const link = useService((state) => state.link);
-  const trouble = useService((state) => state.trouble);
+  const connectionError = useService((state) => state.connectionError);
   const [now, setNow] = useState(() => performance.now());
-  const shown = trouble !== null && link.state !== "open";
+  const shown = connectionError !== null && link.state !== "open";
   useEffect(() => {
     if (!shown) return;
     const ticking = setInterval(() => setNow(performance.now()), 500);
@@ -150,12 +146,12 @@ function Disconnected(): JSX.Element | null {
   if (!shown) return null;
   const wait = link.state === "waiting" ? Math.max(0, Math.ceil((link.retryAt - now) / 1000)) : 0;
   return (
-    <div className="band" role="alert">
+    <div className="banner" role="alert">
       <Icon name="warning" />
       <span>
-        {trouble}{" "}
+        {connectionError}{" "}
         <span className="dim">
-          What is shown below may be old. {wait > 0 ? `Trying again in ${wait} s.` : "Trying again…"}
+          The data below may be out of date. {wait > 0 ? `Trying again in ${wait} s.` : "Trying again…"}
         </span>
       </span>
     </div>

@@ -1,11 +1,11 @@
-/** The service no longer takes the token of this page, or never had one: what takes the place of every page then. */
+/** The sign-in form, shown in place of every page while a token is required. */
 
 import { type JSX, type SubmitEvent, useState } from "react";
 
-import { signIn } from "../api/http";
-import { signedIn, wordsOf } from "../state/store";
-import { Icon } from "../ui/icons";
-import { Trouble } from "../ui/parts";
+import { signIn } from "../shared/api/http";
+import { signedIn, errorText } from "../shared/state/store";
+import { Icon } from "../shared/ui/icons";
+import { ErrorMessage } from "../shared/ui/parts";
 
 export function SignIn(): JSX.Element {
   const [token, setToken] = useState("");
@@ -19,16 +19,16 @@ export function SignIn(): JSX.Element {
         signedIn();
         return;
       }
-      setProblem("This token does not open the service.");
+      setProblem("This token is not valid.");
     } catch (error) {
-      setProblem(wordsOf(error));
+      setProblem(errorText(error));
     }
     setBusy(false);
   };
   return (
     <section className="panel sign-in" aria-labelledby="sign-in">
       <h1 id="sign-in">
-        <Icon name="key" /> This service needs its token
+        <Icon name="key" /> This service requires a token
       </h1>
       <form
         onSubmit={(event: SubmitEvent) => {
@@ -49,10 +49,10 @@ export function SignIn(): JSX.Element {
           Sign in
         </button>
       </form>
-      {problem !== null && <Trouble text={problem} />}
+      {problem !== null && <ErrorMessage text={problem} />}
       <p className="dim">
-        The one used so far was revoked, or has expired. Whoever runs the service makes another with{" "}
-        <code>spiked token create NAME</code>. A capture that runs goes on meanwhile.
+        The previous token was revoked or has expired. Create another on the machine of the service with{" "}
+        <code>spiked token create NAME</code>. Running captures continue.
       </p>
     </section>
   );

@@ -1,0 +1,189 @@
+/** One capture: recording, notes, reconstructions, plots, downloads. */
+
+import { type JSX, useState } from "react";
+
+import * as calls from "../../shared/api/calls";
+import type { Capture, OptionValues, Reconstruction } from "../../shared/api/types";
+import { useDenied } from "../../shared/state/access";
+import { attempt } from "../../shared/state/attempt";
+import { nameOf, sourceOf } from "../../shared/state/capture";
+import { adjust, go, useRoute } from "../../shared/state/route";
+import {
+  isFinished,
+  loadReconstructions,
+  newestReconstruction,
+  storeCapture,
+  storeReconstruction,
+  useService,
+} from "../../shared/state/store";
+import { useFetch } from "../../shared/state/useFetch";
+import { ActionButton, ScopeNote } from "../../shared/ui/access";
+import { Icon } from "../../shared/ui/icons";
+import { CaptureBadge, ErrorMessage, Loading, Panel } from "../../shared/ui/parts";
+import { Plots } from "./Plots";
+import { ReconstructionsPanel, RerunPanel } from "./ReconstructionsPanel";
+import { RecordingPanel } from "./RecordingPanel";
+import { removeWithUndo } from "./remove";
+import { LogPanel, OptionsPanel, ResultPanel } from "./ResultPanel";
+
+export function CaptureDetail({ id }: { id: string }): JSX.Element {
+  const capture = useService((state) => state.captures[id] ?? null);
+  const fetched = useFetch(id, async () => {
+    const [one] = await Promise.all([calls.capture(id), loadReconstructions(id)]);
+    storeCapture(one);
+    return one;
+  });
+  if (capture === null)
+    return (
+      <div className="detail">
+        <h1 className="hidden">Capture</h1>
+        <button type="button" onClick={() => go({ page: "captures", capture: null, reconstruction: null })}>
+          <Icon name="back" /> All captures
+        </button>
+        {fetched.problem === null ? (
+          <Loading what="the capture" />
+        ) : (
+          <ErrorMessage text={fetched.problem} again={fetched.again} />
+        )}
+      </div>
+    );
+  return <Detail capture={capture} />;
+}
+
+function Detail({ capture }: { capture: Capture }): JSX.Element {
+  const at = useRoute();
+  const all = useService((state) => state.reconstructions);
+  const jobs = Object.values(all)
+    .filter((job) => job.capture_id === capture.id)
+    .sort((a, b) => (a.id < b.id ? 1 : -1));
+  const job = jobs.find((one) => one.id === at.reconstruction) ?? newestReconstruction(all, capture.id);
+  const [otherId, setOtherId] = useState<string | null>(null);
+  const other = jobs.find((one) => one.id === otherId && one.id !== job?.id) ?? null;
+  const nameOfJob = (one: Reconstruction): string => `#${jobs.length - jobs.indexOf(one)}`;
+  const [rerunning, setRerunning] = useState(false);
+
+  const submit = async (options: OptionValues): Promise<void> => {
+    await attempt(async () => {
+      const made = await calls.submit(capture.id, options);
+      storeReconstruction(made);
+      adjust({ reconstruction: made.id });
+      if (job !== null && job.version > 0) setOtherId(job.id);
+      setRerunning(false);
+    });
+  };
+
+  return (
+    <div className="detail">
+      <Head capture={capture} />
+      <ScopeNote />
+      <div className="columns">
+        <div>
+          <ReconstructionsPanel
+            jobs={jobs}
+            job={job}
+            other={other}
+            nameOf={nameOfJob}
+            onOther={setOtherId}
+            onRerun={() => setRerunning(!rerunning)}
+            rerunning={rerunning}
+            canRun={capture.recording !== null && isFinished(capture)}
+          />
+          {rerunning && (
+            <RerunPanel initial={job?.options ?? {}} onSubmit={submit} onCancel={() => setRerunning(false)} />
+          )}
+          {job !== null && <Plots capture={capture} job={job} other={other} nameOf={nameOfJob} />}
+          {job !== null && <LogPanel job={job} />}
+        </div>
+        <div>
+          <RecordingPanel capture={capture} />
+          <Notes key={capture.id} capture={capture} />
+          {job !== null && <ResultPanel job={job} other={other} nameOf={nameOfJob} />}
+          {job !== null && <OptionsPanel job={job} />}
+        </div>
+      </div>
+    </div>
+  );
+}
+
+function Head({ capture }: { capture: Capture }): JSX.Element {
+  const [name, setName] = useState(capture.name);
+  const readOnly = useDenied("operate");
+  const change = async (values: { name: string } | { keep: boolean }): Promise<boolean> =>
+    attempt(async () => storeCapture(await calls.changeCapture(capture.id, values)));
+  const rename = async (): Promise<void> => {
+    if (name !== capture.name && !(await change({ name }))) setName(capture.name);
+  };
+  return (
+    <header className="head">
+      <button type="button" onClick={() => go({ page: "captures", capture: null, reconstruction: null })}>
+        <Icon name="back" /> All captures
+      </button>
+      <h1 className="hidden">{nameOf(capture)}</h1>
+      <input
+        className="title"
+        aria-label="Name of the capture"
+        value={name}
+        placeholder={sourceOf(capture)}
+        maxLength={200}
+        readOnly={readOnly !== null}
+        onChange={(event) => setName(event.target.value)}
+        onBlur={() => void rename()}
+        onKeyDown={(event) => {
+          if (event.key === "Enter") event.currentTarget.blur();
+          if (event.key === "Escape") setName(capture.name);
+        }}
+      />
+      <CaptureBadge capture={capture} />
+      <label className="check" title={readOnly ?? "Exclude from automatic removal"}>
+        <input
+          type="checkbox"
+          checked={capture.keep}
+          disabled={readOnly !== null}
+          onChange={(event) => void change({ keep: event.target.checked })}
+        />{" "}
+        Keep
+      </label>
+      <button
+        type="button"
+        onClick={() => go({ page: "scene", capture: capture.id, frame: null, camera: null, ride: false })}
+      >
+        <Icon name="scene" /> Scene
+      </button>
+      <ActionButton
+        onClick={() =>
+          void removeWithUndo(
+            capture,
+            () => go({ page: "captures", capture: null, reconstruction: null }),
+            () => go({ page: "captures", capture: capture.id }),
+          )
+        }
+      >
+        <Icon name="trash" /> Delete
+      </ActionButton>
+    </header>
+  );
+}
+
+function Notes({ capture }: { capture: Capture }): JSX.Element {
+  const [notes, setNotes] = useState(capture.notes);
+  const readOnly = useDenied("operate");
+  const save = async (): Promise<void> => {
+    if (notes === capture.notes) return;
+    await attempt(async () => storeCapture(await calls.changeCapture(capture.id, { notes })));
+  };
+  return (
+    <Panel title="Notes">
+      <textarea
+        className="notes"
+        aria-label="Notes on the capture"
+        placeholder="Notes; included in the search"
+        value={notes}
+        rows={Math.min(12, Math.max(2, notes.split("\n").length))}
+        maxLength={20000}
+        readOnly={readOnly !== null}
+        onChange={(event) => setNotes(event.target.value)}
+        onBlur={() => void save()}
+      />
+    </Panel>
+  );
+}

@@ -1,0 +1,198 @@
+/** The table of captures, newest first, searched by the service. */
+
+import { type JSX, useEffect, useState } from "react";
+
+import { address, captures as fetchCaptures } from "../../shared/api/calls";
+import type { Capture } from "../../shared/api/types";
+import { lengthOf, nameOf, sourceOf } from "../../shared/state/capture";
+import { bytes, when } from "../../shared/state/format";
+import { adjust, go, useRoute } from "../../shared/state/route";
+import { loadReconstructions, newestReconstruction, useService, errorText } from "../../shared/state/store";
+import { ActionButton } from "../../shared/ui/access";
+import { Icon } from "../../shared/ui/icons";
+import { PageLink } from "../../shared/ui/PageLink";
+import { CaptureBadge, Empty, ErrorMessage, JobBadge, JobReason, Loading } from "../../shared/ui/parts";
+import { Table } from "../../shared/ui/Table";
+import { removeWithUndo } from "./remove";
+
+const ROWS = 50;
+const TYPING_MS = 200;
+
+const COLUMNS = [
+  { name: "Picture", hidden: true },
+  { name: "Name" },
+  { name: "Started" },
+  { name: "Length", number: true },
+  { name: "Size", number: true },
+  { name: "Verdict" },
+  { name: "Reconstruction" },
+  { name: "Actions", hidden: true },
+];
+
+interface Listed {
+  search: string;
+  items: Capture[];
+  cursor: string | null;
+}
+
+export function CapturesTable(): JSX.Element {
+  const { search } = useRoute();
+  const [listed, setListed] = useState<Listed | null>(null);
+  const [problem, setProblem] = useState<string | null>(null);
+  const [round, setRound] = useState(0);
+  const known = useService((state) => state.captures);
+  const newest = Object.keys(known).sort().at(-1);
+
+  useEffect(() => {
+    let current = true;
+    const timer = setTimeout(() => {
+      fetchCaptures({ limit: ROWS, q: search }).then(
+        (page) => {
+          if (!current) return;
+          setListed({ search, items: page.items, cursor: page.next_cursor });
+          setProblem(null);
+        },
+        (error: unknown) => current && setProblem(errorText(error)),
+      );
+    }, TYPING_MS);
+    return () => {
+      current = false;
+      clearTimeout(timer);
+    };
+  }, [search, round, newest]);
+
+  const more = async (): Promise<void> => {
+    if (listed?.cursor == null) return;
+    try {
+      const page = await fetchCaptures({ limit: ROWS, q: listed.search, cursor: listed.cursor });
+      setListed({ ...listed, items: [...listed.items, ...page.items], cursor: page.next_cursor });
+    } catch (error) {
+      setProblem(errorText(error));
+    }
+  };
+
+  return (
+    <div className="captures">
+      <header className="head">
+        <h1>Captures</h1>
+        <label className="search">
+          <Icon name="search" />
+          <span className="hidden">Search captures</span>
+          <input
+            type="search"
+            placeholder="Search name, notes, source"
+            value={search}
+            onChange={(event) => adjust({ search: event.target.value })}
+          />
+        </label>
+      </header>
+      {problem !== null && <ErrorMessage text={problem} again={() => setRound((n) => n + 1)} />}
+      {listed === null && problem === null && <Loading what="captures" />}
+      {listed !== null &&
+        (listed.items.length === 0 ? (
+          listed.search === "" ? (
+            <Empty icon="captures" title="No captures yet">
+              <button onClick={() => go({ page: "live" })}>Start one</button>
+            </Empty>
+          ) : (
+            <Empty icon="search" title={`No capture matches “${listed.search}”`}>
+              <button onClick={() => adjust({ search: "" })}>Show all</button>
+            </Empty>
+          )
+        ) : (
+          <Table
+            label="Table of captures"
+            className="list"
+            columns={COLUMNS}
+            below={
+              listed.cursor !== null && (
+                <button type="button" className="more" onClick={() => void more()}>
+                  Show more
+                </button>
+              )
+            }
+          >
+            {listed.items.map((one) => (
+              <Row
+                key={one.id}
+                capture={known[one.id] ?? one}
+                onRemoved={() =>
+                  setListed((old) => old && { ...old, items: old.items.filter((item) => item.id !== one.id) })
+                }
+                onRestored={() => setRound((n) => n + 1)}
+              />
+            ))}
+          </Table>
+        ))}
+    </div>
+  );
+}
+
+function Row({
+  capture,
+  onRemoved,
+  onRestored,
+}: {
+  capture: Capture;
+  onRemoved: () => void;
+  onRestored: () => void;
+}): JSX.Element {
+  const job = useService((state) => newestReconstruction(state.reconstructions, capture.id));
+  const jobs = capture.reconstruction_ids.length;
+  const unknown = job === null && jobs > 0;
+  useEffect(() => {
+    if (unknown) loadReconstructions(capture.id).catch(() => undefined); // shown by the banner at the top
+  }, [unknown, capture.id]);
+  return (
+    <tr>
+      <td>
+        <Thumbnail id={capture.id} />
+      </td>
+      <th scope="row">
+        <PageLink to={{ page: "captures", capture: capture.id }}>{nameOf(capture)}</PageLink>
+        <span className="dim">
+          {capture.name !== "" && <span title={capture.source}>{sourceOf(capture)}</span>}
+          {capture.name !== "" && capture.keep && " · "}
+          {capture.keep && "kept"}
+        </span>
+        {capture.notes !== "" && (
+          <span className="dim notes" title={capture.notes}>
+            {capture.notes}
+          </span>
+        )}
+      </th>
+      <td>{when(capture.started_at)}</td>
+      <td className="number">{lengthOf(capture)}</td>
+      <td className="number">{capture.recording === null ? "–" : bytes(capture.recording.bytes)}</td>
+      <td>
+        <CaptureBadge capture={capture} />
+      </td>
+      <td>
+        {job === null ? <span className="dim">{jobs === 0 ? "not reconstructed" : "…"}</span> : <JobBadge job={job} />}
+        {jobs > 1 && job !== null && <span className="dim"> of {jobs}</span>}
+        {job !== null && <JobReason job={job} />}
+      </td>
+      <td className="number">
+        <ActionButton
+          className="bare"
+          aria-label={`Delete ${nameOf(capture)}`}
+          title="Delete"
+          onClick={() => void removeWithUndo(capture, onRemoved, onRestored)}
+        >
+          <Icon name="trash" />
+        </ActionButton>
+      </td>
+    </tr>
+  );
+}
+
+function Thumbnail({ id }: { id: string }): JSX.Element {
+  const [missing, setMissing] = useState(false);
+  return missing ? (
+    <span className="thumb none" aria-hidden="true">
+      <Icon name="camera" />
+    </span>
+  ) : (
+    <img className="thumb" src={address.thumbnail(id)} alt="" loading="lazy" onError={() => setMissing(true)} />
+  );
+}

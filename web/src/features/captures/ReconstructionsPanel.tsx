@@ -1,0 +1,186 @@
+/** The reconstructions of a capture: which one is shown, which one it is compared with, and new ones. */
+
+import type { JSX } from "react";
+
+import * as calls from "../../shared/api/calls";
+import type { OptionValues, Reconstruction } from "../../shared/api/types";
+import { attempt } from "../../shared/state/attempt";
+import { progressText } from "../../shared/state/capture";
+import { count, decibel, when } from "../../shared/state/format";
+import { adjust, go } from "../../shared/state/route";
+import { isEnded, storeReconstruction } from "../../shared/state/store";
+import { useFetch } from "../../shared/state/useFetch";
+import { ActionButton } from "../../shared/ui/access";
+import { Fetched } from "../../shared/ui/Fetched";
+import { Icon } from "../../shared/ui/icons";
+import { Badge, Empty, JobBadge, JobReason, jobTone, Panel } from "../../shared/ui/parts";
+import { Table } from "../../shared/ui/Table";
+import { OptionsForm } from "./OptionsForm";
+
+const COLUMNS = [
+  { name: "Show" },
+  { name: "Compare" },
+  { name: "Started" },
+  { name: "State" },
+  { name: "Poses", number: true },
+  { name: "Splats", number: true },
+  { name: "PSNR", number: true },
+  { name: "Actions", hidden: true },
+];
+
+export function ReconstructionsPanel({
+  jobs,
+  job,
+  other,
+  nameOf,
+  onOther,
+  onRerun,
+  rerunning,
+  canRun,
+}: {
+  /** Newest first. */
+  jobs: readonly Reconstruction[];
+  /** The one shown. */
+  job: Reconstruction | null;
+  /** The one it is compared with. */
+  other: Reconstruction | null;
+  nameOf: (job: Reconstruction) => string;
+  onOther: (id: string | null) => void;
+  onRerun: () => void;
+  rerunning: boolean;
+  canRun: boolean;
+}): JSX.Element {
+  return (
+    <Panel
+      title="Reconstructions"
+      aside={
+        <ActionButton
+          aria-expanded={rerunning}
+          disabled={!canRun}
+          title={canRun ? undefined : "Needs a complete recording"}
+          onClick={onRerun}
+        >
+          <Icon name="again" /> {jobs.length === 0 ? "Reconstruct" : "Re-run with other options"}
+        </ActionButton>
+      }
+    >
+      {jobs.length === 0 ? (
+        <Empty icon="scene" title="None yet" />
+      ) : (
+        <Table label="Table of reconstructions" className="grid jobs" columns={COLUMNS}>
+          {jobs.map((one) => (
+            <Row
+              key={one.id}
+              job={one}
+              name={nameOf(one)}
+              shown={one.id === job?.id}
+              compared={one.id === other?.id}
+              onCompare={(wanted) => onOther(wanted ? one.id : null)}
+            />
+          ))}
+        </Table>
+      )}
+    </Panel>
+  );
+}
+
+function Row({
+  job,
+  name,
+  shown,
+  compared,
+  onCompare,
+}: {
+  job: Reconstruction;
+  name: string;
+  shown: boolean;
+  compared: boolean;
+  onCompare: (wanted: boolean) => void;
+}): JSX.Element {
+  return (
+    <tr>
+      <td>
+        <input
+          type="radio"
+          name="shown"
+          aria-label={`Show reconstruction ${name}`}
+          checked={shown}
+          onChange={() => adjust({ reconstruction: job.id })}
+        />
+      </td>
+      <td>
+        <input
+          type="checkbox"
+          aria-label={`Compare with reconstruction ${name}`}
+          disabled={shown}
+          checked={compared}
+          onChange={(event) => onCompare(event.target.checked)}
+        />
+      </td>
+      <td>
+        {name} {when(job.created_at)} {job.live && <span className="dim">live</span>}
+      </td>
+      <td>
+        {job.state === "running" ? (
+          <Badge tone={jobTone.running}>{`${job.stage} ${Math.round(100 * job.progress)} %`}</Badge>
+        ) : (
+          <JobBadge job={job} />
+        )}
+        {job.state === "queued" && <span className="dim reason">{progressText(job)}</span>}
+        <JobReason job={job} />
+      </td>
+      <td className="number">{count(job.poses)}</td>
+      <td className="number">{count(job.splats)}</td>
+      <td className="number">{decibel(job.psnr_db)}</td>
+      <td className="number">{isEnded(job) ? <SceneButton job={job} name={name} /> : <CancelButton job={job} />}</td>
+    </tr>
+  );
+}
+
+function SceneButton({ job, name }: { job: Reconstruction; name: string }): JSX.Element {
+  return (
+    <button
+      type="button"
+      className="bare"
+      disabled={job.version === 0}
+      aria-label={`Scene of reconstruction ${name}`}
+      onClick={() =>
+        go({
+          page: "scene",
+          capture: job.capture_id,
+          reconstruction: job.id,
+          frame: null,
+          camera: null,
+          ride: false,
+        })
+      }
+    >
+      <Icon name="scene" />
+    </button>
+  );
+}
+
+function CancelButton({ job }: { job: Reconstruction }): JSX.Element {
+  const cancel = async (): Promise<void> => storeReconstruction(await calls.cancel(job.id));
+  return <ActionButton onClick={() => void attempt(cancel)}>Cancel</ActionButton>;
+}
+
+/** The form for another reconstruction of the capture. */
+export function RerunPanel({
+  initial,
+  onSubmit,
+  onCancel,
+}: {
+  initial: OptionValues;
+  onSubmit: (values: OptionValues) => Promise<void>;
+  onCancel: () => void;
+}): JSX.Element {
+  const schema = useFetch("options", calls.optionSchema);
+  return (
+    <Panel title="Options of the new reconstruction">
+      <Fetched from={schema} what="the options">
+        {(fields) => <OptionsForm schema={fields} initial={initial} onSubmit={onSubmit} onCancel={onCancel} />}
+      </Fetched>
+    </Panel>
+  );
+}

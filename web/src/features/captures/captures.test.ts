@@ -1,0 +1,75 @@
+import { expect, it } from "vitest";
+
+import type { Timeline } from "../../shared/api/types";
+import { fieldsOf, valuesOf } from "./OptionsForm";
+import { flicker, joined } from "./series";
+import { merged } from "../live/Histogram";
+
+const SCHEMA = {
+  $defs: { Mode: { type: "string", enum: ["fast", "exact"] } },
+  properties: {
+    steps: { type: "integer", default: 2000, minimum: 0, description: "Gradient steps" },
+    mode: { $ref: "#/$defs/Mode", default: "fast" },
+    limit_s: { anyOf: [{ type: "number" }, { type: "null" }], default: null },
+    flicker: { type: "boolean", default: true },
+    nested: { type: "object" },
+  },
+};
+
+it("makes a field of each option that a form can show", () => {
+  expect(fieldsOf(SCHEMA).map((field) => [field.key, field.kind, field.optional])).toEqual([
+    ["steps", "integer", false],
+    ["mode", "choice", false],
+    ["limit_s", "number", true],
+    ["flicker", "boolean", false],
+  ]);
+});
+
+it("sends what differs from the defaults, with its type", () => {
+  const fields = fieldsOf(SCHEMA);
+  expect(valuesOf(fields, { steps: "2000", mode: "exact", limit_s: "", flicker: "false" })).toEqual({
+    mode: "exact",
+    flicker: false,
+  });
+  expect(valuesOf(fields, { steps: "10", limit_s: "2.5" })).toEqual({ steps: 10, limit_s: 2.5 });
+});
+
+it("joins two timelines on one axis", () => {
+  expect(
+    joined(
+      [
+        [0, 1, 2],
+        [1, 3],
+      ],
+      [
+        [10, 11, 12],
+        [21, 23],
+      ],
+    ),
+  ).toEqual([
+    [0, 1, 2, 3],
+    [10, 11, 12, null],
+    [null, 21, null, 23],
+  ]);
+});
+
+it("finds the swing of mains light and nothing in steady light", () => {
+  const times = Array.from({ length: 500 }, (_, i) => i * 0.0004);
+  const line = (rate: number[]): Timeline => ({ time_s: times, rate }) as unknown as Timeline;
+  const swing = flicker(line(times.map((t) => 0.3 * (1 + 0.1 * Math.sin(2 * Math.PI * 100 * t)))));
+  const middle = swing.slice(50, 450).map((x) => x ?? 0);
+  expect(Math.max(...middle)).toBeCloseTo(10, 0);
+  const steady = flicker(line(times.map(() => 0.3)));
+  expect(Math.max(...steady.map((x) => Math.abs(x ?? 0)))).toBeLessThan(1e-7);
+});
+
+it("joins the bins of a histogram of few frames", () => {
+  const comb = {
+    edges: Array.from({ length: 17 }, (_, i) => i / 16),
+    counts: [1, 0, 4, 0, 9, 0, 6, 0, 2, 0, 1, 0, 0, 0, 0, 0],
+  };
+  expect(merged(comb).counts).toEqual([1, 4, 9, 6, 2, 1, 0, 0]);
+  expect(merged(comb).edges[8]).toBe(1);
+  const full = { edges: comb.edges, counts: comb.counts.map(() => 2) };
+  expect(merged(full)).toEqual(full);
+});

@@ -1,0 +1,162 @@
+/** The live picture, with hot pixels marked. */
+
+import { type JSX, useEffect, useRef, useState } from "react";
+
+import { stats } from "../../shared/api/calls";
+import type { Capture, PreviewKind, Stats } from "../../shared/api/types";
+import { count } from "../../shared/state/format";
+import { isFinished } from "../../shared/state/store";
+import { Icon } from "../../shared/ui/icons";
+import { Empty, Segmented } from "../../shared/ui/parts";
+import { Histogram } from "./Histogram";
+import { usePicture } from "./usePicture";
+
+const KINDS: readonly { value: PreviewKind; label: string; hint: string }[] = [
+  { value: "interval", label: "Interval", hint: "Brightness from the time between spikes: follows motion" },
+  {
+    value: "accumulation",
+    label: "Accumulation",
+    hint: "Spikes counted over a longer window: less noise, blurred by motion",
+  },
+  { value: "render", label: "Render", hint: "The reconstructed scene, seen from the newest tracked pose" },
+];
+const STATS_MS = 1000;
+
+function useStats(capture: Capture | null): Stats | null {
+  const [value, setValue] = useState<{ id: string; stats: Stats } | null>(null);
+  const id = capture?.id ?? null;
+  const over = capture === null || isFinished(capture);
+  const begun = over || (capture.counters?.received ?? 0) > 0;
+  useEffect(() => {
+    if (id === null || !begun) return;
+    let current = true;
+    const ask = (): void => {
+      stats(id).then(
+        (got) => current && setValue({ id, stats: got }),
+        () => undefined, // the picture says that there is nothing yet
+      );
+    };
+    ask();
+    const timer = over ? undefined : setInterval(ask, STATS_MS);
+    return () => {
+      current = false;
+      clearInterval(timer);
+    };
+  }, [id, over, begun]);
+  return value?.id === id ? value.stats : null;
+}
+
+export function PictureView({ capture }: { capture: Capture | null }): JSX.Element {
+  const [kind, setKind] = useState<PreviewKind>("interval");
+  const [stops, setStops] = useState(0);
+  const [marked, setMarked] = useState(true);
+  const gain = 2 ** stops;
+  const picture = usePicture(capture, kind, gain);
+  const measured = useStats(capture);
+  const histogram = measured?.rate_histogram ?? null;
+  const image = useRef<HTMLImageElement>(null);
+  useEffect(() => {
+    if (image.current !== null)
+      image.current.style.filter = picture?.gained === true || gain === 1 ? "" : `brightness(${gain})`;
+  }, [gain, picture?.gained]);
+  const sensor = capture?.sensor ?? null;
+  const hot = measured?.hot_pixels ?? [];
+  return (
+    <section className="panel picture" aria-label="Live picture">
+      <header className="tools">
+        <Segmented label="Picture" value={kind} choices={KINDS} onChange={setKind} />
+        <label className="slider">
+          Gain
+          <input
+            type="range"
+            min={-3}
+            max={5}
+            step={0.25}
+            value={stops}
+            aria-valuetext={`${gain.toFixed(2)} times`}
+            onChange={(event) => setStops(event.target.valueAsNumber)}
+            onDoubleClick={() => setStops(0)}
+          />
+          <output>×{gain < 10 ? gain.toFixed(2) : gain.toFixed(0)}</output>
+        </label>
+        <label className="check">
+          <input type="checkbox" checked={marked} onChange={(event) => setMarked(event.target.checked)} />
+          Hot pixels <output>{measured === null ? "–" : count(hot.length)}</output>
+        </label>
+      </header>
+      <div className="frame">
+        {picture === null ? (
+          <NoPicture capture={capture} kind={kind} />
+        ) : (
+          <div className="stack">
+            <img ref={image} src={picture.url} alt={`Newest frames, ${kind}`} />
+            {marked && sensor !== null && hot.length > 0 && (
+              <svg
+                className="marks"
+                viewBox={`0 0 ${sensor.width} ${sensor.height}`}
+                aria-label={`${hot.length} hot pixels`}
+                role="img"
+              >
+                {hot.slice(0, 2000).map(([x = 0, y = 0]) => (
+                  <circle key={`${x} ${y}`} cx={x + 0.5} cy={y + 0.5} r={sensor.width / 110} />
+                ))}
+              </svg>
+            )}
+            <Caption capture={capture} frame={picture.frame} />
+          </div>
+        )}
+      </div>
+      <Histogram
+        histogram={histogram}
+        meanRate={measured?.mean_rate ?? null}
+        frameRateHz={sensor?.frame_rate_hz ?? null}
+      />
+    </section>
+  );
+}
+
+function Caption({ capture, frame }: { capture: Capture | null; frame: number | null }): JSX.Element {
+  const sensor = capture?.sensor;
+  return (
+    <p className="caption">
+      {sensor != null && `${sensor.width} × ${sensor.height}`}
+      {frame !== null && ` · frame ${count(frame)}`}
+      {frame !== null && sensor != null && ` · ${((1000 * frame) / sensor.frame_rate_hz).toFixed(1)} ms`}
+    </p>
+  );
+}
+
+function NoPicture({ capture, kind }: { capture: Capture | null; kind: PreviewKind }): JSX.Element {
+  if (capture === null)
+    return (
+      <Empty icon="camera" title="No capture yet">
+        Choose a device and press <b>Start</b>. Without a camera, <b>sim:</b> is a simulated one and <b>replay:</b>{" "}
+        plays a recording.
+      </Empty>
+    );
+  if (capture.state === "failed")
+    return (
+      <Empty icon="problem" title="The capture has failed">
+        {capture.reason}
+      </Empty>
+    );
+  if (kind === "render")
+    return (
+      <Empty icon="scene" title="Nothing rendered yet">
+        The scene appears here as soon as the first poses are tracked.
+      </Empty>
+    );
+  if (isFinished(capture))
+    return (
+      <Empty icon="camera" title="No picture of this capture">
+        It was not recorded, and live pictures are not stored.
+      </Empty>
+    );
+  return (
+    <div className="empty" role="status">
+      <Icon name="camera" />
+      <strong>Waiting for the first frames…</strong>
+      {capture.reason !== "" && <p>{capture.reason}</p>}
+    </div>
+  );
+}

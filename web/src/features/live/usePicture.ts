@@ -1,0 +1,73 @@
+/** The newest picture of a capture: from the WebSocket if it carries this kind, otherwise from REST. */
+
+import { useEffect, useState } from "react";
+
+import { address } from "../../shared/api/calls";
+import { reach } from "../../shared/api/http";
+import type { Capture, PreviewKind } from "../../shared/api/types";
+import { isFinished, useService } from "../../shared/state/store";
+
+export interface Picture {
+  url: string;
+  frame: number | null;
+  /** Whether the service has applied the gain already. */
+  gained: boolean;
+}
+
+const PERIOD_MS = 300;
+const PATIENT_MS = 1500;
+
+/** Kinds sent over the WebSocket; others are rendered on request. */
+const PUSHED: readonly PreviewKind[] = ["interval", "rate"];
+
+export function usePicture(capture: Capture | null, kind: PreviewKind, gain: number): Picture | null {
+  const pushed = useService((state) =>
+    state.previewOf === capture?.id && PUSHED.includes(kind) ? state.previews[kind] : undefined,
+  );
+  const [picture, setPicture] = useState<(Picture & { key: string }) | null>(null);
+  const id = capture?.id ?? null;
+  const over = capture === null || isFinished(capture);
+  const begun = over || (capture.counters?.received ?? 0) > 0;
+  const served = pushed !== undefined && !over;
+  // Live pictures are encoded once for all clients, so the page applies the gain.
+  const gained = over || kind === "render";
+  const servedGain = gained ? gain : 1;
+
+  useEffect(() => {
+    if (id === null || served || !begun) return;
+    const key = `${id} ${kind}`;
+    let timer: ReturnType<typeof setTimeout> | undefined;
+    let url: string | null = null;
+    const ended = new AbortController();
+    const ask = async (): Promise<void> => {
+      let wait = PERIOD_MS;
+      try {
+        const response = await reach(address.preview(id, kind, { gain: servedGain === 1 ? undefined : servedGain }), {
+          signal: ended.signal,
+        });
+        if (response.ok) {
+          const next = URL.createObjectURL(await response.blob());
+          const frame = response.headers.get("X-Frame");
+          setPicture({ key, url: next, frame: frame === null ? null : Number(frame), gained });
+          if (url !== null) URL.revokeObjectURL(url);
+          url = next;
+        } else {
+          wait = PATIENT_MS;
+        }
+      } catch {
+        wait = PATIENT_MS; // not available yet, or no connection: shown by the banner at the top
+      }
+      if (!ended.signal.aborted && !(over && url !== null)) timer = setTimeout(() => void ask(), wait);
+    };
+    void ask();
+    return () => {
+      ended.abort();
+      clearTimeout(timer);
+      // The shown picture keeps its URL until the next one has arrived.
+      if (url !== null) setTimeout(() => URL.revokeObjectURL(url ?? ""), 2000);
+    };
+  }, [id, kind, servedGain, gained, over, served, begun]);
+
+  if (served) return { url: `data:image/webp;base64,${pushed.image}`, frame: pushed.frame, gained: false };
+  return picture !== null && picture.key === `${id ?? ""} ${kind}` ? picture : null;
+}

@@ -1,0 +1,258 @@
+/** Settings of the scene view: version, camera control, layers, legend, bookmarks. */
+
+import { type JSX, useState } from "react";
+
+import type { Capture, Reconstruction, Version } from "../../shared/api/types";
+import { nameOf } from "../../shared/state/capture";
+import { count, decibel, percent } from "../../shared/state/format";
+import { toast } from "../../shared/state/toasts";
+import { Icon } from "../../shared/ui/icons";
+import { JobBadge, JobReason, Meter, Segmented, Stat, trackingMeaning } from "../../shared/ui/parts";
+import { type Bookmark, readBookmarks, writeBookmarks } from "./bookmarks";
+import type { Colouring } from "./path";
+import { MAX_WIDTH_PX, type LineStyle, SPEED_STYLES, STATE_STYLES, STATES } from "./stateStyles";
+import type { Shown } from "./useScene";
+import type { Layers, Steering } from "./Viewer";
+
+const LAYER_NAMES: Record<keyof Layers, string> = {
+  splats: "Splats",
+  path: "Path",
+  frustum: "Frustum",
+  grid: "Grid",
+  axes: "Axes",
+};
+const STEERINGS = [
+  { value: "orbit", label: "Orbit", hint: "Drag: rotate; right drag or arrow keys: pan; wheel: zoom" },
+  { value: "fly", label: "Fly", hint: "Click the scene; W A S D R F: move, Q E: roll, drag: look around" },
+] as const;
+const COLOURINGS = [
+  { value: "state", label: "State" },
+  { value: "speed", label: "Speed" },
+] as const;
+
+export interface InspectorProps {
+  capture: Capture;
+  job: Reconstruction;
+  /** The versions that are kept, oldest first. */
+  versions: readonly Version[];
+  /** The version shown; null: the newest. */
+  pinned: Version | null;
+  onVersion: (version: number | null) => void;
+  shown: Shown | null;
+  loading: boolean;
+  full: boolean;
+  onFull: () => void;
+  layers: Layers;
+  onLayers: (layers: Layers) => void;
+  colouring: Colouring;
+  onColouring: (colouring: Colouring) => void;
+  steering: Steering;
+  onSteering: (steering: Steering) => void;
+  ride: boolean;
+  onRide: (ride: boolean) => void;
+  onHome: () => void;
+  onScreenshot: () => void;
+  currentView: () => { camera: number[]; frame: number | null };
+  onView: (camera: number[], frame: number | null) => void;
+}
+
+export function Inspector(props: InspectorProps): JSX.Element {
+  const { capture, job, pinned, shown } = props;
+  const running = job.state === "running" || job.state === "queued";
+  return (
+    <aside className="inspector" aria-label="Scene settings">
+      <header>
+        <strong>{nameOf(capture)}</strong>
+        <JobBadge job={job} />
+      </header>
+      <JobReason job={job} />
+      <Versions {...props} />
+      <dl className="stats">
+        <Stat name="Splats shown" hint={`${count((pinned ?? job).splats)} in the scene`}>
+          {shown === null ? "–" : count(shown.splats)}
+        </Stat>
+        <Stat name="Poses">{count((pinned ?? job).poses)}</Stat>
+        <Stat name="PSNR">{decibel((pinned ?? job).psnr_db)}</Stat>
+      </dl>
+      {running && job.stage === "refining" && (
+        <div className="refining">
+          <Meter share={job.progress} label="Refinement" />
+          <span>{percent(job.progress)} refined</span>
+        </div>
+      )}
+      {shown !== null && !shown.whole && (
+        <button type="button" disabled={props.full} onClick={props.onFull}>
+          <Icon name="layers" />{" "}
+          {props.full ? "Loading all splats…" : `Show all ${count((pinned ?? job).splats)} splats`}
+        </button>
+      )}
+      <div className="row">
+        <Segmented label="Camera control" value={props.steering} choices={STEERINGS} onChange={props.onSteering} />
+        <button type="button" onClick={props.onHome} title="Back to the initial view">
+          <Icon name="home" /> Home
+        </button>
+      </div>
+      <p className="dim hint">{STEERINGS.find((one) => one.value === props.steering)?.hint}</p>
+      <button type="button" aria-pressed={props.ride} onClick={() => props.onRide(!props.ride)}>
+        <Icon name="eye" /> Ride along
+      </button>
+      <fieldset className="layers">
+        <legend>Layers</legend>
+        {(Object.keys(LAYER_NAMES) as (keyof Layers)[]).map((name) => (
+          <label key={name} className="check">
+            <input
+              type="checkbox"
+              checked={props.layers[name]}
+              onChange={(event) => props.onLayers({ ...props.layers, [name]: event.target.checked })}
+            />
+            {LAYER_NAMES[name]}
+          </label>
+        ))}
+      </fieldset>
+      <div className="row">
+        <span className="dim">Path by</span>
+        <Segmented label="Path coloured by" value={props.colouring} choices={COLOURINGS} onChange={props.onColouring} />
+      </div>
+      <Legend colouring={props.colouring} />
+      <Bookmarks key={capture.id} captureId={capture.id} currentView={props.currentView} onView={props.onView} />
+      <button type="button" onClick={props.onScreenshot}>
+        <Icon name="camera" /> Screenshot
+      </button>
+    </aside>
+  );
+}
+
+/** Choice of a published version; the service keeps earlier ones. */
+function Versions({ job, versions, pinned, onVersion }: InspectorProps): JSX.Element | null {
+  if (job.version === 0) return null;
+  return (
+    <label className="row version">
+      <span className="dim">Version</span>
+      <select
+        value={pinned?.version ?? ""}
+        onChange={(event) => onVersion(event.target.value === "" ? null : Number(event.target.value))}
+      >
+        <option value="">newest, {job.version}</option>
+        {versions
+          .filter((one) => one.version < job.version || one === pinned)
+          .reverse()
+          .map((one) => (
+            <option key={one.version} value={one.version}>
+              {one.version}: {count(one.splats)} splats, {decibel(one.psnr_db)}
+            </option>
+          ))}
+      </select>
+    </label>
+  );
+}
+
+/** Legend of the path; the timeline always shows the states. */
+function Legend({ colouring }: { colouring: Colouring }): JSX.Element {
+  return (
+    <>
+      {colouring === "speed" && (
+        <div className="legend speed" title="Each style covers one fifth of the highest speed">
+          <span>slow</span>
+          {SPEED_STYLES.map((style) => (
+            <Swatch key={style.name} style={style} />
+          ))}
+          <span>fast</span>
+        </div>
+      )}
+      <ul className="legend" aria-label="States of the tracking">
+        {STATES.map((state) => (
+          <li key={state} title={trackingMeaning[state]}>
+            <Swatch style={STATE_STYLES[state]} />
+            {state}
+          </li>
+        ))}
+        <li title="Missing frames, in the timeline">
+          <svg className="swatch missing" viewBox={`0 0 ${SWATCH_PX} ${MAX_WIDTH_PX + 4}`} aria-hidden="true">
+            <rect className="glass" y={2} width={SWATCH_PX} height={MAX_WIDTH_PX} />
+            <rect className="overhang" x={SWATCH_PX / 2 - 3} width={5} height={MAX_WIDTH_PX + 4} />
+            <rect className="cut" x={SWATCH_PX / 2 - 3} y={2} width={5} height={MAX_WIDTH_PX} />
+          </svg>
+          missing
+        </li>
+      </ul>
+    </>
+  );
+}
+
+const SWATCH_PX = 32;
+
+function Swatch({ style }: { style: LineStyle }): JSX.Element {
+  const middle = MAX_WIDTH_PX / 2 + 2;
+  return (
+    <svg className="swatch" viewBox={`0 0 ${SWATCH_PX} ${2 * middle}`} aria-hidden="true">
+      <rect className="glass" y={1} width={SWATCH_PX} height={2 * middle - 2} rx={2} />
+      <line
+        x1={0}
+        x2={SWATCH_PX}
+        y1={middle}
+        y2={middle}
+        stroke={`var(--${style.colour})`}
+        strokeWidth={style.width_px}
+        strokeDasharray={style.dash_px?.join(" ")}
+      />
+    </svg>
+  );
+}
+
+function Bookmarks({
+  captureId,
+  currentView,
+  onView,
+}: {
+  captureId: string;
+  currentView: () => { camera: number[]; frame: number | null };
+  onView: (camera: number[], frame: number | null) => void;
+}): JSX.Element {
+  const [bookmarks, setBookmarks] = useState(() => readBookmarks(captureId));
+  const keep = (next: Bookmark[]): void => {
+    setBookmarks(next);
+    try {
+      writeBookmarks(captureId, next);
+    } catch {
+      toast("This browser does not allow the page to store bookmarks.", { tone: "problem" });
+    }
+  };
+  return (
+    <section className="bookmarks" aria-label="Bookmarks">
+      <div className="row">
+        <span className="dim">Bookmarks</span>
+        <button
+          type="button"
+          onClick={() => {
+            const names = new Set(bookmarks.map((one) => one.name));
+            let number = bookmarks.length + 1;
+            while (names.has(`View ${number}`)) number += 1;
+            keep([...bookmarks, { name: `View ${number}`, ...currentView() }]);
+          }}
+        >
+          <Icon name="bookmark" /> Add
+        </button>
+      </div>
+      {bookmarks.length > 0 && (
+        <ul>
+          {bookmarks.map((one, i) => (
+            <li key={one.name}>
+              <button type="button" className="bare" onClick={() => onView(one.camera, one.frame)}>
+                {one.name}
+                {one.frame !== null && <span className="dim"> frame {count(one.frame)}</span>}
+              </button>
+              <button
+                type="button"
+                className="bare"
+                aria-label={`Remove ${one.name}`}
+                onClick={() => keep(bookmarks.filter((_, k) => k !== i))}
+              >
+                <Icon name="close" />
+              </button>
+            </li>
+          ))}
+        </ul>
+      )}
+    </section>
+  );
+}

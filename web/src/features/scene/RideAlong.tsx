@@ -1,0 +1,165 @@
+/** The capture camera's view: observed image over rendered scene, with a wipe or the difference. */
+
+import { type JSX, useEffect, useRef, useState } from "react";
+
+import { address, fetched } from "../../shared/api/calls";
+import type { Capture, Sensor } from "../../shared/api/types";
+import { Segmented } from "../../shared/ui/parts";
+
+type Comparison = "wipe" | "difference" | "rendered" | "observed";
+const CHOICES = [
+  { value: "wipe", label: "Wipe" },
+  { value: "difference", label: "Difference" },
+  { value: "rendered", label: "Rendered" },
+  { value: "observed", label: "Observed" },
+] as const;
+const LOOK_MS = 60;
+/** Gain of the difference image; `.brightened` in the style sheet applies it. */
+const DIFFERENCE_GAIN = 4;
+
+export function RideAlong({
+  capture,
+  white,
+  sensor,
+  frame,
+}: {
+  capture: Capture;
+  /** Radiance of white in the scene. */
+  white: number | undefined;
+  sensor: Sensor;
+  frame: number | null;
+}): JSX.Element {
+  const [comparison, setComparison] = useState<Comparison>("wipe");
+  const [share, setShare] = useState(0.5);
+  const image = useRef<HTMLImageElement>(null);
+  const observed = useObserved(capture.id, white, frame);
+  const bar = useRef<HTMLDivElement>(null);
+  useAspectFit(bar, sensor.width / sensor.height);
+
+  useEffect(() => {
+    const style = image.current?.style;
+    if (style === undefined) return;
+    style.clipPath = comparison === "wipe" ? `inset(0 ${100 * (1 - share)}% 0 0)` : "";
+    style.mixBlendMode = comparison === "difference" ? "difference" : "normal";
+    style.visibility = comparison === "rendered" ? "hidden" : "visible";
+  }, [comparison, share, observed.url]);
+
+  return (
+    <>
+      {observed.url !== null && (
+        <img
+          ref={image}
+          className="observed"
+          src={observed.url}
+          alt="Observed by the camera"
+          data-frame={frame ?? ""}
+        />
+      )}
+      {comparison === "wipe" && <Wipe share={share} onShare={setShare} />}
+      {comparison === "difference" && <span className="brightened" aria-hidden="true" />}
+      <div className="compare" ref={bar}>
+        <Segmented label="Comparison" value={comparison} choices={CHOICES} onChange={setComparison} />
+        {comparison === "difference" && <span className="note">|observed − rendered| × {DIFFERENCE_GAIN}</span>}
+        {observed.missing && comparison !== "rendered" && (
+          <span className="note">No recorded picture of this frame</span>
+        )}
+        {sensor.intrinsics === null && <span className="note">The intrinsics of this capture are unknown</span>}
+      </div>
+    </>
+  );
+}
+
+function Wipe({ share, onShare }: { share: number; onShare: (share: number) => void }): JSX.Element {
+  const line = useRef<HTMLSpanElement>(null);
+  useEffect(() => {
+    if (line.current !== null) line.current.style.left = `${100 * share}%`;
+  }, [share]);
+  return (
+    <>
+      <span className="wipe-line" ref={line} aria-hidden="true" />
+      <span className="wipe-names" aria-hidden="true">
+        <b>observed</b>
+        <b>rendered</b>
+      </span>
+      <input
+        className="wipe"
+        type="range"
+        aria-label="Observed on the left, rendered on the right of"
+        min={0}
+        max={1}
+        step={0.01}
+        value={share}
+        onChange={(event) => onShare(event.target.valueAsNumber)}
+      />
+    </>
+  );
+}
+
+const stageOf = (inside: HTMLElement | null): HTMLElement | null => inside?.closest<HTMLElement>(".stage") ?? null;
+
+/** Fit the stage into its container at the aspect ratio of the sensor; reset on unmount. */
+function useAspectFit(inside: { readonly current: HTMLElement | null }, aspect: number): void {
+  useEffect(() => {
+    const box = stageOf(inside.current);
+    const around = box?.parentElement;
+    if (box === null || around == null) return;
+    const fit = (): void => {
+      const width = Math.min(around.clientWidth, around.clientHeight * aspect);
+      box.style.width = `${Math.floor(width)}px`;
+      box.style.height = `${Math.floor(width / aspect)}px`;
+    };
+    const observer = new ResizeObserver(fit);
+    observer.observe(around);
+    fit();
+    return () => {
+      observer.disconnect();
+      box.style.width = box.style.height = "";
+    };
+  }, [inside, aspect]);
+}
+
+/**
+ * The observed picture of a frame, at the brightness of the scene. Frames may change faster than pictures arrive: one
+ * request runs at a time, for the newest frame.
+ */
+function useObserved(
+  captureId: string,
+  white: number | undefined,
+  frame: number | null,
+): { url: string | null; missing: boolean } {
+  const [url, setUrl] = useState<string | null>(null);
+  const [missing, setMissing] = useState(false);
+  const wanted = useRef(frame);
+  useEffect(() => {
+    wanted.current = frame;
+  }, [frame]);
+  useEffect(() => {
+    const ended = new AbortController();
+    let shown: number | null = null;
+    let busy = false;
+    const ask = async (): Promise<void> => {
+      const requested = wanted.current;
+      if (busy || requested === null || requested === shown) return;
+      busy = true;
+      shown = requested;
+      try {
+        const picture = address.preview(captureId, "interval", { frame: requested, white });
+        const next = URL.createObjectURL(await (await fetched(picture, ended.signal)).blob());
+        setUrl((before) => {
+          if (before !== null) URL.revokeObjectURL(before);
+          return next;
+        });
+        setMissing(false);
+      } catch {
+        if (!ended.signal.aborted) setMissing(true);
+      }
+      busy = false;
+    };
+    const timer = setInterval(() => void ask(), LOOK_MS);
+    return () => {
+      ended.abort();
+      clearInterval(timer);
+    };
+  }, [captureId, white]);
+  return { url, missing };
+}

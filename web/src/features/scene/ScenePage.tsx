@@ -1,0 +1,240 @@
+/** The Scene page: splats, path, timeline, and the view of the capture camera. */
+
+import { type JSX, useCallback, useEffect, useState } from "react";
+
+import { capture as askCapture } from "../../shared/api/calls";
+import type { Capture } from "../../shared/api/types";
+import { nameOf } from "../../shared/state/capture";
+import { count } from "../../shared/state/format";
+import { adjust, go, route, useRoute } from "../../shared/state/route";
+import {
+  isEnded,
+  loadReconstructions,
+  newestCapture,
+  newestReconstruction,
+  storeCapture,
+  useService,
+  errorText,
+} from "../../shared/state/store";
+import { toast } from "../../shared/state/toasts";
+import { Empty, ErrorMessage, JobReason, Loading, trackingHint } from "../../shared/ui/parts";
+import { Inspector } from "./Inspector";
+import { type Colouring, rowAt } from "./path";
+import { RideAlong } from "./RideAlong";
+import { Scrubber } from "./Scrubber";
+import { usePath } from "./usePath";
+import { useScene } from "./useScene";
+import { useVersions } from "./useVersions";
+import { type Layers, type Steering, Viewer } from "./Viewer";
+
+const LAYERS: Layers = { splats: true, path: true, frustum: true, grid: true, axes: true };
+const URL_MS = 300;
+
+export function ScenePage(): JSX.Element {
+  return (
+    <>
+      <h1 className="hidden">Scene</h1>
+      <Wanted />
+    </>
+  );
+}
+
+function Wanted(): JSX.Element {
+  const at = useRoute();
+  const capture = useService((state) =>
+    at.capture === null ? newestCapture(state.captures) : (state.captures[at.capture] ?? null),
+  );
+  const job = useService((state) =>
+    at.reconstruction === null
+      ? newestReconstruction(state.reconstructions, capture?.id ?? null)
+      : (state.reconstructions[at.reconstruction] ?? null),
+  );
+  const loaded = useService((state) => state.loaded);
+  const problem = useWanted(at.capture, capture);
+  if (problem !== null)
+    return (
+      <ErrorMessage text={problem} again={() => go({ capture: null, reconstruction: null })} called="Newest scene" />
+    );
+  if (!loaded && capture === null) return <Loading what="the scene" />;
+  if (capture === null)
+    return (
+      <Empty icon="scene" title="No scene yet">
+        A scene grows while a camera moves. <button onClick={() => go({ page: "live" })}>Start a capture</button>
+      </Empty>
+    );
+  if (job === null)
+    return (
+      <Empty icon="scene" title="This capture has no reconstruction">
+        <button onClick={() => go({ page: "captures", capture: capture.id })}>Reconstruct it</button>
+      </Empty>
+    );
+  return <SceneView key={job.id} capture={capture} jobId={job.id} />;
+}
+
+/** Fetch a capture that the URL names and the store does not hold. */
+function useWanted(id: string | null, known: Capture | null): string | null {
+  const [problem, setProblem] = useState<{ id: string; text: string } | null>(null);
+  const missing = id !== null && known === null;
+  const knownId = known?.id ?? null;
+  useEffect(() => {
+    if (missing) askCapture(id).then(storeCapture, (error: unknown) => setProblem({ id, text: errorText(error) }));
+  }, [id, missing]);
+  useEffect(() => {
+    if (knownId !== null) loadReconstructions(knownId).catch(() => undefined); // shown by the banner at the top
+  }, [knownId]);
+  return missing && problem?.id === id ? problem.text : null;
+}
+
+function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX.Element | null {
+  const at = useRoute();
+  const job = useService((state) => state.reconstructions[jobId] ?? null);
+  const [viewer, setViewer] = useState<Viewer | null>(null);
+  const [fault, setFault] = useState<string | null>(null);
+  const [layers, setLayers] = useState(LAYERS);
+  const [colouring, setColouring] = useState<Colouring>("state");
+  const [steering, setSteering] = useState<Steering>("orbit");
+  const [full, setFull] = useState(false);
+  const sensor = capture.sensor;
+  const versions = useVersions(job);
+  const pinned = versions.find((one) => one.version === at.version) ?? null;
+  const path = usePath(job, pinned);
+  const { shown, loading, problem } = useScene(viewer, job, full, pinned);
+
+  const mount = useCallback((canvas: HTMLCanvasElement | null) => {
+    if (canvas === null) return;
+    let timer: ReturnType<typeof setTimeout> | undefined;
+    let made: Viewer;
+    try {
+      made = new Viewer(canvas, () => {
+        clearTimeout(timer);
+        timer = setTimeout(() => adjust({ camera: made.view() }), URL_MS);
+      });
+    } catch {
+      setFault(
+        "This browser has no WebGL 2, which the scene view requires. The pictures of the Live page work without it.",
+      );
+      return;
+    }
+    setViewer(made);
+    return () => {
+      clearTimeout(timer);
+      made.dispose();
+      setViewer(null);
+    };
+  }, []);
+
+  const last = path?.frames.at(-1) ?? null;
+  const row = path === null ? -1 : rowAt(path, at.frame ?? last ?? 0);
+  useEffect(() => {
+    if (viewer === null || path === null || row < 0 || sensor === null) return;
+    viewer.setPose(
+      [...path.positions.subarray(3 * row, 3 * row + 3)],
+      [...path.quaternions.subarray(4 * row, 4 * row + 4)],
+      sensor,
+    );
+  }, [viewer, path, row, sensor, shown?.version]);
+  useEffect(() => {
+    if (path !== null) viewer?.setPath(path, colouring);
+  }, [viewer, path, colouring]);
+  useEffect(() => viewer?.setLayers(layers), [viewer, layers]);
+  useEffect(() => viewer?.steer(steering), [viewer, steering]);
+  useEffect(() => viewer?.setRiding(at.ride), [viewer, at.ride]);
+  const linked = at.camera;
+  useEffect(() => {
+    // Only views from a link or the history; the viewer's own updates are in effect already.
+    if (viewer !== null && linked !== null && linked.some((x, i) => Math.abs(x - (viewer.view()[i] ?? 0)) > 1e-3))
+      viewer.setView(linked);
+  }, [viewer, linked]);
+
+  if (job === null) return null;
+  const screenshot = async (): Promise<void> => {
+    if (viewer === null) return;
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(await viewer.picture());
+    link.download = `spiked-${capture.id}-v${viewer.version}.png`;
+    link.click();
+    URL.revokeObjectURL(link.href);
+    toast(`Saved ${link.download}`);
+  };
+  return (
+    <div className="scene">
+      <div className={at.ride ? "viewport ride" : "viewport"}>
+        <div className="stage">
+          <canvas
+            ref={mount}
+            tabIndex={0}
+            role="application"
+            aria-label={`Scene of ${nameOf(capture)}: ${count(shown?.splats ?? 0)} splats, version ${shown?.version ?? 0}`}
+            data-version={shown?.version ?? 0}
+            data-splats={shown?.splats ?? 0}
+          />
+          {at.ride && sensor !== null && (
+            <RideAlong
+              capture={capture}
+              white={(pinned ?? job).white ?? undefined}
+              sensor={sensor}
+              frame={path?.frames[row] ?? null}
+            />
+          )}
+        </div>
+        {fault !== null && <ErrorMessage text={fault} />}
+        {shown === null && fault === null && (
+          <div className="veil">
+            {problem !== null ? (
+              <ErrorMessage text={problem} />
+            ) : isEnded(job) && job.version === 0 ? (
+              <Empty
+                icon="problem"
+                title={job.state === "failed" ? "The reconstruction has failed" : "This reconstruction has no scene"}
+              >
+                <JobReason job={job} />
+              </Empty>
+            ) : (
+              <Empty icon="scene" title={loading ? "Loading the scene…" : "Waiting for the first version…"}>
+                {!loading && trackingHint(job)}
+                {!loading && <JobReason job={job} />}
+              </Empty>
+            )}
+          </div>
+        )}
+      </div>
+      <Inspector
+        capture={capture}
+        job={job}
+        versions={versions}
+        pinned={pinned}
+        onVersion={(version) => {
+          setFull(false);
+          adjust({ version });
+        }}
+        shown={shown}
+        loading={loading}
+        full={full}
+        onFull={() => setFull(true)}
+        layers={layers}
+        onLayers={setLayers}
+        colouring={colouring}
+        onColouring={setColouring}
+        steering={steering}
+        onSteering={setSteering}
+        ride={at.ride}
+        onRide={(ride) => adjust({ ride })}
+        onHome={() => {
+          viewer?.home();
+          adjust({ camera: null });
+        }}
+        onScreenshot={() => void screenshot().catch((error: unknown) => toast(errorText(error), { tone: "problem" }))}
+        currentView={() => ({ camera: viewer?.view() ?? [], frame: route().frame })}
+        onView={(camera, frame) => adjust({ camera, frame, ride: false })}
+      />
+      <Scrubber
+        path={path}
+        row={row}
+        frameRateHz={sensor?.frame_rate_hz ?? null}
+        live={job.live && job.state === "running" && pinned === null}
+        jobId={job.id}
+        version={shown?.version ?? 0}
+      />
+    </div>
+  );
+}

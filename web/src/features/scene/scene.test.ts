@@ -1,0 +1,112 @@
+import { PerspectiveCamera, Vector3 } from "three";
+import { expect, it } from "vitest";
+
+import type { Trajectory } from "../../shared/api/types";
+import { placementOf, projectionOf } from "./axes";
+import { classes, pathOf, rowAt, runs, stylesBy, speeds, thinned } from "./path";
+import { SPEED_STYLES, STATE_STYLES, STATES } from "./stateStyles";
+import { readBookmarks, writeBookmarks } from "./bookmarks";
+
+const straight = (n: number): Trajectory => ({
+  version: 1,
+  frames: Array.from({ length: n }, (_, i) => 8 * i + 4),
+  times_s: Array.from({ length: n }, (_, i) => (8 * i + 4.5) / 20_000),
+  positions: Array.from({ length: n }, (_, i) => [0.01 * i, 0, 0]),
+  quaternions_wxyz: Array.from({ length: n }, () => [1, 0, 0, 0]),
+  states: Array.from({ length: n }, (_, i) => (i < 2 ? "boot" : "track")),
+});
+
+/** Pixel of a point given in OpenCV's world, through three.js. */
+function pixel(point: number[], position: number[], wxyz: number[]): [number, number] {
+  const k = { fx: 350, fy: 340, cx: 190, cy: 130 };
+  const camera = new PerspectiveCamera();
+  const placement = placementOf(position, wxyz);
+  camera.position.copy(placement.position);
+  camera.quaternion.copy(placement.quaternion);
+  camera.updateMatrixWorld();
+  camera.projectionMatrix.copy(projectionOf(k, 400, 250, 0.01, 100));
+  const [x = 0, y = 0, z = 0] = point;
+  const seen = new Vector3(x, -y, -z).applyMatrix4(camera.matrixWorldInverse).applyMatrix4(camera.projectionMatrix);
+  return [((seen.x + 1) / 2) * 400, ((1 - seen.y) / 2) * 250];
+}
+
+it("sees a point at the pixel where a pinhole camera with OpenCV's axes sees it", () => {
+  // Right 0.2, down 0.1, forward 2: u = 350 * 0.1 + 190, v = 340 * 0.05 + 130.
+  const [u, v] = pixel([0.2, 0.1, 2], [0, 0, 0], [1, 0, 0, 0]);
+  expect(u).toBeCloseTo(225, 3);
+  expect(v).toBeCloseTo(147, 3);
+  // A camera at x = 1 turned 90 degrees about y (down) looks along +x: what is at x = 3 is 2 ahead of it.
+  const half = Math.SQRT1_2;
+  const [u2, v2] = pixel([3, 0.1, -0.2], [1, 0, 0], [half, 0, half, 0]);
+  expect(u2).toBeCloseTo(225, 3);
+  expect(v2).toBeCloseTo(147, 3);
+});
+
+it("finds the pose nearest to a frame", () => {
+  const path = pathOf(straight(100));
+  expect(rowAt(path, -5)).toBe(0);
+  expect(rowAt(path, 4)).toBe(0);
+  expect(rowAt(path, 9)).toBe(1);
+  expect(rowAt(path, 1e9)).toBe(99);
+  expect(rowAt(pathOf(straight(0)), 3)).toBe(-1);
+});
+
+it("continues with live poses after the end of the published path", () => {
+  const tail = [4, 804, 812].map((frame) => ({
+    frame,
+    time_s: (frame + 0.5) / 20_000,
+    position: [9, 9, 9] as [number, number, number],
+    quaternion_wxyz: [1, 0, 0, 0] as [number, number, number, number],
+    state: "track" as const,
+  }));
+  const path = pathOf(straight(100), tail);
+  expect([...path.frames.slice(-3)]).toEqual([796, 804, 812]);
+});
+
+it("measures speed and draws by state", () => {
+  const path = pathOf(straight(50));
+  for (const speed of speeds(path)) expect(speed).toBeCloseTo(0.01 / (8 / 20_000), 2);
+  const drawn = [...classes(path, "state")].map((which) => stylesBy("state")[which]?.name);
+  expect(drawn.slice(0, 3)).toEqual(["boot", "boot", "track"]);
+  expect(drawn.at(-1)).toBe("track");
+  expect(runs(path)).toEqual([
+    { state: "boot", first: 0, end: 2 },
+    { state: "track", first: 2, end: 50 },
+  ]);
+});
+
+it("draws what is faster by a later class", () => {
+  const slower = straight(200);
+  slower.positions = slower.times_s.map((_, i) => [0.00005 * i * i, 0, 0]);
+  const drawn = [...classes(pathOf(slower), "speed")];
+  expect(drawn).toEqual([...drawn].sort((a, b) => a - b));
+  expect(new Set(drawn).size).toBe(SPEED_STYLES.length);
+});
+
+it("tells states and speeds apart without their colours: by dashes or by width", () => {
+  for (const styles of [STATES.map((state) => STATE_STYLES[state]), SPEED_STYLES]) {
+    for (const [i, one] of styles.entries()) {
+      for (const other of styles.slice(i + 1)) {
+        const [a, b] = [one, other].map(({ dash_px: dash }) => (dash === null ? 1 : dash[0] / (dash[0] + dash[1])));
+        const apart = Math.abs(one.width_px - other.width_px) >= 1 || Math.abs((a ?? 0) - (b ?? 0)) > 0.15;
+        expect(apart, `${one.name} and ${other.name}`).toBe(true);
+      }
+    }
+  }
+});
+
+it("thins evenly and keeps both ends", () => {
+  expect(thinned(5, 10)).toEqual([0, 1, 2, 3, 4]);
+  const rows = thinned(1000, 11);
+  expect([rows.length, rows[0], rows.at(-1)]).toEqual([11, 0, 999]);
+});
+
+it("keeps bookmarks and ignores what is not one", () => {
+  const mark = { name: "View 1", camera: [1, 2, 3, 4, 5, 6, 55], frame: null };
+  writeBookmarks("c", [mark]);
+  expect(readBookmarks("c")).toEqual([mark]);
+  localStorage.setItem("spiked.bookmarks.c", '[{"name": "x", "camera": [1]}, 3]');
+  expect(readBookmarks("c")).toEqual([]);
+  localStorage.setItem("spiked.bookmarks.c", "{");
+  expect(readBookmarks("c")).toEqual([]);
+});

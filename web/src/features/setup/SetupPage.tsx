@@ -1,0 +1,249 @@
+/** The Set-up page: machine check, configuration, tokens, links. */
+
+import type { JSX } from "react";
+
+import * as calls from "../../shared/api/calls";
+import type { Finding, Setting, Token } from "../../shared/api/types";
+import { allows } from "../../shared/state/access";
+import { attempt } from "../../shared/state/attempt";
+import { bytes, duration, when } from "../../shared/state/format";
+import { useService } from "../../shared/state/store";
+import { toast } from "../../shared/state/toasts";
+import { type Fetch, useFetch } from "../../shared/state/useFetch";
+import { ScopeNote } from "../../shared/ui/access";
+import { Fetched } from "../../shared/ui/Fetched";
+import { Icon } from "../../shared/ui/icons";
+import { Badge, Empty, Loading, Markup, Panel, type Tone } from "../../shared/ui/parts";
+import { Table } from "../../shared/ui/Table";
+
+const TONES: Record<Finding["status"], Tone> = { ok: "good", warning: "warning", problem: "problem" };
+const LINKS = [
+  { href: "docs", label: "API documentation", hint: "All operations, with requests and responses" },
+  { href: "openapi.json", label: "OpenAPI schema", hint: "For client generators" },
+  { href: "metrics", label: "Metrics", hint: "For Prometheus" },
+  { href: "healthz", label: "Health", hint: "The process answers" },
+  { href: "readyz", label: "Readiness", hint: "Captures can be started" },
+] as const;
+const SETTING_COLUMNS = [{ name: "Setting" }, { name: "Value" }, { name: "From" }, { name: "Reload" }];
+const TOKEN_COLUMNS = [{ name: "Name" }, { name: "Scope" }, { name: "Created" }, { name: "Expires" }];
+
+export function SetupPage(): JSX.Element {
+  const scope = useService((state) => state.system?.scope ?? null);
+  const administrator = scope !== null && allows(scope, "admin");
+  return (
+    <div className="setup">
+      <h1 className="hidden">Set-up</h1>
+      <div>
+        <Doctor />
+        {administrator && <Configuration />}
+      </div>
+      <div>
+        <Service />
+        {administrator && <Tokens />}
+        {scope !== null && !administrator && (
+          <Panel title="Administration">
+            <p>Configuration and tokens are hidden.</p>
+            <ScopeNote needs="admin" />
+          </Panel>
+        )}
+        <Links />
+        <Keys />
+      </div>
+    </div>
+  );
+}
+
+function Refresh({ of, label }: { of: Fetch<unknown>; label: string }): JSX.Element {
+  return (
+    <button type="button" aria-label={label} onClick={of.again} disabled={of.loading}>
+      <Icon name="again" /> Refresh
+    </button>
+  );
+}
+
+function Doctor(): JSX.Element {
+  const doctor = useFetch("doctor", calls.doctor);
+  return (
+    <Panel title="Device doctor" aside={<Refresh of={doctor} label="Refresh the findings" />}>
+      <Fetched from={doctor} what="the findings">
+        {(items) =>
+          items.length === 0 ? (
+            <Empty icon="good" title="No findings" />
+          ) : (
+            <ul className="doctor">
+              {items.map((item) => (
+                <li key={item.name}>
+                  <Badge tone={TONES[item.status]}>{item.status}</Badge>
+                  <div>
+                    <strong>{item.name}</strong>
+                    <p>
+                      <Markup>{item.finding}</Markup>
+                    </p>
+                    {item.what_to_do !== null && (
+                      <p className="todo">
+                        <Markup>{item.what_to_do}</Markup>
+                      </p>
+                    )}
+                  </div>
+                </li>
+              ))}
+            </ul>
+          )
+        }
+      </Fetched>
+    </Panel>
+  );
+}
+
+function Service(): JSX.Element {
+  const system = useService((state) => state.system);
+  return (
+    <Panel title="Service">
+      {system === null ? (
+        <Loading what="the state of the service" />
+      ) : (
+        <dl className="facts">
+          <dt>Version</dt>
+          <dd>{system.version}</dd>
+          <dt>Running for</dt>
+          <dd>{duration(system.uptime_s)}</dd>
+          <dt>Memory</dt>
+          <dd>{bytes(system.memory_bytes)}</dd>
+          <dt>Process</dt>
+          <dd>{system.pid}</dd>
+          <dt>Data folder</dt>
+          <dd>
+            <code>{system.data_folder}</code>
+          </dd>
+          <dt>Disk</dt>
+          <dd>
+            {bytes(system.disk.free_bytes)} free of {bytes(system.disk.total_bytes)}:{" "}
+            {duration(system.disk.recording_s)} of {system.disk.recording_of}
+          </dd>
+          <dt>Your scope</dt>
+          <dd>{system.scope}</dd>
+        </dl>
+      )}
+    </Panel>
+  );
+}
+
+function Tokens(): JSX.Element {
+  const tokens = useFetch("tokens", calls.tokens);
+  return (
+    <Panel title="Tokens" aside={<Refresh of={tokens} label="Refresh the tokens" />}>
+      <Fetched from={tokens} what="the tokens">
+        {(items) =>
+          items.length === 0 ? (
+            <p>No tokens, other than one in the settings, if any.</p>
+          ) : (
+            <Table label="Table of tokens" className="grid" columns={TOKEN_COLUMNS}>
+              {items.map((token) => (
+                <tr key={token.name}>
+                  <th scope="row">{token.name}</th>
+                  <td>{token.scope}</td>
+                  <td className="dim">{when(token.created_at)}</td>
+                  <td>{expiry(token)}</td>
+                </tr>
+              ))}
+            </Table>
+          )
+        }
+      </Fetched>
+      <p className="dim note">
+        <code>spiked token create NAME --days 30</code> creates a token and prints it once;{" "}
+        <code>spiked token revoke NAME</code> revokes it at once, for this page too.
+      </p>
+    </Panel>
+  );
+}
+
+function expiry({ expires_at: end }: Token): JSX.Element {
+  if (end === null) return <span className="dim">never</span>;
+  return Date.parse(end) <= Date.now() ? <Badge tone="warning">expired {when(end)}</Badge> : <>{when(end)}</>;
+}
+
+function Configuration(): JSX.Element {
+  const configuration = useFetch("configuration", calls.configuration);
+  const reload = async (): Promise<void> => {
+    if (!(await attempt(calls.reloadConfiguration))) return;
+    toast("Configuration reloaded");
+    configuration.again();
+  };
+  return (
+    <Panel
+      title="Configuration"
+      aside={
+        <button type="button" disabled={configuration.loading} onClick={() => void reload()}>
+          <Icon name="again" /> Reload
+        </button>
+      }
+    >
+      <Fetched from={configuration} what="the configuration">
+        {(items) => (
+          <Table label="Table of settings" className="grid configuration" columns={SETTING_COLUMNS}>
+            {items.map((item) => (
+              <SettingRow key={item.key} setting={item} />
+            ))}
+          </Table>
+        )}
+      </Fetched>
+    </Panel>
+  );
+}
+
+function SettingRow({ setting }: { setting: Setting }): JSX.Element {
+  const { value } = setting;
+  return (
+    <tr>
+      <th scope="row">
+        <code>{setting.key}</code>
+        <span className="dim">
+          <Markup>{setting.doc}</Markup>
+        </span>
+      </th>
+      <td>
+        <code>{value === null ? "–" : typeof value === "string" ? value : JSON.stringify(value)}</code>
+      </td>
+      <td>
+        <span className={setting.origin === "default" ? "dim" : ""}>{setting.origin}</span>
+      </td>
+      <td className="dim">{setting.reloadable ? "yes" : "restart"}</td>
+    </tr>
+  );
+}
+
+function Links(): JSX.Element {
+  return (
+    <Panel title="Links">
+      <ul className="links">
+        {LINKS.map((link) => (
+          <li key={link.href}>
+            <a href={link.href}>{link.label}</a> <span className="dim">{link.hint}</span>
+          </li>
+        ))}
+      </ul>
+    </Panel>
+  );
+}
+
+function Keys(): JSX.Element {
+  return (
+    <Panel title="Keys">
+      <dl className="facts">
+        <dt>
+          <kbd>1</kbd> – <kbd>4</kbd>
+        </dt>
+        <dd>Live, Scene, Captures, Set-up</dd>
+        <dt>
+          <kbd>←</kbd> <kbd>→</kbd>
+        </dt>
+        <dd>Previous or next frame, in the time slider</dd>
+        <dt>
+          <kbd>W A S D R F</kbd>
+        </dt>
+        <dd>Fly through the scene while it has the focus</dd>
+      </dl>
+    </Panel>
+  );
+}

@@ -1,0 +1,113 @@
+/** Calls of the REST API made by the page. */
+
+import { answered, API, client, query, request } from "./http";
+import type {
+  Capture,
+  CaptureChange,
+  CapturePage,
+  CaptureRequest,
+  Device,
+  Finding,
+  OptionSchema,
+  OptionValues,
+  PreviewKind,
+  Reconstruction,
+  Setting,
+  SourceKind,
+  Stats,
+  System,
+  Timeline,
+  Token,
+  Trajectory,
+  Version,
+} from "./types";
+
+/** `crypto.randomUUID` exists only in secure contexts; a phone on the local network has none. */
+const newKey = (): string =>
+  Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");
+const idempotent = (): { "idempotency-key": string } => ({ "idempotency-key": newKey() });
+const ofCapture = (capture_id: string) => ({ params: { path: { capture_id } } });
+const ofReconstruction = (reconstruction_id: string) => ({ params: { path: { reconstruction_id } } });
+
+export const devices = async (): Promise<Device[]> => (await answered(client.GET("/api/v1/devices"))).items;
+export const doctor = async (): Promise<Finding[]> =>
+  ((await (await request("doctor")).json()) as { items: Finding[] }).items;
+export const system = (): Promise<System> => answered(client.GET("/api/v1/system"));
+export const configuration = async (): Promise<Setting[]> =>
+  (await answered(client.GET("/api/v1/configuration"))).items;
+export const reloadConfiguration = (): Promise<unknown> => answered(client.POST("/api/v1/configuration:reload"));
+export const tokens = async (): Promise<Token[]> => (await answered(client.GET("/api/v1/tokens"))).items;
+export const optionSchema = async (): Promise<OptionSchema> => await answered(client.GET("/api/v1/options"));
+export const sourceKinds = async (): Promise<SourceKind[]> =>
+  (await answered(client.GET("/api/v1/options/sources"))).items;
+
+export const captures = (wanted: { limit?: number; cursor?: string; q?: string }): Promise<CapturePage> =>
+  answered(client.GET("/api/v1/captures", { params: { query: wanted } }));
+export const capture = (id: string): Promise<Capture> =>
+  answered(client.GET("/api/v1/captures/{capture_id}", ofCapture(id)));
+export const startCapture = (plan: CaptureRequest): Promise<Capture> =>
+  answered(client.POST("/api/v1/captures", { body: plan, params: { header: idempotent() } }));
+export const stopCapture = (id: string): Promise<Capture> =>
+  answered(client.POST("/api/v1/captures/{capture_id}:stop", ofCapture(id)));
+export const changeCapture = (id: string, change: CaptureChange): Promise<Capture> =>
+  answered(client.PATCH("/api/v1/captures/{capture_id}", { ...ofCapture(id), body: change }));
+export const removeCapture = (id: string): Promise<unknown> =>
+  answered(client.DELETE("/api/v1/captures/{capture_id}", ofCapture(id)));
+export const restoreCapture = (id: string): Promise<Capture> =>
+  answered(client.POST("/api/v1/captures/{capture_id}:restore", ofCapture(id)));
+export const stats = (id: string): Promise<Stats> =>
+  answered(client.GET("/api/v1/captures/{capture_id}/stats", ofCapture(id)));
+
+export const reconstructions = async (captureId: string): Promise<Reconstruction[]> =>
+  (await answered(client.GET("/api/v1/reconstructions", { params: { query: { capture_id: captureId, limit: 100 } } })))
+    .items;
+/** Running and queued reconstructions of all captures. */
+export const unfinished = async (): Promise<Reconstruction[]> => {
+  const states = ["running", "queued"] as const;
+  const pages = states.map((state) =>
+    answered(client.GET("/api/v1/reconstructions", { params: { query: { state, limit: 100 } } })),
+  );
+  return (await Promise.all(pages)).flatMap((page) => page.items);
+};
+export const submit = (captureId: string, options: OptionValues): Promise<Reconstruction> =>
+  answered(
+    client.POST("/api/v1/reconstructions", {
+      body: { capture_id: captureId, options },
+      params: { header: idempotent() },
+    }),
+  );
+export const cancel = (id: string): Promise<Reconstruction> =>
+  answered(client.POST("/api/v1/reconstructions/{reconstruction_id}:cancel", ofReconstruction(id)));
+export const timeline = (id: string): Promise<Timeline> =>
+  answered(client.GET("/api/v1/reconstructions/{reconstruction_id}/timeline", ofReconstruction(id)));
+/** Kept versions, oldest first. */
+export const versions = async (id: string): Promise<Version[]> =>
+  (await answered(client.GET("/api/v1/reconstructions/{reconstruction_id}/versions", ofReconstruction(id)))).items;
+/** Every `step`-th pose of a version, the newest if none is named. */
+export const trajectory = async (id: string, step: number, version?: number): Promise<Trajectory> =>
+  (await (
+    await request(`reconstructions/${id}/trajectory${query({ format: "json", step, version })}`)
+  ).json()) as Trajectory;
+export const log = async (id: string): Promise<string> => (await request(`reconstructions/${id}/log`)).text();
+
+/** URLs for elements that fetch by themselves. */
+export const address = {
+  thumbnail: (id: string): string => `${API}/captures/${id}/thumbnail`,
+  preview: (
+    id: string,
+    kind: PreviewKind,
+    extra: { gain?: number | undefined; frame?: number | undefined; white?: number | undefined } = {},
+  ): string => `${API}/captures/${id}/preview${query({ kind, ...extra })}`,
+  recording: (id: string): string => `${API}/captures/${id}/recording`,
+  sidecar: (id: string): string => `${API}/captures/${id}/recording/sidecar`,
+  scene: (
+    id: string,
+    format: "ply" | "spz",
+    extra: { max_splats?: number; version?: number | undefined } = {},
+  ): string => `${API}/reconstructions/${id}/scene${query({ format, ...extra })}`,
+  trajectory: (id: string, format: string): string => `${API}/reconstructions/${id}/trajectory${query({ format })}`,
+};
+
+/** The bytes of a picture or a scene, aborted by `signal`. */
+export const fetched = (url: string, signal: AbortSignal): Promise<Response> =>
+  request(url.slice(API.length + 1), { signal });

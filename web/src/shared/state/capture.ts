@@ -1,0 +1,25 @@
+/** Texts for captures and jobs. */
+
+import type { Capture, Reconstruction } from "../api/types";
+import { count, duration, percent } from "./format";
+
+/** The source without folders and options, which are in the tooltip. */
+export const sourceOf = (capture: Capture): string =>
+  capture.origin === "upload" ? "uploaded" : capture.source.replace(/\?.*$/, "").replace(/^(\w+:).*\//, "$1");
+
+export const nameOf = (capture: Capture): string => (capture.name === "" ? sourceOf(capture) : capture.name);
+
+export function lengthOf(capture: Capture): string {
+  const frames = capture.recording?.frames ?? capture.counters?.next_frame ?? capture.frames_planned;
+  if (frames == null) return "–";
+  return capture.sensor === null ? `${count(frames)} frames` : duration(frames / capture.sensor.frame_rate_hz);
+}
+
+/** Progress, or place in the queue; empty for ended reconstructions. */
+export function progressText(job: Reconstruction): string {
+  const left = job.eta_s === null ? "" : `, about ${duration(job.eta_s)} left`;
+  if (job.state === "queued")
+    return `${job.queue_place === null ? "waiting" : `place ${job.queue_place} in the queue`}${left}`;
+  if (job.state !== "running") return "";
+  return `${percent(job.progress)}${left}`;
+}

@@ -1,0 +1,48 @@
+import { beforeEach, expect, it } from "vitest";
+
+import { adjust, dropToken, formatRoute, go, HOME, parseRoute, route } from "./route";
+
+beforeEach(() => go(HOME));
+
+it("keeps everything that is looked at in the URL", () => {
+  const there = {
+    page: "scene" as const,
+    capture: "01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10",
+    reconstruction: "01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e11",
+    version: 7,
+    frame: 640,
+    camera: [0.5, 1, -2, 0, 0, -1, 55],
+    ride: true,
+    search: "desk & lamp",
+  };
+  expect(parseRoute(formatRoute(there).slice(2))).toEqual(there);
+});
+
+it("does not believe what a link says", () => {
+  const odd = parseRoute("?page=attic&capture=../../etc&frame=-1&camera=1,2,x,4,5,6,7&reconstruction=a%2Fb");
+  expect(odd).toEqual(HOME);
+});
+
+it("takes details into the same entry of the history and pages into a new one", () => {
+  const before = window.history.length;
+  adjust({ frame: 3 });
+  expect(window.history.length).toBe(before);
+  go({ page: "scene" });
+  expect(window.history.length).toBe(before + 1);
+  expect(window.location.search).toBe("?page=scene&frame=3");
+});
+
+it("lets go of a version with its reconstruction", () => {
+  go({ page: "scene", reconstruction: "a", version: 3 });
+  go({ page: "captures" });
+  expect(route().version).toBe(3);
+  go({ page: "scene", reconstruction: "b" });
+  expect(route().version).toBeNull();
+});
+
+it("takes the token out of the address", () => {
+  window.history.replaceState(null, "", "./?token=sesame");
+  dropToken();
+  expect(window.location.search).toBe("");
+  expect(route().page).toBe("live");
+});

@@ -1,0 +1,104 @@
+/** The state of the page in the URL: a reload or a shared link shows the same view. */
+
+import { useSyncExternalStore } from "react";
+
+export const PAGES = ["live", "scene", "captures", "setup"] as const;
+export type PageName = (typeof PAGES)[number];
+
+export interface Route {
+  page: PageName;
+  /** Capture shown; null: the newest. */
+  capture: string | null;
+  /** Reconstruction shown; null: the newest of the capture. */
+  reconstruction: string | null;
+  /** Version of the scene; null follows the newest. */
+  version: number | null;
+  /** Frame of the scrubber; null follows the newest. */
+  frame: number | null;
+  /** Seven numbers: position and target of the orbiting camera, and its field of view in degrees. */
+  camera: number[] | null;
+  /** Whether the scene is shown from the camera of the capture. */
+  ride: boolean;
+  /** Search text of the captures table. */
+  search: string;
+}
+
+export const HOME: Route = {
+  page: "live",
+  capture: null,
+  reconstruction: null,
+  version: null,
+  frame: null,
+  camera: null,
+  ride: false,
+  search: "",
+};
+
+/** Identifiers are letters, digits and dashes; anything else in a link is ignored. */
+const identifier = (text: string | null): string | null => (text !== null && /^[\w-]{1,64}$/.test(text) ? text : null);
+
+const counted = (text: string | null): number | null =>
+  text !== null && /^\d{1,15}$/.test(text) ? Number(text) : null;
+
+export function parseRoute(search: string): Route {
+  const query = new URLSearchParams(search);
+  const page = PAGES.find((name) => name === query.get("page")) ?? "live";
+  const camera = query.get("camera")?.split(",").map(Number);
+  return {
+    page,
+    capture: identifier(query.get("capture")),
+    reconstruction: identifier(query.get("reconstruction")),
+    version: counted(query.get("version")),
+    frame: counted(query.get("frame")),
+    camera: camera?.length === 7 && camera.every(Number.isFinite) ? camera : null,
+    ride: query.get("ride") === "1",
+    search: query.get("search") ?? "",
+  };
+}
+
+export function formatRoute(route: Route): string {
+  const pairs = new URLSearchParams();
+  if (route.page !== "live") pairs.set("page", route.page);
+  if (route.capture !== null) pairs.set("capture", route.capture);
+  if (route.reconstruction !== null) pairs.set("reconstruction", route.reconstruction);
+  if (route.version !== null) pairs.set("version", String(route.version));
+  if (route.frame !== null) pairs.set("frame", String(route.frame));
+  if (route.camera !== null) pairs.set("camera", route.camera.map((x) => Number(x.toPrecision(5))).join(","));
+  if (route.ride) pairs.set("ride", "1");
+  if (route.search !== "") pairs.set("search", route.search);
+  const text = pairs.toString().replaceAll("%2C", ",");
+  return text === "" ? "./" : `./?${text}`;
+}
+
+let current = parseRoute(window.location.search);
+const listeners = new Set<() => void>();
+const subscribe = (listener: () => void): (() => void) => {
+  listeners.add(listener);
+  return () => listeners.delete(listener);
+};
+
+function set(route: Route, push: boolean): void {
+  if (formatRoute(route) === formatRoute(current)) return;
+  current = route;
+  window.history[push ? "pushState" : "replaceState"](null, "", formatRoute(route));
+  for (const listener of listeners) listener();
+}
+
+window.addEventListener("popstate", () => {
+  current = parseRoute(window.location.search);
+  for (const listener of listeners) listener();
+});
+
+/** Navigate, with a new history entry. The version is reset when the reconstruction changes. */
+export const go = (change: Partial<Route>): void =>
+  set({ ...current, ...("capture" in change || "reconstruction" in change ? { version: null } : {}), ...change }, true);
+/** Change parameters without a new history entry. */
+export const adjust = (change: Partial<Route>): void => set({ ...current, ...change }, false);
+export const route = (): Route => current;
+export const useRoute = (): Route => useSyncExternalStore(subscribe, route);
+
+/** Remove the token from the address, so that it is not in screenshots and bookmarks; the service has set its cookie. */
+export function dropToken(): void {
+  if (new URLSearchParams(window.location.search).has("token"))
+    window.history.replaceState(null, "", formatRoute(current));
+}

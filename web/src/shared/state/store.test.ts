@@ -1,0 +1,86 @@
+import { beforeEach, expect, it } from "vitest";
+
+import type { Capture, Message, Reconstruction } from "../api/types";
+import { ApiError } from "../api/http";
+import { progressText } from "./capture";
+import {
+  isAcquiring,
+  newestCapture,
+  newestReconstruction,
+  handleMessage,
+  activeJobs,
+  useService,
+  errorText,
+} from "./store";
+
+const initial = useService.getInitialState();
+beforeEach(() => useService.setState(initial, true));
+
+const capture = (id: string, more: Partial<Capture> = {}): Capture =>
+  ({ id, state: "streaming", deleted_at: null, counters: null, ...more }) as Capture;
+const job = (id: string, captureId: string, version: number): Reconstruction =>
+  ({ id, capture_id: captureId, version }) as Reconstruction;
+const message = (topic: string, data: unknown, ids: Partial<Message> = {}): Message =>
+  ({ seq: 1, topic, at: "", capture_id: null, reconstruction_id: null, data, ...ids }) as Message;
+
+it("shows the newest capture that is not deleted", () => {
+  const captures = { a: capture("a"), b: capture("b"), c: capture("c", { deleted_at: "2026-11-21T00:00:00Z" }) };
+  expect(newestCapture(captures)?.id).toBe("b");
+});
+
+it("shows the newest reconstruction that has a scene, and one without only if there is no other", () => {
+  const jobs = { x: job("x", "a", 3), y: job("y", "a", 0), z: job("z", "b", 9) };
+  expect(newestReconstruction(jobs, "a")?.id).toBe("x");
+  expect(newestReconstruction({ y: jobs.y }, "a")?.id).toBe("y");
+  expect(newestReconstruction(jobs, "c")).toBeNull();
+});
+
+it("follows a device that comes and goes", () => {
+  handleMessage(message("device", { id: "usb0", state: "idle" }));
+  handleMessage(message("device", { id: "usb0", state: "lost" }));
+  expect(useService.getState().devices).toEqual([{ id: "usb0", state: "lost" }]);
+});
+
+it("forgets the pictures of the capture before", () => {
+  handleMessage(message("preview", { kind: "rate", image: "1" }, { capture_id: "a" }));
+  handleMessage(message("preview", { kind: "interval", image: "2" }, { capture_id: "b" }));
+  expect(Object.keys(useService.getState().previews)).toEqual(["interval"]);
+  expect(useService.getState().previewOf).toBe("b");
+});
+
+it("puts what the service says into sentences for a person", () => {
+  const gone = new ApiError(
+    404,
+    "there is no capture 12; GET captures lists them",
+    "look for the id with the GET of the list",
+  );
+  expect(errorText(gone)).toBe("There is no capture 12. It may have been deleted.");
+  const full = new ApiError(507, "the disk is full", "remove recordings");
+  expect(errorText(full)).toBe("The disk is full. Remove recordings.");
+  expect(errorText(new ApiError(422, "/data/a.dat: cannot be read"))).toBe("/data/a.dat: cannot be read.");
+});
+
+it("lists those under way in the order of their turns, and says when each comes", () => {
+  const at = (id: string, state: string, queue_place: number | null, eta_s: number | null): Reconstruction =>
+    ({ id, capture_id: id, version: 0, state, queue_place, eta_s, progress: 0.4 }) as Reconstruction;
+  const jobs = {
+    c: at("c", "queued", 1, 90),
+    b: at("b", "queued", 2, null),
+    a: at("a", "running", null, 30),
+    d: at("d", "complete", null, null),
+  };
+  expect(activeJobs(jobs).map((one) => [one.id, progressText(one)])).toEqual([
+    ["a", "40\u202f%, about 30.0\u202fs left"],
+    ["c", "place 1 in the queue, about 1\u202fmin 30\u202fs left"],
+    ["b", "place 2 in the queue"],
+  ]);
+});
+
+it("takes a camera as free while its last capture only refines", () => {
+  expect(["starting", "streaming", "finishing", "complete"].map((state) => isAcquiring({ state } as Capture))).toEqual([
+    true,
+    true,
+    false,
+    false,
+  ]);
+});

@@ -1,0 +1,262 @@
+/** State of the service: from REST at the start and after every gap, from the WebSocket in between. */
+
+import { create } from "zustand";
+
+import * as calls from "../api/calls";
+import { Events, type ConnectionState } from "../api/events";
+import { ApiError, UnreachableError, onUnauthorized } from "../api/http";
+import type { Capture, Device, Message, Preview, Reconstruction, SceneEvent, System } from "../api/types";
+import { poses } from "./poses";
+
+const NEWEST = 20;
+/** Polling interval of REST without a WebSocket. */
+const POLL_MS = 2000;
+const SYSTEM_MS = 10_000;
+
+export interface ServiceState {
+  link: ConnectionState;
+  /** Connection error; null while the service answers. */
+  connectionError: string | null;
+  /** A token is required: no requests until sign-in. */
+  signedOut: boolean;
+  loaded: boolean;
+  devices: Device[];
+  /** Known captures by id; the table of all captures asks for its own pages. */
+  captures: Record<string, Capture>;
+  reconstructions: Record<string, Reconstruction>;
+  system: System | null;
+  /** Newest picture of each kind that came over the socket. */
+  previews: Record<string, Preview>;
+  /** Capture that `previews` show. */
+  previewOf: string | null;
+  /** Newest scene of each reconstruction. */
+  scenes: Record<string, SceneEvent>;
+  /** Frames a second, from the counters of the capture that runs. */
+  rateHz: number | null;
+}
+
+export const useService = create<ServiceState>(() => ({
+  link: { state: "connecting" },
+  connectionError: null,
+  signedOut: false,
+  loaded: false,
+  devices: [],
+  captures: {},
+  reconstructions: {},
+  system: null,
+  previews: {},
+  previewOf: null,
+  scenes: {},
+  rateHz: null,
+}));
+
+const { setState: set, getState: get } = useService;
+
+export const isFinished = (capture: Capture): boolean => capture.state === "complete" || capture.state === "failed";
+/** Whether the capture still takes frames; while it only refines, its device is free. */
+export const isAcquiring = (capture: Capture): boolean => capture.state === "starting" || capture.state === "streaming";
+export const isEnded = (job: Reconstruction): boolean => !["queued", "running"].includes(job.state);
+
+/** Ids are UUIDs of version 7: the largest is the newest. */
+export function newestCapture(captures: Record<string, Capture>): Capture | null {
+  let newest: Capture | null = null;
+  for (const one of Object.values(captures))
+    if (one.deleted_at === null && (newest === null || one.id > newest.id)) newest = one;
+  return newest;
+}
+
+/** The newest reconstruction of a capture; one with a scene goes before a later one that has none yet. */
+export function newestReconstruction(
+  jobs: Record<string, Reconstruction>,
+  captureId: string | null,
+): Reconstruction | null {
+  const own = Object.values(jobs)
+    .filter((job) => job.capture_id === captureId)
+    .sort((a, b) => (a.id < b.id ? 1 : -1));
+  return own.find((job) => job.version > 0) ?? own[0] ?? null;
+}
+
+/** Running reconstructions, then queued ones in order. */
+export const activeJobs = (jobs: Record<string, Reconstruction>): Reconstruction[] =>
+  Object.values(jobs)
+    .filter((job) => !isEnded(job))
+    .sort((a, b) => (a.queue_place ?? 0) - (b.queue_place ?? 0) || (a.id < b.id ? -1 : 1));
+
+let counted: { id: string; frames: number; atMs: number } | null = null;
+
+/** The acquisition rate, smoothed over about a second. */
+function measureRate(capture: Capture): number | null {
+  const frames = capture.counters?.next_frame;
+  if (frames === undefined || capture.state !== "streaming") {
+    counted = null;
+    return null;
+  }
+  const now = performance.now();
+  if (counted === null || counted.id !== capture.id || frames < counted.frames) {
+    counted = { id: capture.id, frames, atMs: now };
+    return null;
+  }
+  const elapsed = (now - counted.atMs) / 1000;
+  if (elapsed < 0.5) return get().rateHz;
+  const rate = (frames - counted.frames) / elapsed;
+  counted = { id: capture.id, frames, atMs: now };
+  return rate;
+}
+
+export function storeCapture(capture: Capture): void {
+  set((state) => ({
+    captures: { ...state.captures, [capture.id]: capture },
+    rateHz:
+      newestCapture({ ...state.captures, [capture.id]: capture })?.id === capture.id
+        ? measureRate(capture)
+        : state.rateHz,
+  }));
+}
+
+export function storeReconstruction(job: Reconstruction): void {
+  set((state) => ({ reconstructions: { ...state.reconstructions, [job.id]: job } }));
+}
+
+export function removeFromStore(id: string): void {
+  set((state) => ({ captures: Object.fromEntries(Object.entries(state.captures).filter(([key]) => key !== id)) }));
+}
+
+export function handleMessage(message: Message): void {
+  switch (message.topic) {
+    case "device": {
+      const device = message.data;
+      set((state) => ({
+        devices: state.devices.some((one) => one.id === device.id)
+          ? state.devices.map((one) => (one.id === device.id ? device : one))
+          : [...state.devices, device],
+      }));
+      return;
+    }
+    case "capture":
+      storeCapture(message.data);
+      return;
+    case "job":
+      storeReconstruction(message.data);
+      return;
+    case "pose":
+      poses.push(message.capture_id, message.data);
+      return;
+    case "scene":
+      if (message.reconstruction_id !== null) {
+        const id = message.reconstruction_id;
+        set((state) => ({ scenes: { ...state.scenes, [id]: message.data } }));
+      }
+      return;
+    case "preview":
+      set((state) => ({
+        previews: {
+          ...(state.previewOf === message.capture_id ? state.previews : {}),
+          [message.data.kind]: message.data,
+        },
+        previewOf: message.capture_id,
+      }));
+      return;
+    case "log":
+    case "lost":
+      return;
+  }
+}
+
+/** With a capital and a full stop, unless it begins with a path or ends with a sign already. */
+export const sentence = (text: string): string =>
+  text.replace(/^[a-z](?=[a-z]* )/, (c) => c.toUpperCase()).replace(/([^.!?…])$/, "$1.");
+
+/** Text of an error, for display. */
+export function errorText(error: unknown): string {
+  if (error instanceof ApiError) {
+    if (error.status === 401) return "This service requires a token.";
+    // `what_to_do` is then meant for API clients.
+    if (error.status === 404 && error.message.startsWith("there is no "))
+      return `${sentence(error.message.split(";")[0] ?? "")} It may have been deleted.`;
+    return error.whatToDo === null ? sentence(error.message) : `${sentence(error.message)} ${sentence(error.whatToDo)}`;
+  }
+  if (error instanceof UnreachableError) return error.message;
+  return error instanceof Error ? error.message : String(error);
+}
+
+const byId = (jobs: Reconstruction[]): Record<string, Reconstruction> =>
+  Object.fromEntries(jobs.map((job) => [job.id, job]));
+
+/** Only ended reconstructions: the service lists all others afresh. */
+const withoutUnfinished = (jobs: Record<string, Reconstruction>): Record<string, Reconstruction> =>
+  byId(Object.values(jobs).filter(isEnded));
+
+/** Fetch everything shown on more than one page. */
+export async function refresh(): Promise<void> {
+  try {
+    const [devices, captures, unfinished] = await Promise.all([
+      calls.devices(),
+      calls.captures({ limit: NEWEST }),
+      calls.unfinished(),
+    ]);
+    const known = Object.fromEntries(captures.items.map((one) => [one.id, one]));
+    set((state) => ({
+      devices,
+      captures: known,
+      reconstructions: { ...withoutUnfinished(state.reconstructions), ...byId(unfinished) },
+      loaded: true,
+      connectionError: null,
+    }));
+    const newest = newestCapture(known);
+    if (newest !== null) {
+      storeCapture(newest);
+      await loadReconstructions(newest.id);
+    }
+  } catch (error) {
+    set({ connectionError: errorText(error) });
+  }
+}
+
+export async function loadReconstructions(captureId: string): Promise<void> {
+  const jobs = await calls.reconstructions(captureId);
+  set((state) => ({
+    reconstructions: { ...state.reconstructions, ...byId(jobs) },
+  }));
+}
+
+async function refreshSystem(): Promise<void> {
+  try {
+    set({ system: await calls.system(), connectionError: null });
+  } catch (error) {
+    set({ connectionError: errorText(error) });
+  }
+}
+
+onUnauthorized(() => set({ signedOut: true }));
+/** The scope may be another one: it is unknown until the service states it. */
+export const signedIn = (): void => set({ signedOut: false, connectionError: null, system: null });
+
+/** Start following the service; returns a function that stops it. */
+export function follow(): () => void {
+  const events = new Events({
+    onMessage: handleMessage,
+    onLink: (link) => {
+      const before = get().link.state;
+      set({ link });
+      if (link.state === "open" && before !== "open") {
+        void refresh();
+        void refreshSystem();
+      }
+    },
+    onGap: () => void refresh(),
+  });
+  void refresh();
+  void refreshSystem();
+  events.open();
+  const polling = setInterval(() => {
+    if (get().link.state !== "open" && !document.hidden) void refresh();
+  }, POLL_MS);
+  const system = setInterval(() => {
+    if (!document.hidden) void refreshSystem();
+  }, SYSTEM_MS);
+  return () => {
+    clearInterval(polling);
+    clearInterval(system);
+    events.close();
+  };
+}

@@ -55,8 +55,8 @@ class Daemon:
         for child in psutil.Process(self.process.pid).children():
             with suppress(psutil.NoSuchProcess):
                 words = child.cmdline()  # empty for a zombie, and without the role just after a fork
-                if words[1:3] == ["-m", "spiked_service.worker"]:
-                    found.setdefault(words[3], child)  # the oldest: a spare recorder stands by
+                if "spiked_service.workers" in words[1:-1]:
+                    found.setdefault(words[-1], child)  # the oldest: a spare recorder stands by
         return found
 
     def close(self) -> None:

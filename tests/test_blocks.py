@@ -1,4 +1,4 @@
-"""The native reductions against plain NumPy, on random bits and on real recordings, for every instruction set."""
+"""Spike-aligned windows against plain NumPy, on random bits and on real recordings, for every instruction set."""
 
 import os
 import subprocess
@@ -12,17 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from spiked.blocks import (
-    Block,
-    Window,
-    aligned_window,
-    benchmark,
-    instruction_sets,
-    merge,
-    reduce_block,
-    reduce_blocks,
-    unpack,
-)
+from spiked.blocks import Window, aligned_window, benchmark, instruction_sets, unpack
 from spiked.sensor import BitOrder, Layout, Sensor
 
 REAL = Path(__file__).parents[2] / "shared" / "real"
@@ -46,13 +36,6 @@ def random_bits(rng: np.random.Generator, n: int, height: int, width: int) -> Bi
     """Bits whose rate differs from pixel to pixel, from never to nearly always."""
     rate = rng.choice([0.0, 0.01, 0.03, 0.1, 0.3, 0.9], (height, width))
     return rng.random((n, height, width)) < rate
-
-
-def naive_block(bits: Bits) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]:
-    fired = bits.any(axis=0)
-    first = np.where(fired, bits.argmax(axis=0), 255)
-    last = np.where(fired, len(bits) - 1 - bits[::-1].argmax(axis=0), 255)
-    return bits.sum(axis=0, dtype=np.uint8), first.astype(np.uint8), last.astype(np.uint8)
 
 
 def naive_window(times: NDArray[np.int64], begin: int, end: int) -> tuple[int, int, int]:
@@ -127,22 +110,6 @@ sensors = st.builds(
 
 
 @settings(max_examples=30, deadline=None)
-@given(sensor=sensors, n=st.integers(1, 21), seed=st.integers(0, 2**32 - 1))
-def test_blocks_equal_numpy_for_any_sensor(sensor: Sensor, n: int, seed: int) -> None:
-    bits = random_bits(np.random.default_rng(seed), n, sensor.height, sensor.width)
-    for name in SETS:
-        blocks = reduce_blocks(stored(bits, sensor), sensor, 40, instruction_set=name)
-        assert len(blocks) == -(-n // 8)
-        for i in range(len(blocks)):
-            block = blocks[i]
-            assert block.first_frame == 40 + 8 * i
-            for got, want in zip(
-                (block.count, block.first, block.last), naive_block(bits[8 * i : 8 * i + 8]), strict=True
-            ):
-                np.testing.assert_array_equal(got, want, err_msg=name)
-
-
-@settings(max_examples=30, deadline=None)
 @given(sensor=sensors, data=st.data(), seed=st.integers(0, 2**32 - 1))
 def test_windows_equal_numpy_for_any_sensor(sensor: Sensor, data: st.DataObject, seed: int) -> None:
     n = data.draw(st.integers(1, 60))
@@ -168,7 +135,7 @@ def test_windows_equal_numpy_on_many_pixels_and_long_runs(name: str, n: int, beg
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real recordings in ../shared/real are not here")
 @pytest.mark.parametrize("name", SETS)
-def test_both_are_exact_on_a_real_recording(name: str) -> None:
+def test_windows_are_exact_on_a_real_recording(name: str) -> None:
     sensor = Sensor(400, 250, 20_000.0)
     frames = np.memmap(REAL / "reds_rocks.dat", np.uint8, "r").reshape(-1, sensor.frame_bytes)[100:150]
     bits = np.unpackbits(frames, axis=1, bitorder="little").reshape(-1, 250, 400)[:, ::-1].astype(bool)
@@ -177,58 +144,13 @@ def test_both_are_exact_on_a_real_recording(name: str) -> None:
     np.testing.assert_array_equal(window.spikes.ravel(), spikes)
     np.testing.assert_array_equal(window.start.ravel(), start + 100)
     np.testing.assert_array_equal(window.stop.ravel(), stop + 100)
-    block = reduce_block(frames[:8], sensor, 100, instruction_set=name)
-    for got, want in zip((block.count, block.first, block.last), naive_block(bits[:8]), strict=True):
-        np.testing.assert_array_equal(got, want)
 
 
 def test_strided_views_are_read_in_place() -> None:
     sensor = Sensor(64, 3, 20_000.0)
     bits = random_bits(np.random.default_rng(3), 16, 3, 64)
     view = stored(bits, sensor)[::2]
-    np.testing.assert_array_equal(reduce_block(view, sensor, 0).count, bits[::2].sum(axis=0))
-
-
-def split(bits: Bits, cuts: list[int], sensor: Sensor) -> list[Block]:
-    blocks = []
-    for begin, end in zip([0, *cuts], [*cuts, len(bits)], strict=True):
-        run = Block.empty(begin, sensor.height, sensor.width)
-        for k in range(begin, end, 8):
-            run = merge(run, reduce_block(stored(bits[k : min(k + 8, end)], sensor), sensor, k))
-        blocks.append(run)
-    return blocks
-
-
-def assert_same(a: Block, b: Block) -> None:
-    assert (a.first_frame, a.frames) == (b.first_frame, b.frames)
-    for got, want in ((a.count, b.count), (a.first, b.first), (a.last, b.last)):
-        np.testing.assert_array_equal(got, want)
-
-
-@settings(max_examples=40, deadline=None)
-@given(data=st.data(), seed=st.integers(0, 2**32 - 1))
-def test_merge_is_a_monoid(data: st.DataObject, seed: int) -> None:
-    sensor = Sensor(16, 2, 20_000.0)
-    n = data.draw(st.integers(3, 80))
-    cuts = sorted(data.draw(st.lists(st.integers(0, n), min_size=2, max_size=2)))
-    bits = random_bits(np.random.default_rng(seed), n, 2, 16)
-    a, b, c = split(bits, cuts, sensor)
-    assert_same(merge(merge(a, b), c), merge(a, merge(b, c)))
-    assert_same(merge(Block.empty(0, 2, 16), a), a)
-    assert_same(merge(c, Block.empty(n, 2, 16)), c)
-    whole = merge(merge(a, b), c)
-    fired = bits.any(axis=0)
-    np.testing.assert_array_equal(whole.count, bits.sum(axis=0))
-    np.testing.assert_array_equal(whole.first, np.where(fired, bits.argmax(axis=0), whole.never))
-    np.testing.assert_array_equal(whole.last, np.where(fired, n - 1 - bits[::-1].argmax(axis=0), whole.never))
-
-
-def test_merge_refuses_a_gap() -> None:
-    with pytest.raises(ValueError, match="frames 8 to 16"):
-        merge(
-            reduce_block(np.zeros((8, 2), np.uint8), Sensor(16, 1, 1.0), 0),
-            reduce_block(np.zeros((8, 2), np.uint8), Sensor(16, 1, 1.0), 16),
-        )
+    check_window(aligned_window(view, sensor, 0, 2, 6), bits[::2])
 
 
 def one_pixel(times: list[int], begin: int, end: int) -> Window:
@@ -243,8 +165,6 @@ def test_a_regular_pixel_gives_its_rate_and_time_centre() -> None:
     assert (window.spikes[0, 0], window.start[0, 0], window.stop[0, 0], window.count[0, 0]) == (3, 108, 123, 3)
     assert window.rate()[0, 0] == np.float32(0.2)
     assert window.centre()[0, 0] == 116.0
-    # p = 0.2, m = 3, T = 15
-    assert window.variance(jitter=0.01)[0, 0] == pytest.approx((0.04 / 6 + 0.03 + 0.0009) / 225, rel=1e-5)
 
 
 def test_equal_distances_take_the_outer_spikes() -> None:
@@ -264,7 +184,7 @@ def test_without_an_interval_there_is_a_bound_instead_of_a_rate() -> None:
     silent, once = one_pixel([], 10, 20), one_pixel([14], 10, 20)
     assert not silent.valid.any()
     assert not once.valid.any()
-    assert np.isnan(once.rate()[0, 0]) and np.isnan(once.centre()[0, 0]) and np.isnan(once.variance()[0, 0])
+    assert np.isnan(once.rate()[0, 0]) and np.isnan(once.centre()[0, 0])
     assert silent.rate_bound()[0, 0] == np.float32(1 / 40)
     assert once.rate_bound()[0, 0] == np.float32(2 / 40)
     assert once.rate(fill=True)[0, 0] == np.float32(1 / 40)
@@ -279,12 +199,12 @@ def test_a_window_outside_the_frames_is_refused(begin: int, end: int) -> None:
 
 def test_frames_of_another_sensor_are_refused() -> None:
     with pytest.raises(ValueError, match=r"uint8 \[n, 2\]"):
-        reduce_block(np.zeros((8, 3), np.uint8), Sensor(16, 1, 1.0), 0)
+        aligned_window(np.zeros((8, 3), np.uint8), Sensor(16, 1, 1.0), 0, 2, 6)
 
 
-def test_benchmark_measures_both_operations_on_every_instruction_set() -> None:
+def test_benchmark_measures_every_instruction_set() -> None:
     rows = benchmark(repeats=1)
-    assert len(rows) == 4 * len(SETS)
+    assert len(rows) == 2 * len(SETS)
     assert all(row.ns_per_frame > 0 and row.memcpy_ratio > 0 for row in rows)
 
 

@@ -11,16 +11,17 @@ from pathlib import Path
 import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
-from spiked_service.config import Settings, load_settings
-from spiked_service.events import Bus
-from spiked_service.health import Health, Verdict
-from spiked_service.limits import Gate
-from spiked_service.metrics import Metrics, Reading, Readings
+from spiked_service.base.health import CheckStatus, Health
+from spiked_service.base.limits import ConcurrencyLimit
+from spiked_service.events.bus import Bus
+from spiked_service.operations.metrics import CaptureSample, Metrics, MetricsSource
+from spiked_service.settings.settings import Settings, load_settings
 from spiked_service.store.rows import ConsumerCounters, Counters
 
 from spiked.ring import DeviceState, Policy
 
 DEPLOY = Path(__file__).parents[1] / "deploy"
+GPU = DEPLOY.parent / "evaluation/gpu"
 
 
 def exposed() -> set[str]:
@@ -28,15 +29,15 @@ def exposed() -> set[str]:
     consumer = ConsumerCounters("recorder", Policy.PRIORITY, 8, 0, 0, 0.0, False)
     counters = Counters(DeviceState.STREAMING, "", 8, {"usb": 0}, 8, (consumer,))
     health = Health()
-    health.add("disk", lambda: (Verdict.OK, ""))
-    readings = Readings(
-        lambda: [Reading("a", "usb0", counters, over=False)],
+    health.add("disk", lambda: (CheckStatus.OK, ""))
+    source = MetricsSource(
+        lambda: [CaptureSample("a", "usb0", counters, over=False)],
         lambda: {"streaming": 1},
         lambda: {"queued": 1},
         lambda: {"recorder": 1},
         lambda: Path("/"),
     )
-    metrics = Metrics(readings, Bus(), health, Gate("renders", 1), Gate("event clients", 1))
+    metrics = Metrics(source, Bus(), health, {"renders": ConcurrencyLimit("renders", 1)})
     metrics.request_s.labels("GET", "/", "200").observe(0.01)
     families = text_string_to_metric_families(metrics.exposition().decode())
     return {sample.name for family in families for sample in family.samples}
@@ -84,8 +85,39 @@ def test_systemd_reads_the_unit(tmp_path: Path) -> None:
         pytest.skip("needs systemd-analyze")
     unit = tmp_path / "spiked.service"
     unit.write_text((DEPLOY / "systemd/spiked.service").read_text().replace("/opt/spiked/bin/spiked", sys.executable))
+    command = ["systemd-analyze", "verify", "--man=no", "--generators=no", str(unit)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    unit.write_text(unit.read_text().replace("[Service]", "[Service]\nExecStop=/nowhere/at/all"))
+    assert "/nowhere/at/all" in subprocess.run(command, capture_output=True, text=True, check=False).stderr
+
+
+@pytest.mark.slow
+def test_the_gpu_measurement_installs_a_wheel_and_takes_its_modules(tmp_path: Path) -> None:
+    """Started in the tree, whose own `spiked` must not be found first. Packages are those of this environment."""
+    venv = tmp_path / "venv"
+    subprocess.run([sys.executable, "-m", "venv", str(venv)], check=True)
+    site = venv / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
+    packages = [path for path in sys.path if path.endswith("site-packages")]
+    (site / "packages.pth").write_text("\n".join(packages) + "\n")
     done = subprocess.run(
-        ["systemd-analyze", "verify", "--man=no", "--generators=no", str(unit)],
-        capture_output=True, text=True, check=False,
+        ["sh", str(GPU / "install.sh"), str(venv)],
+        env={**os.environ, "EXTRAS": "", "PIP_NO_BUILD_ISOLATION": "0", "PIP_NO_INDEX": "1"},
+        cwd=DEPLOY.parent, capture_output=True, text=True, check=False,
     )  # fmt: skip
-    assert "spiked.service" not in done.stderr, done.stderr
+    assert done.returncode == 0, done.stderr
+    assert re.search(rf"^\d+ compiled modules from {re.escape(str(site))}/spiked/native$", done.stdout, re.MULTILINE)
+    told = subprocess.run([venv / "bin" / "spiked", "version"], cwd="/", capture_output=True, text=True, check=True)
+    assert "renderer: cpu" in told.stdout
+
+
+def test_the_gpu_measurement_asks_for_what_it_needs(tmp_path: Path) -> None:
+    script = str(GPU / "measure.sh")
+    told = subprocess.run(["sh", script], capture_output=True, text=True, check=False)
+    assert told.returncode != 0 and "usage: evaluation/gpu/measure.sh STREAMS" in told.stderr
+    for tool in ("realpath", "dirname"):
+        (tmp_path / tool).symlink_to(shutil.which(tool) or tool)
+    told = subprocess.run(
+        ["/bin/sh", script, str(tmp_path)], env={"PATH": str(tmp_path)}, capture_output=True, text=True, check=False
+    )
+    assert told.returncode == 1 and "nvcc is not in PATH" in told.stderr

@@ -1,4 +1,5 @@
-"""Scores are zero for a perfect estimate, known for a known error, and those of the streams' own scoring."""
+"""Scores are zero for a perfect estimate, known for a known error, and equal to those of evo, scikit-image and the
+streams' own scoring."""
 
 import importlib.util
 import sys
@@ -7,10 +8,14 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from evo.core import metrics
+from evo.core.trajectory import PosePath3D
 from numpy.typing import NDArray
+from skimage.metrics import structural_similarity
 
 from spiked.errors import ConfigurationError
 from spiked.evaluate import (
+    RPE_FRAMES,
     Similarity,
     best_gain,
     pose_errors,
@@ -22,7 +27,7 @@ from spiked.evaluate import (
     ssim,
     umeyama,
 )
-from spiked.pose import exp_so3
+from spiked.pose import exp_so3, quaternion
 from spiked.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -61,7 +66,7 @@ def score() -> ModuleType:
 @pytest.mark.parametrize("carry", [Similarity(1.0, np.eye(3), np.zeros(3)), CARRY], ids=["same", "other world"])
 def test_the_truth_in_any_world_has_no_error(carry: Similarity) -> None:
     rotations, centres = path()
-    errors = pose_errors(rotations, centres, *carry.poses(rotations, centres))
+    errors = pose_errors(truth=(rotations, centres), estimate=carry.poses(rotations, centres))
     assert errors.ate_percent < 1e-9
     assert errors.ate_unit < 1e-12
     assert errors.rpe_r_deg < 1e-5
@@ -71,7 +76,7 @@ def test_the_truth_in_any_world_has_no_error(carry: Similarity) -> None:
 def test_a_known_turn_between_frames_is_found() -> None:
     _, centres = path()
     drift = exp_so3(np.outer(np.arange(200), [0, 0, np.radians(0.01)]))
-    errors = pose_errors(np.tile(np.eye(3), (200, 1, 1)), centres, drift, centres)
+    errors = pose_errors(truth=(np.tile(np.eye(3), (200, 1, 1)), centres), estimate=(drift, centres))
     assert errors.rpe_r_deg == pytest.approx(0.32, rel=1e-6)
     assert errors.ate_percent < 1e-9
 
@@ -80,26 +85,28 @@ def test_isotropic_noise_shows_as_its_share_of_the_radius() -> None:
     rotations, centres = path(4000)
     radius = np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean())
     wrong = centres + 0.01 * radius * np.random.default_rng(1).standard_normal(centres.shape)
-    assert pose_errors(rotations, centres, rotations, wrong).ate_percent == pytest.approx(np.sqrt(3), rel=0.03)
+    assert pose_errors(truth=(rotations, centres), estimate=(rotations, wrong)).ate_percent == pytest.approx(
+        np.sqrt(3), rel=0.03
+    )
 
 
 def test_a_camera_that_never_moves_scores_as_documented() -> None:
     rotations, centres = path()
-    assert pose_errors(rotations, centres, rotations, np.zeros_like(centres)).ate_unit == pytest.approx(
-        0.2041, abs=1e-4
-    )
+    assert pose_errors(
+        truth=(rotations, centres), estimate=(rotations, np.zeros_like(centres))
+    ).ate_unit == pytest.approx(0.2041, abs=1e-4)
 
 
 def test_a_truth_that_never_moves_is_refused() -> None:
     rotations, centres = path()
     with pytest.raises(ConfigurationError, match="never moves"):
-        pose_errors(rotations, np.ones_like(centres), rotations, centres)
+        pose_errors(truth=(rotations, np.ones_like(centres)), estimate=(rotations, centres))
 
 
 def test_a_straight_path_is_carried_over_by_its_orientations() -> None:
     rotations, _ = path()
     centres = np.outer(np.linspace(0, 1, 200), [1.0, 2.0, 0.5])
-    found = similarity_of_poses(rotations, centres, *CARRY.poses(rotations, centres))
+    found = similarity_of_poses(truth=(rotations, centres), estimate=CARRY.poses(rotations, centres))
     assert found.scale == pytest.approx(CARRY.scale)
     assert np.allclose(found.rotation, CARRY.rotation)
     assert np.allclose(found.translation, CARRY.translation)
@@ -107,7 +114,7 @@ def test_a_straight_path_is_carried_over_by_its_orientations() -> None:
 
 def test_a_mirrored_cloud_is_never_matched_by_a_mirror() -> None:
     points = np.random.default_rng(0).standard_normal((50, 3))
-    assert np.linalg.det(umeyama(points, points * [1, 1, -1]).rotation) == pytest.approx(1)
+    assert np.linalg.det(umeyama(source=points, target=points * [1, 1, -1]).rotation) == pytest.approx(1)
 
 
 def test_coverage_counts_frames_by_time() -> None:
@@ -115,14 +122,23 @@ def test_coverage_counts_frames_by_time() -> None:
     times = (np.arange(200) + 0.5) / 20000
     truth = Trajectory(times, rotations, centres)
     half = Trajectory(times[50:150] + 0.2 / 20000, rotations[50:150], centres[50:150])
-    result = score_trajectory(truth, half, 20000)
+    result = score_trajectory(truth=truth, estimate=half, frame_rate_hz=20000)
     assert result.coverage == 0.5
     assert result.errors is not None and result.errors.ate_percent < 1e-9
     few = Trajectory(times[:20], rotations[:20], centres[:20])
-    assert score_trajectory(truth, few, 20000).errors is None
+    assert score_trajectory(truth=truth, estimate=few, frame_rate_hz=20000).errors is None
     elsewhere = Trajectory(times + 1, rotations, centres)
     with pytest.raises(ConfigurationError, match="time stamps"):
-        similarity_of_trajectories(truth, elsewhere, 20000)
+        similarity_of_trajectories(truth=truth, estimate=elsewhere, frame_rate_hz=20000)
+
+
+def test_truth_and_estimate_cannot_be_swapped_unnoticed() -> None:
+    rotations, centres = path()
+    truth = Trajectory((np.arange(200) + 0.5) / 20000, rotations, centres)
+    for function in (score_trajectory, similarity_of_trajectories, pose_errors, similarity_of_poses, umeyama):
+        with pytest.raises(TypeError, match="positional"):
+            function(truth, truth)
+    assert best_gain([0.5 * centres], truths=[centres]) == pytest.approx(2)
 
 
 def test_known_differences_have_known_psnr() -> None:
@@ -130,7 +146,7 @@ def test_known_differences_have_known_psnr() -> None:
     assert psnr(image + 0.1, image) == pytest.approx(20)
     assert psnr(image, image) == pytest.approx(120)
     assert ssim(image, image) == pytest.approx(1)
-    assert best_gain([0.25 * image], [image]) == pytest.approx(4)
+    assert best_gain([0.25 * image], truths=[image]) == pytest.approx(4)
 
 
 def test_a_view_with_a_small_pose_error_is_refined_to_the_truth() -> None:
@@ -146,12 +162,50 @@ def test_a_view_with_a_small_pose_error_is_refined_to_the_truth() -> None:
     truth = (np.eye(3), np.zeros(3))
     wrong = (exp_so3(np.array([0.004, -0.006, 0.01])), np.array([0.01, 0.0, 0.0]))
     picture = (0.5 * render(*truth)).astype(np.float32)
-    plain = score_views(render, [wrong], [picture], length=2.0, refine=False)
-    refined = score_views(render, [wrong], [picture], length=2.0)
+    plain = score_views(render, poses=[wrong], truths=[picture], length=2.0, refine=False)
+    refined = score_views(render, poses=[wrong], truths=[picture], length=2.0)
     assert plain.mean_psnr_db < 40
     assert refined.mean_psnr_db > 60
     assert refined.gain == pytest.approx(0.5, rel=1e-3)
     assert refined.mean_ssim > 0.9999
+
+
+def test_ate_and_rpe_are_those_of_evo() -> None:
+    rotations, centres = path()
+    moved, places = noisy(*CARRY.poses(rotations, centres))
+    ours = pose_errors(truth=(rotations, centres), estimate=(moved, places))
+    truth = PosePath3D(positions_xyz=centres, orientations_quat_wxyz=quaternion(rotations))
+    estimate = PosePath3D(positions_xyz=places, orientations_quat_wxyz=quaternion(moved))
+    estimate.align(truth, correct_scale=True)
+    ate = metrics.APE(metrics.PoseRelation.translation_part)
+    ate.process_data((truth, estimate))
+    radius = np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean())
+    assert ours.ate_percent == pytest.approx(100 * ate.get_statistic(metrics.StatisticsType.rmse) / radius, rel=1e-9)
+    for relation, figure in (
+        (metrics.PoseRelation.rotation_angle_deg, ours.rpe_r_deg),
+        (metrics.PoseRelation.translation_part, ours.rpe_t_percent * radius / 100),
+    ):
+        rpe = metrics.RPE(relation, delta=RPE_FRAMES, delta_unit=metrics.Unit.frames, all_pairs=True)
+        rpe.process_data((truth, estimate))
+        assert figure == pytest.approx(rpe.get_statistic(metrics.StatisticsType.mean), rel=1e-9)
+
+
+@pytest.mark.parametrize("shape", [(40, 60), (40, 60, 3)], ids=["grey", "colour"])
+def test_ssim_is_that_of_scikit_image(shape: tuple[int, ...]) -> None:
+    """scikit-image leaves out a margin of 5 px in its mean, so the image's own margin is a mirror image there."""
+    rng = np.random.default_rng(3)
+    image = rng.random(shape)
+    other = np.clip(image + 0.1 * rng.standard_normal(shape), 0, 1)
+    margin = [(5, 5), (5, 5), (0, 0)][: len(shape)]
+    theirs = structural_similarity(
+        *(np.pad(one, margin, mode="symmetric") for one in (other, image)),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=2 if len(shape) == 3 else None,
+    )
+    assert ssim(other, image) == pytest.approx(theirs, abs=1e-9)
 
 
 @needs_score
@@ -159,14 +213,14 @@ def test_pose_figures_are_those_of_the_scoring_script(score: ModuleType) -> None
     truth = Trajectory.read_tum(SHARED / "streams" / "living" / "groundtruth.tum")
     rotations, centres = noisy(*CARRY.poses(truth.rotations, truth.centres))
     estimate = Trajectory(truth.times_s, rotations, centres)
-    ours = pose_errors(truth.rotations, truth.centres, rotations, centres)
+    ours = pose_errors(truth=(truth.rotations, truth.centres), estimate=(rotations, centres))
     theirs = score.pose_errors(truth.matrices(), estimate.matrices())
     assert ours.ate_percent == pytest.approx(theirs["ate_percent"], abs=1e-6)
     assert ours.ate_unit == pytest.approx(theirs["ate_unit_24"], abs=1e-6)
     assert ours.rpe_r_deg == pytest.approx(theirs["rpe_r_deg"], abs=1e-6)
     assert ours.rpe_t_percent == pytest.approx(theirs["rpe_t_percent"], abs=1e-6)
     scale, rotation, translation = score.similarity_to_estimate(truth.matrices(), estimate.matrices())
-    found = similarity_of_trajectories(truth, estimate, 20000)
+    found = similarity_of_trajectories(truth=truth, estimate=estimate, frame_rate_hz=20000)
     assert found.scale == pytest.approx(scale)
     assert np.allclose(found.rotation, rotation)
     assert np.allclose(found.translation, translation)

@@ -66,6 +66,7 @@ def test_bad_tum_files_are_refused(text: str, tmp_path: Path) -> None:
 def test_ply_round_trip(scene: Scene, tmp_path: Path, white: float) -> None:
     scene.write_ply(tmp_path / "s.ply", white)
     back = Scene.read_ply(tmp_path / "s.ply")
+    assert back.white == white
     np.testing.assert_allclose(back.colours, scene.colours, atol=1e-6)
     np.testing.assert_allclose(back.quats, scene.quats / np.linalg.norm(scene.quats, axis=1, keepdims=True), atol=1e-6)
     for a, b in zip(
@@ -76,6 +77,14 @@ def test_ply_round_trip(scene: Scene, tmp_path: Path, white: float) -> None:
         np.testing.assert_array_equal(a, b)
 
 
+def test_a_ply_of_another_program_does_not_say_its_radiance(scene: Scene, tmp_path: Path) -> None:
+    scene.write_ply(tmp_path / "s.ply")
+    assert b"radiance" not in (tmp_path / "s.ply").read_bytes()
+    back = Scene.read_ply(tmp_path / "s.ply")
+    assert back.white is None and back.colour_of_white == 1
+    assert back.select(np.arange(3)).join(back).white is None
+
+
 def test_bad_scenes_are_refused(scene: Scene, tmp_path: Path) -> None:
     file = tmp_path / "s.ply"
     good = scene.ply()
@@ -83,6 +92,7 @@ def test_bad_scenes_are_refused(scene: Scene, tmp_path: Path) -> None:
         "not a PLY": b"hello",
         "cut short": good[:-10],
         "only binary_little_endian": good.replace(b"binary_little_endian", b"ascii"),
+        "must be a positive number": scene.ply(0.3).replace(b"radiance 0.3", b"radiance nan"),
         "no property 'opacity'": good.replace(b"opacity", b"opasity"),
     }
     for message, raw in broken.items():

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from spiked_service.cli import app
+from spiked_service.cli.main import app
 from typer.testing import CliRunner
 
 from spiked.errors import RecordingError
@@ -54,7 +54,7 @@ def test_independent_spikes_are_binomial(tmp_path: Path) -> None:
 def test_the_command_prints_a_table_and_writes_json(ramps: Path, tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["noise-report", str(ramps), "--json", str(tmp_path / "noise.json")])
     assert result.exit_code == 0, result.output
-    assert "variance of counts" in result.output and "5.00 frames from spike to spike" in result.output
+    assert "variance of counts" in result.output and "5.00 +- 0.00 frames from spike to spike" in result.output
     assert len(json.loads((tmp_path / "noise.json").read_text())["windows"]) == 5
 
 

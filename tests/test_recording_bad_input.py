@@ -119,7 +119,7 @@ def test_less_than_a_frame(tmp_path: Path) -> None:
     [
         ({"width": 400}, "both width and height"),
         ({"width": 401, "height": 250}, "multiple of 8"),
-        ({"width": 400, "height": 250, "frame_rate_hz": -1.0}, "not positive"),
+        ({"width": 400, "height": 250, "frame_rate_hz": -1.0}, "not a positive number"),
     ],
 )
 def test_impossible_arguments(tmp_path: Path, given: dict[str, Any], match: str) -> None:
@@ -132,7 +132,7 @@ def test_truncated_last_frame_is_a_warning(recorded: Path) -> None:
         file.truncate(4 * 12_500 - 1)
     recording = open_recording(recorded)
     assert recording.frames == 3
-    assert recording.warnings == ("the last frame is truncated to 12499 of 12500 bytes and is left out",)
+    assert recording.warnings == ("the last frame is truncated to 12499 of 12500 bytes and is ignored",)
     result = verify(recorded)
     assert (result.verdict, result.reasons) == ("degraded", recording.warnings)
 

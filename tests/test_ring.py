@@ -12,14 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spiked.ring import (
-    Cause,
-    Condition,
     DeviceState,
+    DeviceStatus,
     End,
     EndReason,
     Frames,
     Gap,
     Item,
+    LossCause,
     Policy,
     Ring,
     RingError,
@@ -86,13 +86,13 @@ def test_frames_and_gaps_come_in_order(writer: RingWriter) -> None:
     reader = attach(writer)
     put(writer, 8)
     put(writer, 5)
-    writer.gap(100, Cause.USB)
-    writer.gap(7, Cause.DEVICE)
+    writer.gap(100, LossCause.USB)
+    writer.gap(7, LossCause.DEVICE)
     put(writer, 8)
     writer.end(EndReason.FINISHED)
     items = drain(reader)
     assert spans(items) == [(0, 8), (8, 5), (13, 100), (113, 7), (120, 8)]
-    assert items[2:4] == [Gap(13, 100, Cause.USB), Gap(113, 7, Cause.DEVICE)]
+    assert items[2:4] == [Gap(13, 100, LossCause.USB), Gap(113, 7, LossCause.DEVICE)]
     assert items[-1] == End(128, EndReason.FINISHED)
 
 
@@ -140,7 +140,7 @@ def test_an_overrun_lossless_reader_gets_a_gap_and_is_marked_until_it_catches_up
         put(writer, 8)
     gap = reader.next(0)
     assert isinstance(gap, Gap)
-    assert (gap.first, gap.cause) == (8, Cause.RING)
+    assert (gap.first, gap.cause) == (8, LossCause.RING)
     status = writer.status().readers[0]
     assert status.lagging
     assert (status.overruns, status.lost) == (1, gap.count)
@@ -163,7 +163,7 @@ def test_the_latest_policy_skips_to_the_newest_block_and_says_how_much(writer: R
     gap = reader.next(0)
     put(writer, 8)  # the block promised by the gap comes, even if a newer one is there by now
     frames = reader.next(0)
-    assert gap == Gap(0, 32, Cause.RING)
+    assert gap == Gap(0, 32, LossCause.RING)
     assert isinstance(frames, Frames)
     assert frames.first == 32
 
@@ -192,7 +192,7 @@ def test_a_view_tells_when_it_was_overwritten_and_its_frames_count_as_lost(write
     assert not frames.release()
     gap = reader.next(0)
     assert isinstance(gap, Gap)
-    assert (gap.first, gap.cause) == (0, Cause.RING)
+    assert (gap.first, gap.cause) == (0, LossCause.RING)
 
 
 def test_a_view_overwritten_at_the_end_of_the_capture_is_told_of_before_the_end(writer: RingWriter) -> None:
@@ -205,7 +205,7 @@ def test_a_view_overwritten_at_the_end_of_the_capture_is_told_of_before_the_end(
     writer.end(EndReason.FINISHED)
     items = drain(reader)
     assert assert_contiguous(items) == 17 * 8
-    assert items[0] == Gap(0, 128, Cause.RING)
+    assert items[0] == Gap(0, 128, LossCause.RING)
 
 
 def test_as_context_manager_frames_say_afterwards_whether_they_were_whole(writer: RingWriter) -> None:
@@ -222,7 +222,7 @@ def test_as_context_manager_frames_say_afterwards_whether_they_were_whole(writer
 def test_a_storm_of_gaps_without_frames_keeps_the_account(writer: RingWriter) -> None:
     reader = attach(writer)
     for _ in range(1000):
-        writer.gap(3, Cause.DEVICE)
+        writer.gap(3, LossCause.DEVICE)
     writer.end(EndReason.STOPPED)
     items = drain(reader)
     assert assert_contiguous(items) == 3000
@@ -234,12 +234,12 @@ def test_slots_acquired_ahead_are_committed_in_order_with_gaps_between(writer: R
     second[:] = 2
     first[:] = 1
     writer.commit(8)
-    writer.gap(8, Cause.USB)
+    writer.gap(8, LossCause.USB)
     writer.commit(8)
     values = []
     while (item := reader.next(0)) is not None:
         values.append(int(item.data[0, 0]) if isinstance(item, Frames) else item)
-    assert values == [1, Gap(8, 8, Cause.USB), 2]
+    assert values == [1, Gap(8, 8, LossCause.USB), 2]
 
 
 def test_a_writer_that_can_wait_has_room_while_no_reader_would_lose(writer: RingWriter) -> None:
@@ -272,7 +272,7 @@ def test_a_successor_may_begin_before_what_a_killed_reader_gave_back(writer: Rin
     start = given_back - 8 * (slots // 4)
     successor = RingReader.attach(writer.name, Policy.PRIORITY, "test", start)
     before, *items = drain(successor)
-    assert before == Gap(0, start, Cause.RING)
+    assert before == Gap(0, start, LossCause.RING)
     assert items and [type(item) for item in items] == [Frames] * len(items)
     successor.close()
 
@@ -308,23 +308,23 @@ def test_a_ring_that_is_held_is_gone_on_with(dying: "subprocess.Popen[str]") -> 
     name = dying.stdout.readline().strip()
     outside, reader = Ring.attach(name), RingReader.attach(name, Policy.LOSSLESS, "test", 0)
     dying.communicate("die\n")
-    assert outside.hold("it died")
-    assert clean_stale() == []
+    assert outside.claim_for_successor("it died")
+    assert name not in clean_stale()
     counts = []
     while isinstance(item := reader.next(0.7), Frames):
         counts.append(item.count)
     assert (counts, item) == ([8, 8, 5], None)
-    assert outside.status().writer.condition == Condition(DeviceState.LOST, "it died")
+    assert outside.status().writer.device_status == DeviceStatus(DeviceState.LOST, "it died")
     successor = RingWriter.take_over(name)
-    successor.gap(16, Cause.USB)
+    successor.gap(16, LossCause.USB)
     successor.acquire()[:] = 3
     successor.commit(3)
-    assert reader.next(0) == Gap(21, 16, Cause.USB)
+    assert reader.next(0) == Gap(21, 16, LossCause.USB)
     item = reader.next(0)
     assert isinstance(item, Frames) and (item.first, item.count) == (37, 3) and (item.data == 3).all()
     successor.close(EndReason.FINISHED)
     assert reader.next(0) == End(40, EndReason.FINISHED)
-    assert not outside.hold("it ended")
+    assert not outside.claim_for_successor("it ended")
     with pytest.raises(RingError):
         RingWriter.take_over(name)
 
@@ -334,38 +334,39 @@ def test_a_ring_that_is_given_up_ends_at_once(dying: "subprocess.Popen[str]") ->
     name = dying.stdout.readline().strip()
     outside, reader = Ring.attach(name), RingReader.attach(name, Policy.LATEST, "test")
     dying.communicate("die\n")
-    assert outside.hold("it died")
+    assert outside.claim_for_successor("it died")
     while reader.next(0) is not None:
         pass
-    outside.give_up()
+    outside.abandon()
     assert reader.next(0.3) == End(21, EndReason.WRITER_DIED)
-    assert clean_stale() == [name]
+    clean_stale()
+    assert not Path("/dev/shm", name).exists()
 
 
 def test_status_is_visible_from_outside_and_outlives_the_name() -> None:
     with RingWriter.create(SENSOR, slots=8) as writer:
         ring = Ring.attach(writer.name)
         reader = attach(writer)
-        writer.publish_condition(Condition(DeviceState.STREAMING, "as it should"))
+        writer.publish_device_status(DeviceStatus(DeviceState.STREAMING, "as it should"))
         put(writer, 8)
-        writer.gap(4, Cause.USB)
+        writer.gap(4, LossCause.USB)
         put(writer, 8)
         drain(reader)
         before = ring.status()
     after = ring.status()
-    assert before.writer.condition == Condition(DeviceState.STREAMING, "as it should")
+    assert before.writer.device_status == DeviceStatus(DeviceState.STREAMING, "as it should")
     assert (before.writer.committed, before.writer.next_frame, before.writer.end) == (16, 20, None)
-    assert before.writer.lost == {Cause.DEVICE: 0, Cause.USB: 4, Cause.RING: 0, Cause.DISK: 0}
+    assert before.writer.lost == {LossCause.DEVICE: 0, LossCause.USB: 4, LossCause.RING: 0, LossCause.DISK: 0}
     (row,) = before.readers
     assert (row.consumer, row.received, row.lost, row.lag_frames, row.alive) == ("test", 16, 4, 0, True)
     assert after.writer.end is EndReason.STOPPED
 
 
 def test_texts_too_long_for_shared_memory_are_cut_between_characters(writer: RingWriter) -> None:
-    writer.publish_condition(Condition(DeviceState.LOST, "x" + "é" * 200))
+    writer.publish_device_status(DeviceStatus(DeviceState.LOST, "x" + "é" * 200))
     with RingReader.attach(writer.name, Policy.LATEST, "x" + "é" * 40):
         status = writer.status()
-    assert status.writer.condition.reason == "x" + "é" * 95
+    assert status.writer.device_status.reason == "x" + "é" * 95
     assert status.readers[0].consumer == "x" + "é" * 23
 
 
@@ -402,7 +403,7 @@ def test_impossible_calls_are_refused(writer: RingWriter) -> None:
     with pytest.raises(RingError, match="9"):
         writer.commit(9)
     with pytest.raises(RingError, match="gap of 0"):
-        writer.gap(0, Cause.USB)
+        writer.gap(0, LossCause.USB)
     writer.end(EndReason.STOPPED)
     with pytest.raises(RingError, match="ended"):
         writer.commit(1)
@@ -435,7 +436,7 @@ def test_the_ring_of_a_dead_creator_is_cleaned_and_that_of_a_living_one_is_not(w
     done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
     name = done.stdout.strip()
     assert Path("/dev/shm", name).exists()
-    assert name in clean_stale()
+    clean_stale()
     assert not Path("/dev/shm", name).exists()
     assert Path("/dev/shm", writer.name).exists()
 
@@ -463,7 +464,7 @@ def test_whatever_happens_each_frame_is_received_or_lost_once(script: list[Step]
             if kind == "put":
                 put(writer, number)
             elif kind == "gap":
-                writer.gap(number, Cause.DEVICE)
+                writer.gap(number, LossCause.DEVICE)
             elif kind == "stall":
                 for _ in range(number):
                     put(writer, 8)
@@ -492,7 +493,7 @@ def test_a_reader_may_start_at_a_frame_that_the_ring_still_holds() -> None:
             with RingReader.attach(writer.name, Policy.PRIORITY, "late", start_frame=start) as reader:
                 items = [reader.next(0)]
                 if first:
-                    assert items[0] == Gap(0, first, Cause.RING)
+                    assert items[0] == Gap(0, first, LossCause.RING)
                     items = [reader.next(0)]
                 assert isinstance(items[0], Frames)
                 assert items[0].first == first

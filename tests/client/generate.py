@@ -1,6 +1,7 @@
 """Makes `spiked/client/models.py` from the OpenAPI description: `python tests/client/generate.py [FILE]`.
 
-The client does not check what the service checks, so that limits, which would become a class each, are left out.
+The client does not check what the service checks, so that limits and rules between fields, which would become a class
+each, are left out.
 """
 
 import json
@@ -14,7 +15,7 @@ MODELS = Path(__file__).parents[2] / "spiked" / "client" / "models.py"
 _LIMITS = frozenset(
     ("minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum", "minLength", "maxLength", "minItems", "maxItems")
 )
-_LEFT_OUT = _LIMITS | {"pattern", "title", "examples", "example"}
+_LEFT_OUT = _LIMITS | {"pattern", "title", "examples", "example", "allOf"}
 _HEADER = '"""What goes over HTTP: made from the OpenAPI description, see tests/client."""'
 _OPTIONS = (
     "--input-file-type",

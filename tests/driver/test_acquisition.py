@@ -9,14 +9,14 @@ from spiked_driver.simulated import SimulatedSource
 
 from spiked.errors import SourceError
 from spiked.ring import (
-    Cause,
-    Condition,
     DeviceState,
+    DeviceStatus,
     End,
     EndReason,
     Frames,
     Gap,
     Item,
+    LossCause,
     Policy,
     RingReader,
     RingWriter,
@@ -70,14 +70,14 @@ def test_every_frame_arrives_bit_for_bit(truth: np.ndarray) -> None:
     items, writer = run(simulated())
     assert items[-1][0] == End(FRAMES, EndReason.FINISHED)
     np.testing.assert_array_equal(np.concatenate([copy for _, copy in items if copy is not None]), truth)
-    assert writer.status().writer.condition.state is DeviceState.IDLE
+    assert writer.status().writer.device_status.state is DeviceState.IDLE
 
 
 def test_losses_are_gaps_and_the_other_frames_stay_what_they_were(truth: np.ndarray) -> None:
-    faults = Faults((Loss(13, 4), Loss(100, 30, Cause.DEVICE, unplugged=True)))
+    faults = Faults((Loss(13, 4), Loss(100, 30, LossCause.DEVICE, unplugged=True)))
     items, writer = run(FaultySource(simulated(), faults))
     gaps = [item for item, _ in items if isinstance(item, Gap)]
-    assert gaps == [Gap(13, 4, Cause.USB), Gap(100, 30, Cause.DEVICE)]
+    assert gaps == [Gap(13, 4, LossCause.USB), Gap(100, 30, LossCause.DEVICE)]
     for item, copy in items:
         if isinstance(item, Frames):
             np.testing.assert_array_equal(copy, truth[item.first : item.first + item.count])
@@ -91,34 +91,34 @@ def test_blocks_end_at_multiples_of_eight_also_after_a_loss() -> None:
     assert blocks[:4] == [(0, 8), (8, 5), (17, 7), (24, 8)]
 
 
-def test_random_losses_take_about_the_fraction_asked_for_and_repeat_with_the_seed() -> None:
+def test_random_losses_have_about_the_stated_fraction_and_repeat_with_the_seed() -> None:
     faults = Faults(drop=0.3, drop_run=2, seed=5)
     first, writer = run(FaultySource(simulated(frames=400), faults))
     second, _ = run(FaultySource(simulated(frames=400), faults))
-    lost = writer.status().writer.lost[Cause.USB]
+    lost = writer.status().writer.lost[LossCause.USB]
     assert 70 < lost < 170
     gaps = [item for item, _ in first if isinstance(item, Gap)]
     assert gaps == [item for item, _ in second if isinstance(item, Gap)]
     assert sum(gap.count for gap in gaps) == lost
 
 
-def test_a_loss_at_the_end_is_told_of_before_the_end() -> None:
+def test_a_loss_at_the_end_comes_before_the_end() -> None:
     items, _ = run(FaultySource(simulated(), Faults((Loss(FRAMES - 5, 50),))))
-    assert [item for item, _ in items[-2:]] == [Gap(FRAMES - 5, 5, Cause.USB), End(FRAMES, EndReason.FINISHED)]
+    assert [item for item, _ in items[-2:]] == [Gap(FRAMES - 5, 5, LossCause.USB), End(FRAMES, EndReason.FINISHED)]
 
 
-def test_faults_on_faults_are_told_in_order() -> None:
-    inner = FaultySource(simulated(), Faults((Loss(20, 10, Cause.DEVICE),)))
+def test_nested_faults_come_in_order() -> None:
+    inner = FaultySource(simulated(), Faults((Loss(20, 10, LossCause.DEVICE),)))
     items, _ = run(FaultySource(inner, Faults((Loss(16, 20),))))
     gaps = [item for item, _ in items if isinstance(item, Gap)]
-    assert gaps == [Gap(16, 4, Cause.USB), Gap(20, 10, Cause.DEVICE), Gap(30, 6, Cause.USB)]
+    assert gaps == [Gap(16, 4, LossCause.USB), Gap(20, 10, LossCause.DEVICE), Gap(30, 6, LossCause.USB)]
 
 
 def test_a_limit_ends_the_capture_at_that_frame_even_within_a_block_or_a_gap() -> None:
     items, writer = run(simulated(), limit_frames=50)
     assert items[-1][0] == End(50, EndReason.FINISHED)
     items, writer = run(FaultySource(simulated(), Faults((Loss(45, 20),))), limit_frames=50)
-    assert [item for item, _ in items[-2:]] == [Gap(45, 5, Cause.USB), End(50, EndReason.FINISHED)]
+    assert [item for item, _ in items[-2:]] == [Gap(45, 5, LossCause.USB), End(50, EndReason.FINISHED)]
     assert writer.status().writer.committed == 45
 
 
@@ -140,18 +140,18 @@ def test_a_capture_can_be_stopped_while_the_source_is_stalled() -> None:
 
 
 def test_an_unplugged_device_is_seen_as_lost_while_it_is_away() -> None:
-    source = FaultySource(simulated(), Faults((Loss(8, 8, Cause.DEVICE, unplugged=True),)))
+    source = FaultySource(simulated(), Faults((Loss(8, 8, LossCause.DEVICE, unplugged=True),)))
     source.open()
     view = np.zeros((4, source.sensor.frame_bytes), np.uint8)
     seen = []
     for _ in range(5):
-        seen.append((source.read_into(view), source.condition.state))
+        seen.append((source.read_into(view), source.device_status.state))
     source.close()
     assert seen == [
         (Chunk(0, 4), DeviceState.STREAMING),
         (Chunk(4, 4), DeviceState.STREAMING),
         (None, DeviceState.LOST),
-        (Gap(8, 8, Cause.DEVICE), DeviceState.STREAMING),
+        (Gap(8, 8, LossCause.DEVICE), DeviceState.STREAMING),
         (Chunk(16, 4), DeviceState.STREAMING),
     ]
 
@@ -171,7 +171,7 @@ def test_an_error_of_the_source_ends_the_capture_as_failed_and_says_why() -> Non
         with pytest.raises(SourceError, match="cable"):
             acquire(source, writer, threading.Event())
         assert take_all(reader)[-1][0] == End(24, EndReason.FAILED)
-        assert writer.status().writer.condition == Condition(DeviceState.LOST, "SourceError: the cable broke")
+        assert writer.status().writer.device_status == DeviceStatus(DeviceState.LOST, "the cable broke")
 
 
 def test_a_source_that_renumbers_or_skips_frames_is_refused() -> None:
@@ -203,7 +203,7 @@ def test_a_source_with_nothing_to_give_yet_comes_back_with_nothing() -> None:
     source = SimulatedSource(Sensor(64, 48, 1.0), seed=3, frames=100, pace=1.0)
     source.open()
     assert source.read_into(np.zeros((8, source.sensor.frame_bytes), np.uint8)) is None
-    assert source.condition.state is DeviceState.ARMED
+    assert source.device_status.state is DeviceState.ARMED
 
 
 def test_a_camera_is_not_opened_before_its_frames_are_awaited() -> None:

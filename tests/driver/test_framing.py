@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from spiked_driver.framing import USB_COMPACT_BYTES, USB_FRAME_BYTES, Framing, UsbFraming, benchmark_usb, encode_usb
 from spiked_driver.source import Chunk
 
-from spiked.ring import Cause, Gap
+from spiked.ring import Gap, LossCause
 
 REAL = Path(__file__).parents[3] / "shared" / "wire" / "sps10_002_ep82_contiguous.bin"
 SENT = 12
@@ -146,19 +146,19 @@ def test_counters_may_wrap_within_a_gap() -> None:
     wire = encode_usb(FRAMES, lines=WRAP, nbytes=17)
     kept = [0, 1, 2, 9, 10, 11]
     taken = take(UsbFraming(), wire[kept].tobytes(), [])
-    assert taken.gaps == [Gap(3, 6, Cause.DEVICE)]
+    assert taken.gaps == [Gap(3, 6, LossCause.DEVICE)]
     assert list(taken.frames) == kept
     for index, frame in taken.frames.items():
         np.testing.assert_array_equal(frame, FRAMES[index])
 
 
-def test_the_camera_and_the_host_are_told_apart_as_losers() -> None:
+def test_losses_of_the_camera_and_of_the_host_have_different_causes() -> None:
     wire = encode_usb(FRAMES)
     spoilt = wire[4].copy()
     spoilt[5000:5400] = 0xFF
     stream = [*wire[:2], *wire[3:4], spoilt, *wire[5:]]
     taken = take(UsbFraming(), np.concatenate(stream).tobytes(), [])
-    assert taken.gaps == [Gap(2, 1, Cause.DEVICE), Gap(4, 1, Cause.USB)]
+    assert taken.gaps == [Gap(2, 1, LossCause.DEVICE), Gap(4, 1, LossCause.USB)]
 
 
 def test_a_marked_loss_is_the_hosts_though_no_byte_is_amiss() -> None:
@@ -167,7 +167,7 @@ def test_a_marked_loss_is_the_hosts_though_no_byte_is_amiss() -> None:
     framing.read_into(view)
     framing.mark_loss()
     framing.feed(wire[6:].reshape(-1))
-    assert framing.read_into(view) == Gap(3, 3, Cause.USB)
+    assert framing.read_into(view) == Gap(3, 3, LossCause.USB)
 
 
 def test_repeated_and_late_frames_are_dropped_and_counted() -> None:
@@ -176,7 +176,7 @@ def test_repeated_and_late_frames_are_dropped_and_counted() -> None:
     taken = take(framing, wire[[0, 1, 1, 2, 4, 3, 5, 6]].tobytes(), [])
     assert framing.counters.duplicates == 2
     assert list(taken.frames) == [0, 1, 2, 4, 5, 6]
-    assert taken.gaps == [Gap(3, 1, Cause.DEVICE)]
+    assert taken.gaps == [Gap(3, 1, LossCause.DEVICE)]
     assert framing.counters.skipped_bytes == 0
 
 
@@ -195,16 +195,18 @@ def test_a_camera_that_counts_anew_goes_on_after_a_gap() -> None:
     framing = UsbFraming()
     taken = take(framing, before.tobytes() + after.tobytes(), [])
     assert framing.counters.restarts == 1
-    assert taken.gaps == [Gap(4, 1, Cause.DEVICE)]
+    assert taken.gaps == [Gap(4, 1, LossCause.DEVICE)]
     np.testing.assert_array_equal(taken.frames[5], FRAMES[4])
 
 
-def resumed(lost: int, tolerance: int, wire: NDArray[np.uint8], cause: Cause = Cause.DEVICE) -> tuple[Gap, Chunk]:
+def resumed(
+    lost: int, tolerance: int, wire: NDArray[np.uint8], cause: LossCause = LossCause.DEVICE
+) -> tuple[Gap, Chunk]:
     """What follows two and a half frames of FRAMES after a break: the gap and the frames."""
     framing, view = UsbFraming(), np.zeros((SENT, USB_COMPACT_BYTES), np.uint8)
     framing.feed(encode_usb(FRAMES[:3]).reshape(-1)[:-100])
     assert framing.read_into(view) == Chunk(0, 2)
-    framing.resume(1, tolerance, Cause.USB)
+    framing.resume(1, tolerance, LossCause.USB)
     framing.resume(lost, tolerance, cause)
     framing.feed(wire.reshape(-1))
     gap, chunk = framing.read_into(view), framing.read_into(view)
@@ -219,21 +221,21 @@ def resumed(lost: int, tolerance: int, wire: NDArray[np.uint8], cause: Cause = C
 def test_after_a_break_the_cameras_own_count_is_taken_if_it_runs_on() -> None:
     wire = encode_usb(FRAMES[6:], first=506)[:-1]
     wire = np.concatenate([wire.reshape(-1), encode_usb(FRAMES[-1:], first=511).reshape(-1)[:16]])
-    assert resumed(500, 20, wire)[0] == Gap(2, 504, Cause.DEVICE)
-    assert resumed(500, 20, wire, Cause.USB)[0] == Gap(2, 504, Cause.USB)
+    assert resumed(500, 20, wire)[0] == Gap(2, 504, LossCause.DEVICE)
+    assert resumed(500, 20, wire, LossCause.USB)[0] == Gap(2, 504, LossCause.USB)
 
 
 @pytest.mark.parametrize(("first", "lines"), [(506, 77), (900, 0), (0, 0)], ids=["anew", "too far", "from zero"])
 def test_after_a_break_a_camera_that_counts_anew_has_lost_what_the_clock_says(first: int, lines: int) -> None:
     wire = encode_usb(FRAMES[6:], first=first, lines=lines).reshape(-1)[: 5 * USB_FRAME_BYTES + 16]
-    assert resumed(500, 20, wire)[0] == Gap(2, 500, Cause.DEVICE)
+    assert resumed(500, 20, wire)[0] == Gap(2, 500, LossCause.DEVICE)
 
 
 def test_a_break_without_a_loss_leaves_no_gap() -> None:
     framing, view, wire = UsbFraming(), np.zeros((SENT, USB_COMPACT_BYTES), np.uint8), encode_usb(FRAMES)
     framing.feed(wire[:2].reshape(-1))
     assert framing.read_into(view) == Chunk(0, 2)
-    framing.resume(3, 100, Cause.USB)
+    framing.resume(3, 100, LossCause.USB)
     framing.feed(wire[2:].reshape(-1))
     assert framing.read_into(view) == Chunk(2, SENT - 2)
 
@@ -241,7 +243,7 @@ def test_a_break_without_a_loss_leaves_no_gap() -> None:
 def test_a_break_before_the_first_frame_is_no_gap() -> None:
     framing, view = UsbFraming(), np.zeros((SENT, USB_COMPACT_BYTES), np.uint8)
     framing.feed(encode_usb(FRAMES).reshape(-1)[:5000])
-    framing.resume(3, 100, Cause.USB)
+    framing.resume(3, 100, LossCause.USB)
     framing.feed(encode_usb(FRAMES[:3]).reshape(-1))
     assert framing.read_into(view) == Chunk(0, 3)
 
@@ -253,7 +255,7 @@ def test_a_camera_that_counts_anew_from_below_is_not_dropped_for_ever_as_late() 
     framing = UsbFraming()
     wire = np.concatenate([encode_usb(frames[:4], first=5000).reshape(-1), encode_usb(frames).reshape(-1)])
     taken = take(framing, wire.tobytes(), [])
-    assert taken.gaps == [Gap(4, 1000, Cause.DEVICE)]
+    assert taken.gaps == [Gap(4, 1000, LossCause.DEVICE)]
     assert len(taken.frames) == 4 + count - 1000
     assert framing.counters.restarts == 1
     assert framing.counters.duplicates == 0
@@ -266,7 +268,7 @@ def test_the_structure_of_the_real_sample() -> None:
     framing = UsbFraming()
     taken = take(framing, bytes.fromhex("00636063") + (whole.tobytes() + later.tobytes())[:16_380], [])
     assert list(taken.frames) == [0]
-    assert taken.gaps == [Gap(1, 241_231, Cause.DEVICE), Gap(241_232, 1, Cause.USB)]
+    assert taken.gaps == [Gap(1, 241_231, LossCause.DEVICE), Gap(241_232, 1, LossCause.USB)]
     assert later[0, :16].tobytes() == bytes.fromhex("0063606321001000d0275ace") + (3_762_912_173).to_bytes(4, "little")
 
 
@@ -275,7 +277,7 @@ def test_the_real_bytes_hold_one_frame_and_its_gap() -> None:
     taken = take(UsbFraming(), REAL.read_bytes(), [5000])
     assert list(taken.frames) == [0]
     assert int(np.bitwise_count(taken.frames[0]).sum()) == 311
-    assert taken.gaps == [Gap(1, 241_231, Cause.DEVICE), Gap(241_232, 1, Cause.USB)]
+    assert taken.gaps == [Gap(1, 241_231, LossCause.DEVICE), Gap(241_232, 1, LossCause.USB)]
 
 
 def test_the_benchmark_parses_every_frame_it_times() -> None:

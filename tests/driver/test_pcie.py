@@ -22,7 +22,7 @@ from spiked_driver.source import Chunk
 from spiked_driver.spec import open_source
 
 from spiked.errors import SourceError
-from spiked.ring import Cause, DeviceState, End, EndReason, Gap
+from spiked.ring import DeviceState, End, EndReason, Gap, LossCause
 
 SENT = 6
 FRAMES = np.random.default_rng(3).integers(0, 256, (SENT, PCIE_COMPACT_BYTES), np.uint8)
@@ -108,7 +108,7 @@ def test_a_wrong_line_number_costs_its_frame_and_no_other() -> None:
     wire[3, 64 * 700 + 63] ^= 0x04
     framing, frames, gaps = take(wire.tobytes(), [])
     assert [sent_index(frame) for frame in frames] == [0, 1, 2, 4, 5]
-    assert gaps == [Gap(3, 1, Cause.USB)]
+    assert gaps == [Gap(3, 1, LossCause.USB)]
     assert framing.counters.resyncs == 1
 
 
@@ -153,11 +153,11 @@ def test_a_file_is_a_source(tmp_path: Path) -> None:
     source = PcieSource(path)
     for _ in range(2):
         source.open()
-        assert source.waits
+        assert source.can_block
         frames, end = read_all(source)
         np.testing.assert_array_equal(np.stack(frames), FRAMES)
         assert end == End(SENT, EndReason.FINISHED)
-        assert source.condition.state is DeviceState.IDLE
+        assert source.device_status.state is DeviceState.IDLE
         source.close()
 
 
@@ -175,7 +175,7 @@ def test_a_pipe_is_a_source_that_cannot_wait(tmp_path: Path) -> None:
         while first is None:
             first = source.read_into(view)
     assert isinstance(first, Chunk)
-    assert not source.waits
+    assert not source.can_block
     np.testing.assert_array_equal(view[: first.frames], FRAMES[: first.frames])
     _rest_of(source, first.frames)
     sender.join()
@@ -207,8 +207,8 @@ def test_a_character_device_is_a_source_by_its_name() -> None:
             received += item.frames
         else:
             assert item is None
-    assert not source.waits
-    assert source.condition.state is DeviceState.STREAMING
+    assert not source.can_block
+    assert source.device_status.state is DeviceState.STREAMING
     sender.join()
     source.close()
     os.close(card)

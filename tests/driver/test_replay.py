@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from spiked_driver import Chunk, Faults, FaultySource, Loss, Source, Stall, acquire
 from spiked_driver.replay import ReplaySource
 from spiked_driver.simulated import SimulatedSource
-from spiked_driver.spec import is_camera, open_source
+from spiked_driver.source_kinds import is_camera
+from spiked_driver.spec import open_source
 
 from spiked.errors import SourceError, SpikedError
 from spiked.recording import RecordingWriter, open_recording
-from spiked.ring import Cause, DeviceState, End, EndReason, Frames, Gap, Policy, RingReader, RingWriter
+from spiked.ring import DeviceState, End, EndReason, Frames, Gap, LossCause, Policy, RingReader, RingWriter
 from spiked.sensor import BitOrder, Intrinsics, Layout, Sensor
+from spiked.simulate import MotionKind
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared"
 FRAMES = 50
@@ -65,7 +67,7 @@ def play(source: Source, block: int = 8) -> np.ndarray:
 
 def test_a_replay_delivers_the_recording(recording: Path) -> None:
     source = ReplaySource(open_recording(recording), pace=0)
-    assert source.waits
+    assert source.can_block
     assert source.frames == FRAMES
     np.testing.assert_array_equal(play(source), bits())
 
@@ -95,20 +97,20 @@ def test_what_the_recording_lost_is_lost_again(tmp_path: Path) -> None:
     source = open_source(f"replay:{path}?pace=0")
     assert source.frames == 65
     assert items_of(source) == [
-        Gap(0, 3, Cause.DEVICE),
+        Gap(0, 3, LossCause.DEVICE),
         Chunk(3, 20),
-        Gap(23, 7, Cause.USB),
+        Gap(23, 7, LossCause.USB),
         Chunk(30, 30),
-        Gap(60, 5, Cause.DISK),
+        Gap(60, 5, LossCause.DISK),
         End(65, EndReason.FINISHED),
     ]
     part = open_source(f"replay:{path}?pace=0&range=10:30&repeat=2")
     assert items_of(part) == [
         Chunk(0, 10),
-        Gap(10, 7, Cause.USB),
+        Gap(10, 7, LossCause.USB),
         Chunk(17, 10),
         Chunk(27, 10),
-        Gap(37, 7, Cause.USB),
+        Gap(37, 7, LossCause.USB),
         Chunk(44, 10),
         End(54, EndReason.FINISHED),
     ]
@@ -135,18 +137,18 @@ def test_other_bit_orders_and_row_tags_are_delivered_as_compact_lsb_frames(tmp_p
 def test_a_source_can_be_opened_again(recording: Path) -> None:
     source = open_source(f"replay:{recording}?pace=0&range=:20")
     np.testing.assert_array_equal(play(source), play(source))
-    assert source.condition.state is DeviceState.IDLE
+    assert source.device_status.state is DeviceState.IDLE
 
 
 def test_a_paced_replay_does_not_wait_for_readers(recording: Path) -> None:
     source = open_source(f"replay:{recording}?pace=20")
-    assert not source.waits
+    assert not source.can_block
     np.testing.assert_array_equal(play(source), bits())
 
 
 def test_faults_are_options_of_every_source(recording: Path) -> None:
     line = "pace=0&drop=0.1&drop_run=2&fault_seed=4&gap=5:3&gap=10:2:disk&unplug-at=20:5&stall=30:0.5&corrupt=0.2"
-    losses = (Loss(5, 3), Loss(10, 2, Cause.DISK), Loss(20, 5, Cause.DEVICE, unplugged=True))
+    losses = (Loss(5, 3), Loss(10, 2, LossCause.DISK), Loss(20, 5, LossCause.DEVICE, unplugged=True))
     expected = Faults(losses, (Stall(30, 0.5),), drop=0.1, drop_run=2, seed=4, corrupt=0.2)
     for spec, kind in ((f"replay:{recording}?{line}", ReplaySource), (f"sim:?{line}", SimulatedSource)):
         source = open_source(spec)
@@ -158,7 +160,7 @@ def test_faults_are_options_of_every_source(recording: Path) -> None:
 def test_lengths_of_faults_may_be_times() -> None:
     source = open_source("sim:?rate=20000&gap=5:1.5ms:ring&unplug-at=100:2s&stall=30:40ms&stall=40:1s")
     assert isinstance(source, FaultySource)
-    losses = (Loss(5, 30, Cause.RING), Loss(100, 40_000, Cause.DEVICE, unplugged=True))
+    losses = (Loss(5, 30, LossCause.RING), Loss(100, 40_000, LossCause.DEVICE, unplugged=True))
     assert source.faults == Faults(losses, (Stall(30, 0.04), Stall(40, 1.0)))
 
 
@@ -198,7 +200,7 @@ def test_cameras_are_described_without_being_there() -> None:
     assert (card.sensor.width, card.sensor.height, card.sensor.frame_rate_hz) == (1000, 1000, 20_000)
     assert card.sensor.intrinsics == Intrinsics.from_fov(1000, 1000, 50)
     assert open_source("usb0").sensor.intrinsics is None
-    assert not open_source("usb0").waits
+    assert not open_source("usb0").can_block
 
 
 @pytest.mark.parametrize(
@@ -232,6 +234,30 @@ def test_cameras_are_told_from_files_and_simulations(spec: str, camera: bool) ->
         ("sim:?gap=5:3&gap=6:1", "overlap"),
         ("sim:?gap=5:0", "at least one frame"),
         ("sim:?pace=-1", "pace=-1"),
+        ("sim:?threads=100000", "threads=100000: it must be less than or equal to 64"),
+        ("sim:?rate=inf", "rate=inf: it must be a finite number"),
+        ("sim:?rate=nan", "rate=nan"),
+        ("sim:?rate=1e30", "rate=1e30"),
+        ("sim:?seed=-1", "seed=-1: it must be greater than or equal to 0"),
+        ("sim:?seed=99999999999999999999", "seed=9"),
+        ("sim:?width=16384&height=16384", "frames of 16384x16384 are larger than"),
+        ("sim:?width=100000", "width=100000"),
+        ("sim:?seconds=inf", "seconds=inf"),
+        ("sim:?flow_px=nan", "flow_px=nan"),
+        ("sim:?pace=1e300", "pace=1e300"),
+        ("sim:?drop=nan", "drop=nan"),
+        ("sim:?drop_run=10000000000", "drop_run"),
+        ("sim:?stall=5:nans", "stall=5:nans"),
+        ("sim:?stall=5:1e9s", "stall=5:1e9s"),
+        ("sim:?gap=-5:3", "gap=-5:3"),
+        ("sim:?gap=5:99999999999999999999", "neither a number of frames nor a time"),
+        ("sim:?fault-seed=-1", "fault_seed=-1"),
+        ("replay:{}?width=16384&height=16384", "larger than"),
+        ("replay:{}?repeat=99999999999", "repeat"),
+        ("usb0?rate=inf", "rate=inf"),
+        ("usb0?silence_s=inf", "silence_s=inf"),
+        ("usb0?hide_ms=nan", "hide_ms=nan"),
+        ("pcie:/dev/JR6101?rate=1e30", "rate=1e30"),
         ("replay:{}?range=40:60", "range 40:60"),
         ("replay:{}?range=7", "range=7"),
         ("replay:{}?repeat=0", "repeat=0"),
@@ -242,6 +268,16 @@ def test_a_wrong_line_is_refused_in_one_line_that_says_what(recording: Path, spe
     with pytest.raises(SpikedError, match=message) as caught:
         open_source(spec.format(recording))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("motion", MotionKind)
+@pytest.mark.parametrize(
+    "options", [f"width=8&height=1&rate=0.1&flow_px=8&seed={2**32 - 1}", "width=64&height=48&rate=1e6&flow_px=1e-4"]
+)
+def test_what_the_bounds_allow_can_be_simulated(options: str, motion: MotionKind) -> None:
+    source = open_source(f"sim:?pace=0&motion={motion}&{options}")
+    source.open()
+    assert source.read_into(np.zeros((4, source.sensor.frame_bytes), np.uint8)) == Chunk(0, 4)
 
 
 def test_a_real_stream_goes_through_the_ring_unchanged() -> None:
@@ -268,7 +304,7 @@ def test_a_real_stream_goes_through_the_ring_unchanged() -> None:
 def faults(draw: st.DrawFn) -> Faults:
     starts = sorted(draw(st.sets(st.integers(0, FRAMES + 5), max_size=4)))
     ends = [*starts[1:], FRAMES + 10]
-    causes = st.sampled_from([Cause.USB, Cause.DEVICE, Cause.DISK])
+    causes = st.sampled_from([LossCause.USB, LossCause.DEVICE, LossCause.DISK])
     losses = [Loss(a, draw(st.integers(1, b - a)), draw(causes)) for a, b in zip(starts, ends, strict=False)]
     stalls = [Stall(frame, 0.0) for frame in draw(st.sets(st.integers(0, FRAMES), max_size=2))]
     drop = draw(st.sampled_from([0.0, 0.05, 0.5, 0.95]))
@@ -277,7 +313,7 @@ def faults(draw: st.DrawFn) -> Faults:
 
 @settings(deadline=None)
 @given(inner=faults(), outer=faults(), block=st.integers(1, 9))
-def test_whatever_the_faults_each_frame_comes_once_or_is_told_lost_once(
+def test_whatever_the_faults_each_frame_comes_once_or_is_lost_once(
     recording: Path, inner: Faults, outer: Faults, block: int
 ) -> None:
     source = FaultySource(FaultySource(ReplaySource(open_recording(recording), pace=0), inner), outer)

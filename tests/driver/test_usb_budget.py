@@ -15,7 +15,7 @@ MIB = 1 << 20
 
 def test_by_default_a_quarter_of_a_second_is_hidden() -> None:
     plan = plan_transfers(RATE, None)
-    assert 0.25 <= plan.hides_s < 0.26
+    assert 0.25 <= plan.buffered_s < 0.26
     assert plan.transfer_bytes == MIB
     assert plan.note is None
 
@@ -31,10 +31,10 @@ def test_the_kernels_default_takes_fifteen_and_the_note_says_how_to_get_more() -
     assert plan_transfers(RATE, int(raised[1]) * MIB).note is None
 
 
-def test_what_was_asked_for_and_does_not_fit_is_refused_with_what_fits() -> None:
+def test_a_stated_buffer_that_does_not_fit_is_refused_with_what_fits() -> None:
     with pytest.raises(SourceError, match=r"to hide \d+ ms .* usbfs_memory_mb=16 .* 15 transfers .* raise it"):
-        plan_transfers(RATE, 16 * MIB, hide_s=0.25)
-    assert plan_transfers(RATE, 16 * MIB, hide_s=0.05).note is None
+        plan_transfers(RATE, 16 * MIB, buffer_s=0.25)
+    assert plan_transfers(RATE, 16 * MIB, buffer_s=0.05).note is None
 
 
 def test_too_little_for_any_reading_is_refused_even_by_default() -> None:

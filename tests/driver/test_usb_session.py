@@ -32,7 +32,7 @@ def test_the_request_index_wraps_around() -> None:
 
 def test_the_chip_configuration_is_understood() -> None:
     chip = ChipConfiguration.parse(configuration(clock=1, mode=1))
-    assert (chip.vendor_id, chip.product_id, chip.power_ma, chip.channels) == (0x0403, 0x601F, 96, 2)
+    assert (chip.vendor_id, chip.product_id, chip.power_ma) == (0x0403, 0x601F, 96)
     assert chip.fifo_clock is FifoClock.MHZ_66 and chip.fifo_clock.mhz == 66
     assert chip.fifo_mode is FifoMode.MODE_600
 

@@ -56,7 +56,7 @@ def test_a_recording_becomes_a_trajectory_and_novel_views(
     tum = tmp_path / "trajectory.tum"
     tum.write_text(http.get(f"captures/{capture_id}/trajectory", params={"format": "tum"}).text)
     estimate, truth = Trajectory.read_tum(tum), Trajectory.read_tum(room / "groundtruth.tum")
-    score = score_trajectory(truth, estimate, RATE_HZ)
+    score = score_trajectory(truth=truth, estimate=estimate, frame_rate_hz=RATE_HZ)
     assert score.coverage > 0.98
     assert score.errors is not None
     assert score.errors.ate_percent < 2
@@ -73,13 +73,13 @@ def test_a_recording_becomes_a_trajectory_and_novel_views(
         return np.asarray(oiio.ImageBuf(str(tmp_path / "view.exr")).get_pixels(oiio.FLOAT))[..., 0]
 
     held_out = json.loads((room / "views.json").read_text())
-    to_estimate = similarity_of_trajectories(truth, estimate, RATE_HZ)
+    to_estimate = similarity_of_trajectories(truth=truth, estimate=estimate, frame_rate_hz=RATE_HZ)
     poses = [np.array(view["c2w"]) for view in held_out["views"]]
     carried = [to_estimate.poses(pose[:3, :3], pose[:3, 3]) for pose in poses]
     pictures = [
         cv2.imread(str(room / view["file"]), cv2.IMREAD_GRAYSCALE) / np.float32(255) for view in held_out["views"]
     ]
-    likeness = score_views(render, carried, pictures, to_estimate.scale * held_out["median_depth"])
+    likeness = score_views(render, poses=carried, truths=pictures, length=to_estimate.scale * held_out["median_depth"])
     assert likeness.mean_psnr_db > 28
 
     scene = http.get(f"captures/{capture_id}/scene")

@@ -5,9 +5,9 @@
 
 namespace {
 
-using spiked::wire::Event;
-using spiked::wire::Kind;
-using spiked::wire::PcieParser;
+using spiked::Event;
+using spiked::Kind;
+using spiked::PcieParser;
 
 constexpr size_t most_frames = 4, view_frames = 2;
 

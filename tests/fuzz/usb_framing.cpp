@@ -5,9 +5,9 @@
 
 namespace {
 
-using spiked::wire::Event;
-using spiked::wire::Kind;
-using spiked::wire::UsbParser;
+using spiked::Event;
+using spiked::Kind;
+using spiked::UsbParser;
 
 constexpr size_t most_frames = 8, view_frames = 3;
 constexpr size_t stride = UsbParser::row_bytes + 2;

@@ -174,24 +174,24 @@ def driven(guest: Guest) -> Any:
     for kind in (Kind.DROP, Kind.STALL, Kind.BABBLE):
         camera.add(Fault(1, kind, count=7))
         driver.wait_for_frames(2 * rate)
-    seen = len(driver.told.states)
+    seen = len(driver.observed.states)
     guest.unplug(camera)
     driver.wait_for_state("absent", after=seen)
     stream.power_on(lines=1000, nbytes=77)
     guest.plug_in(known, 4)
-    driver.wait_for_state("streaming", after=len(driver.told.states))
+    driver.wait_for_state("streaming", after=len(driver.observed.states))
     driver.wait_for_frames(rate)
-    told = driver.stop()
+    observed = driver.stop()
     return {
-        "states": told.states,
-        "gaps": told.gaps,
-        "end": told.end,
-        "received": told.received,
-        "offsets": told.offsets,
-        "closed_s": told.closed_s,
+        "states": observed.states,
+        "gaps": observed.gaps,
+        "end": observed.end,
+        "received": observed.received,
+        "offsets": observed.offsets,
+        "closed_s": observed.closed_s,
         "sent": all(
             any(run.first <= number and number + count <= run.first + run.count for run in stream.sent)
-            for (_, number), count in told.runs.items()
+            for (_, number), count in observed.runs.items()
             if count
         ),
     }

@@ -38,18 +38,18 @@ int main(int, char** paths) {
     const auto rotations = read<double>(in, 9 * poses), centres = read<double>(in, 3 * poses);
     std::fclose(in);
 
-    raster::Lens lens{};
-    lens.fx = optics[0], lens.fy = optics[1], lens.cx = optics[2], lens.cy = optics[3], lens.near = optics[4];
-    lens.limit_x = static_cast<float>(1.3 * 0.5 * width / lens.fx);
-    lens.limit_y = static_cast<float>(1.3 * 0.5 * height / lens.fy);
-    lens.width = sizes[2], lens.height = sizes[3];
-    lens.tiles_x = (lens.width + raster::kTile - 1) / raster::kTile;
-    lens.tiles_y = (lens.height + raster::kTile - 1) / raster::kTile;
-    raster::Renderer renderer(lens, 2);
+    spiked::PinholeF camera{};
+    camera.fx = optics[0], camera.fy = optics[1], camera.cx = optics[2], camera.cy = optics[3], camera.near = optics[4];
+    camera.limit_x = static_cast<float>(1.3 * 0.5 * width / camera.fx);
+    camera.limit_y = static_cast<float>(1.3 * 0.5 * height / camera.fy);
+    camera.width = sizes[2], camera.height = sizes[3];
+    camera.tiles_x = (camera.width + spiked::kTile - 1) / spiked::kTile;
+    camera.tiles_y = (camera.height + spiked::kTile - 1) / spiked::kTile;
+    spiked::Renderer renderer(camera, 2);
 
-    const raster::SplatArrays splats{sizes[0],      sizes[1],      means.data(), quats.data(),
+    const spiked::SplatArrays splats{sizes[0],      sizes[1],      means.data(), quats.data(),
                                      scales.data(), logits.data(), colour.data()};
-    const raster::Views views{
+    const spiked::Views views{
         rotations.data(), centres.data(), sizes[4], nullptr, windows.data(), windows.data() + width * height, nullptr};
     const float background[3] = {0.1f, 0.1f, 0.1f};
     std::vector<float> values(colours * width * height), alpha(width * height), depth(width * height);

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spiked.blocks import reduce_block
+from spiked.blocks import aligned_window
 from spiked.pose import exp_so3
-from spiked.render import Camera, Rasteriser, Splats
+from spiked.render import Camera, Rasteriser
+from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
 
 HERE = Path(__file__).parent
@@ -25,9 +26,17 @@ pytestmark = [
 ]
 
 
-def build(target: Path, main: str, *sources: Path) -> None:
+def build(target: Path, main: str, kernels: str, *sources: str) -> None:
+    """Compile a program with a folder's kernels for NEON and for the baseline, as CMake's spiked_kernels() does."""
     options = ["-std=c++17", "-O2", "-static", "-pthread", "-ffp-contract=fast", "-fno-math-errno", "-Wall", "-Werror"]
-    subprocess.run([COMPILER, *options, HERE / main, *sources, "-o", target], check=True)
+    objects = []
+    for level in ("neon", "baseline"):
+        objects.append(target.with_suffix(f".{level}.o"))
+        names = [f"-DSPIKED_INSTRUCTION_SET={level}", f"-DSPIKED_{level.upper()}=1"]
+        source = NATIVE / kernels / "kernels.cpp"
+        subprocess.run([COMPILER, *options, *names, "-c", source, "-o", objects[-1]], check=True)
+    others = [NATIVE / name for name in sources]
+    subprocess.run([COMPILER, *options, HERE / main, *others, *objects, "-o", target], check=True)
 
 
 def emulate(*command: str | Path) -> str:
@@ -41,13 +50,12 @@ def test_renders_and_gradients(
 ) -> None:
     program = tmp_path_factory.getbasetemp() / "render_once"
     if not program.exists():
-        names = ("renderer.cpp", "pool.cpp", "dispatch.cpp", "kernels_neon.cpp", "kernels_baseline.cpp")
-        build(program, "render_once.cpp", *(NATIVE / "raster" / name for name in names))
+        build(program, "render_once.cpp", "raster", "raster/renderer.cpp", "raster/dispatch.cpp", "common/pool.cpp")
     rng = np.random.default_rng(colours)
     n, width, height = 300, 83, 61
     camera = Camera(Intrinsics(70, 72, 41, 30), width, height)
     z = rng.uniform(1, 3, n)
-    splats = Splats(
+    splats = Scene(
         np.stack([rng.uniform(-0.6, 0.6, n) * z, rng.uniform(-0.5, 0.5, n) * z, z], 1).astype(np.float32),
         rng.normal(size=(n, 4)).astype(np.float32),
         (np.log(0.05) + rng.normal(0, 0.5, (n, 3))).astype(np.float32),
@@ -86,14 +94,15 @@ def test_renders_and_gradients(
     assert not got
 
 
-def test_reduced_blocks(tmp_path: Path) -> None:
-    build(tmp_path / "reduce_once", "reduce_once.cpp", NATIVE / "blocks" / "kernels_neon.cpp")
+def test_aligned_windows(tmp_path: Path) -> None:
+    build(tmp_path / "window_once", "window_once.cpp", "spikes")
     sensor = Sensor(400, 250, 20_000.0, flipped=False)
-    frames = np.random.default_rng(0).integers(0, 256, (8, sensor.frame_bytes), np.uint8)
+    frames = np.random.default_rng(0).integers(0, 256, (40, sensor.frame_bytes), np.uint8)
     frames &= np.random.default_rng(1).integers(0, 256, frames.shape, np.uint8)
     (tmp_path / "in").write_bytes(frames.tobytes())
-    assert emulate(tmp_path / "reduce_once", "400", "250", tmp_path / "in", tmp_path / "out") == "neon"
-    here = reduce_block(frames, sensor, 0)
-    there = np.frombuffer((tmp_path / "out").read_bytes(), np.uint8).reshape(3, 250, 400)
-    for a, b in zip(there, (here.count, here.first, here.last), strict=True):
+    program, numbers = tmp_path / "window_once", ("400", "250", "40", "13", "27")
+    assert emulate(program, *numbers, tmp_path / "in", tmp_path / "out") == "neon"
+    here = aligned_window(frames, sensor, 0, 13, 27)
+    there = np.frombuffer((tmp_path / "out").read_bytes(), np.uint16).reshape(4, 250, 400)
+    for a, b in zip(there, (here.spikes, here.start_offset, here.stop_offset, here.count), strict=True):
         assert (a == b).all()

@@ -1,6 +1,7 @@
 """Recordings of hard days: what may pass in front of the simulated camera, and how the path is judged."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -8,28 +9,41 @@ from numpy.typing import NDArray
 
 from spiked.evaluate import score_trajectory
 from spiked.recon import Options, Reconstructor
-from spiked.sensor import Intrinsics, Sensor
+from spiked.sensor import Image, Intrinsics, Sensor
 from spiked.simulate import SimulatedCamera
+from spiked.simulate.spans import PathRadiance
 from spiked.trajectory import Trajectory
 
 SENSOR = Sensor(240, 160, 20000.0, intrinsics=Intrinsics.from_fov(240, 160, 60))
-Image = NDArray[np.float32]
 
 
 class ObstructedCamera(SimulatedCamera):
     """A camera with something in front of the scene that moves by itself, in image coordinates."""
 
-    over: Callable[[float, Image], Image]
-    speed_px: float
+    over: Callable[[float, Image], Image] | None = None
+    speed_px: float = 0.0
     """How fast it moves, px a frame."""
 
-    def _seen(self, frame: float) -> Image:
-        seen = super()._seen(frame)
-        return np.ascontiguousarray(self.over(frame, seen), np.float32) if hasattr(self, "over") else seen
+    def path_radiance(self) -> PathRadiance:
+        """With what is in front of the scene."""
+        return ObstructedRadiance(self.scene, self.motion, self.sensor, self.intrinsics, self.gain, self)
 
-    def _steps_px(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        steps = super()._steps_px(times)
-        return np.maximum(steps, self.speed_px * np.diff(times)) if hasattr(self, "over") else steps
+
+@dataclass(frozen=True)
+class ObstructedRadiance(PathRadiance):
+    """The radiance that an obstructed camera sees."""
+
+    camera: ObstructedCamera
+
+    def at_with_depth(self, frame: float) -> tuple[Image, Image]:
+        """See `PathRadiance`."""
+        seen, depth = super().at_with_depth(frame)
+        over = self.camera.over
+        return seen if over is None else np.ascontiguousarray(over(frame, seen), np.float32), depth
+
+    def steps_px(self, times: NDArray[np.float64], depth: float) -> NDArray[np.float64]:
+        """See `PathRadiance`."""
+        return np.maximum(super().steps_px(times, depth), self.camera.speed_px * np.diff(times))
 
 
 def behind(camera: ObstructedCamera, over: Callable[[float, Image], Image], speed_px: float) -> ObstructedCamera:
@@ -90,5 +104,5 @@ def followed(
     assert np.isfinite(path.rotations).all() and np.isfinite(path.centres).all()
     k = np.arange(count)
     truth = Trajectory((k + 0.5) / SENSOR.frame_rate_hz, *camera.truth(k))
-    score = score_trajectory(truth, path, SENSOR.frame_rate_hz)
+    score = score_trajectory(truth=truth, estimate=path, frame_rate_hz=SENSOR.frame_rate_hz)
     return reconstructor, np.inf if score.errors is None else score.errors.ate_percent, score.coverage

@@ -3,7 +3,7 @@
 import numpy as np
 
 from spiked.recon import Options, Reconstructor, State
-from spiked.recon.odometry import WORST_SIGMA_PX
+from spiked.recon.odometry.pnp import WORST_SIGMA_PX
 from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
 from spiked.simulate.motion import Motion

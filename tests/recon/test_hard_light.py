@@ -27,7 +27,7 @@ def reconstruct(seen: SimulatedCamera, steps: int = 60) -> tuple[Reconstructor, 
     reconstructor.finish()
     k = np.arange(FRAMES)
     truth = Trajectory((k + 0.5) / SENSOR.frame_rate_hz, *seen.truth(k))
-    score = score_trajectory(truth, reconstructor.trajectory(), SENSOR.frame_rate_hz)
+    score = score_trajectory(truth=truth, estimate=reconstructor.trajectory(), frame_rate_hz=SENSOR.frame_rate_hz)
     scene = reconstructor.scene()
     assert all(np.isfinite(array).all() for array in scene.arrays())
     return reconstructor, np.inf if score.errors is None else score.errors.ate_percent, score.coverage

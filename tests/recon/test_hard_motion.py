@@ -96,7 +96,7 @@ def test_a_camera_that_turns_first() -> None:
     told = status.state is State.DEGRADED and "shape" in status.reason
     assert error < 6 and coverage > 0.7
     assert told or (status.state is State.TRACK and error < 3), (error, status)
-    assert any("sideways" in reason for _, _, reason in reconstructor._odometry.changes)
+    assert any("sideways" in reason for _, _, reason in reconstructor.odometry.changes)
 
 
 def test_a_short_gap_leaves_the_path_whole() -> None:
@@ -109,7 +109,7 @@ def test_a_burst_of_six_pixels_a_frame_is_told_and_the_path_goes_on_behind_it() 
     reconstructor, error, coverage = followed(Bursting(path(), 400, 20, 20), 700)
     assert reconstructor.status().state is State.TRACK, reconstructor.status().reason
     assert error < 3 and 0.9 < coverage < 0.99, (error, coverage)
-    changes = reconstructor._odometry.changes
+    changes = reconstructor.odometry.changes
     assert any(state is State.LOST and "too fast" in reason for _, state, reason in changes), changes
     assert any(state is State.RELOC and "found again" in reason for _, state, reason in changes), changes
     times = reconstructor.trajectory().times_s * SENSOR.frame_rate_hz

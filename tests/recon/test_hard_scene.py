@@ -66,7 +66,7 @@ def test_objects_crossing_on_many_ways(figure: Figure) -> None:
 def test_a_blank_wall_fills_the_view_for_a_while() -> None:
     """The wall ends what is known; behind it the camera finds its place again."""
     reconstructor, error, coverage = followed(behind(camera(), wall(350, 120), 4.0), 700)
-    changes = reconstructor._odometry.changes
+    changes = reconstructor.odometry.changes
     assert reconstructor.status().state is State.TRACK, reconstructor.status().reason
     assert error < 3 and 0.6 < coverage < 0.97, (error, coverage)
     lost = [time for time, state, _ in changes if state is State.LOST]

@@ -1,5 +1,8 @@
-"""The whole reconstruction on the simulated camera, on good days and on bad ones."""
+"""The whole reconstruction of recordings of the simulated camera, those that work and those that cannot."""
 
+from functools import partial
+from itertools import count
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -7,8 +10,9 @@ import pytest
 
 from spiked.errors import ConfigurationError
 from spiked.evaluate import psnr, score_trajectory, similarity_of_trajectories
-from spiked.recon import Options, Reconstructor, State
-from spiked.recon.mapping import Mapper
+from spiked.recon import MapOptions, Options, Reconstructor, State
+from spiked.recon.mapping.mapper import Mapper
+from spiked.recon.mapping.schedule import Schedule
 from spiked.sensor import Intrinsics, Mosaic, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
 from spiked.trajectory import Trajectory
@@ -20,9 +24,9 @@ def sensor(mosaic: Mosaic | None = None) -> Sensor:
     return Sensor(240, 160, 20000.0, intrinsics=Intrinsics.from_fov(240, 160, 60), mosaic=mosaic)
 
 
-def record(camera: SimulatedCamera, count: int) -> tuple[np.ndarray, Trajectory]:
-    frames = camera.next_frames(count)
-    k = np.arange(count)
+def record(camera: SimulatedCamera, length: int) -> tuple[np.ndarray, Trajectory]:
+    frames = camera.next_frames(length)
+    k = np.arange(length)
     return frames, Trajectory((k + 0.5) / camera.sensor.frame_rate_hz, *camera.truth(k))
 
 
@@ -52,10 +56,10 @@ def test_a_shaken_camera_gives_its_path_and_a_scene_that_looks_right(
     assert reconstructor.status().state is State.TRACK, reconstructor.status().reason
     reconstructor.finish()
     path = reconstructor.trajectory()
-    score = score_trajectory(truth, path, 20000.0)
+    score = score_trajectory(truth=truth, estimate=path, frame_rate_hz=20000.0)
     assert score.coverage > 0.98
     assert score.errors is not None and score.errors.ate_percent < 3.0 and score.errors.rpe_r_deg < 0.1
-    carried = similarity_of_trajectories(truth, path, 20000.0)
+    carried = similarity_of_trajectories(truth=truth, estimate=path, frame_rate_hz=20000.0)
     k = FRAMES // 2
     rotation, centre = carried.poses(truth.rotations[k : k + 1], truth.centres[k : k + 1])
     seen = camera.view(truth.rotations[k], truth.centres[k])
@@ -70,7 +74,10 @@ def test_a_refinement_ends_settled(
     steps: int,
     budget_s: float | None,
 ) -> None:
-    """What the last view alone pulls at is its noise; with less time than its steps take it comes to the same end."""
+    """The last views alone would add their noise. With less time than its steps take it comes to the same end."""
+    clock = SimpleNamespace(perf_counter=partial(next, count(0.0, 0.02)))  # each reading is 20 ms after the last
+    monkeypatch.setattr("spiked.recon.refiner.time", clock)
+    monkeypatch.setattr("spiked.recon.reconstructor.time", clock)
     moved: list[float] = []
     step = Mapper.step
 
@@ -116,6 +123,52 @@ def test_same_seed_same_bits(shaken: tuple[SimulatedCamera, np.ndarray, Trajecto
         np.testing.assert_array_equal(a, b)
 
 
+def scene_psnr_db(reconstructor: Reconstructor) -> float:
+    return reconstructor.scene_psnr_db(
+        reconstructor.scene(), reconstructor.trajectory(), reconstructor.camera.intrinsics
+    )
+
+
+def test_a_refinement_cancelled_at_once_leaves_the_live_map(
+    shaken: tuple[SimulatedCamera, np.ndarray, Trajectory],
+) -> None:
+    """A map that was a little off the final path was rebuilt after the end had been asked for, and not refined."""
+    _, frames, _ = shaken
+    always_stale = MapOptions(schedule=Schedule(stale_px=-1.0))
+    reconstructor = Reconstructor(sensor(), Options(mapping=always_stale))
+    for first in range(0, FRAMES, 40):
+        reconstructor.feed(first, frames[first : first + 40])
+        reconstructor.improve(0.2)
+    reconstructor.improve(3.0)
+    before, live_map = scene_psnr_db(reconstructor), reconstructor.scene()
+    stages: list[str] = []
+    reconstructor.finish(lambda status: stages.append(status.stage), cancelled=lambda: True)
+    after = reconstructor.scene()
+    assert stages[0] == "refining"
+    for a, b in zip(live_map.arrays(), after.arrays(), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert scene_psnr_db(reconstructor) > before - 0.5
+    assert len(reconstructor.trajectory()) > 0.95 * FRAMES
+
+
+def test_scene_psnr_falls_with_missing_splats_and_missing_poses_but_not_with_brightness(
+    shaken: tuple[SimulatedCamera, np.ndarray, Trajectory],
+) -> None:
+    reconstructor = Reconstructor(sensor(), Options(steps=150))
+    feed(reconstructor, shaken[1])
+    reconstructor.finish()
+    scene, path, optics = reconstructor.scene(), reconstructor.trajectory(), reconstructor.camera.intrinsics
+    good = scene_psnr_db(reconstructor)
+    half = scene.select(np.arange(0, len(scene), 2))
+    part = Trajectory(path.times_s[:-240], path.rotations[:-240], path.centres[:-240])
+    assert good > 20
+    assert reconstructor.scene_psnr_db(half, path, optics) < good - 3
+    assert reconstructor.scene_psnr_db(scene, part, optics) < good - 3
+    brighter = scene.select(np.arange(len(scene)))
+    brighter.colours *= 2
+    assert abs(reconstructor.scene_psnr_db(brighter, path, optics) - good) < 0.01
+
+
 def test_given_poses_are_kept(shaken: tuple[SimulatedCamera, np.ndarray, Trajectory]) -> None:
     _, frames, truth = shaken
     reconstructor = Reconstructor(sensor(), Options(steps=100, poses=truth))
@@ -126,6 +179,21 @@ def test_given_poses_are_kept(shaken: tuple[SimulatedCamera, np.ndarray, Traject
     assert (found >= 0).mean() > 0.95
     np.testing.assert_allclose(path.centres[found[found >= 0]], truth.centres[found >= 0], atol=1e-3)
     assert len(reconstructor.scene()) > 500
+
+
+def test_views_with_given_poses_stay_in_the_unit_of_these(
+    shaken: tuple[SimulatedCamera, np.ndarray, Trajectory],
+) -> None:
+    """The map has another unit from the end on; the last views are tracked just before it."""
+    _, frames, truth = shaken
+    far = Trajectory(truth.times_s, truth.rotations, 10 * truth.centres)
+    reconstructor = Reconstructor(sensor(), Options(steps=0, poses=far))
+    feed(reconstructor, frames)
+    reconstructor.finish()
+    for view in reconstructor.tracked():
+        (row,) = far.nearest(np.array([view.time_s]), 1e-4)
+        assert view.centre is not None
+        np.testing.assert_allclose(view.centre, far.centres[row], atol=0.02)
 
 
 def test_a_recording_of_forty_frames_says_that_it_is_too_short() -> None:
@@ -161,7 +229,7 @@ def test_a_mosaic_camera_gives_a_coloured_scene() -> None:
     reconstructor = Reconstructor(colour, Options(steps=150))
     feed(reconstructor, frames)
     reconstructor.finish()
-    score = score_trajectory(truth, reconstructor.trajectory(), 20000.0)
+    score = score_trajectory(truth=truth, estimate=reconstructor.trajectory(), frame_rate_hz=20000.0)
     assert score.errors is not None and score.errors.ate_percent < 5.0
     assert reconstructor.scene().colours.shape[1] == 3
     assert np.std(reconstructor.scene().colours, axis=1).mean() > 0.003

@@ -41,9 +41,9 @@ def test_tracks_have_no_bias(figure: Figure) -> None:
     for first in range(0, len(frames), 40):
         reconstructor.feed(first, frames[first : first + 40])
     assert sensor.intrinsics is not None
-    k, places = sensor.intrinsics, np.full((reconstructor._odometry._tracks.next_id, 3), np.nan)
+    k, places = sensor.intrinsics, np.full((len(reconstructor.odometry.points), 3), np.nan)
     known, errors = np.zeros(len(places), bool), []
-    for view in reconstructor._odometry.views[2:]:  # in the first two, the speed of the tracks is not known
+    for view in reconstructor.odometry.views[2:]:  # in the first two, the speed of the tracks is not known
         (rotation,), (centre,) = camera.motion.poses([view.time])
         local = (places[view.ids] - centre) @ rotation
         errors.append(local[:, :2] / local[:, 2:] * [k.fx, k.fy] + [k.cx, k.cy] - view.pixels)
@@ -76,7 +76,7 @@ def test_a_gap_is_left_behind_in_four_blocks(lost: int, figure: Figure) -> None:
     begin = 320
     camera = SimulatedCamera(SENSOR, 2, arc((begin, begin + lost) if lost == 1000 else None))
     reconstructor, error, _ = staging.followed(camera, begin + lost + 160, (begin, begin + lost))
-    views = [v for v in reconstructor._odometry.views if v.time > begin + lost]
+    views = [v for v in reconstructor.odometry.views if v.time > begin + lost]
     found = next(n for n, view in enumerate(views) if view.rotation is not None and view.state is not State.LOST)
     blocks = (views[found].time - begin - lost) / 8
     figure(f"gap of {lost} frames: blocks until found; ATE", f"{blocks:.1f}; {error:.2f} %", "< 4; no NaN")
@@ -104,7 +104,9 @@ def _quality(maps: PixelMaps, lighting: Lighting, frames: int = 480) -> float:
     reconstructor.finish()
     k = np.arange(frames)
     truth = Trajectory((k + 0.5) / SENSOR.frame_rate_hz, *camera.truth(k))
-    carried = similarity_of_trajectories(truth, reconstructor.trajectory(), SENSOR.frame_rate_hz)
+    carried = similarity_of_trajectories(
+        truth=truth, estimate=reconstructor.trajectory(), frame_rate_hz=SENSOR.frame_rate_hz
+    )
     figures = []
     for at in (60, 150, 240, 330, 420):
         rotation, centre = carried.poses(truth.rotations[at : at + 1], truth.centres[at : at + 1])

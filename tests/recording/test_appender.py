@@ -1,6 +1,7 @@
 """Files that grow past the page cache."""
 
 import errno
+import fcntl
 import os
 import resource
 import signal
@@ -75,11 +76,18 @@ def test_a_file_system_without_direct_writes_is_written_as_any(disk: Path, monke
     assert (np.fromfile(disk / "a", np.uint8) == expected).all()
 
 
-def test_direct_writes_that_are_refused_later_are_done_as_any(disk: Path) -> None:
-    """Pages of a size that the file system does not take: staged from memory at an odd address."""
+def test_direct_writes_that_are_refused_later_are_done_as_any(disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some file systems open a file for direct writes and then refuse the writes."""
+    real = os.pwrite
+
+    def refusing(file: int, data: bytes, offset: int) -> int:
+        if fcntl.fcntl(file, fcntl.F_GETFL) & os.O_DIRECT:
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        return real(file, data, offset)
+
+    monkeypatch.setattr(os, "pwrite", refusing)
     expected = content(500_000)
     file = Appender(disk / "a", resume=False, direct=True)
-    file._staged = file._staged[1:]
     file.append(expected)
     file.append(expected)
     assert file.direct_bytes == 0

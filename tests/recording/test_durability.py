@@ -1,6 +1,5 @@
 """What a recording is worth after kills, full disks and bad bytes."""
 
-import ctypes
 import os
 import resource
 import shutil
@@ -144,7 +143,7 @@ def test_an_unsynced_block_with_a_wrong_byte_is_cut_off_and_a_synced_one_is_told
     content = bytearray(path.read_bytes())
     content[8 * SENSOR.frame_bytes] ^= 1
     path.write_bytes(content)
-    assert "8 frames are not as they were written, the first at frame 8" in verify(path).reasons
+    assert "8 frames differ from what was written, the first at frame 8" in verify(path).reasons
 
 
 def test_a_resumed_recording_is_as_one_that_was_never_interrupted(tmp_path: Path) -> None:
@@ -265,15 +264,15 @@ def test_a_read_only_file_system_is_told(small_disk: Path) -> None:
 
 def test_the_disk_begins_before_a_sync_is_due(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     begun: list[tuple[int, int]] = []
-    real = durability._libc.sync_file_range
+    real = durability.begin_write
 
-    def watched(file: int, offset: ctypes.c_int64, size: ctypes.c_int64, flags: int) -> int:
-        begun.append((offset.value, size.value))
-        return int(real(file, offset, size, flags))
+    def watched(file: int, offset: int, size: int) -> None:
+        begun.append((offset, size))
+        real(file, offset, size)
 
-    monkeypatch.setattr(durability._libc, "sync_file_range", watched)
-    monkeypatch.setattr(durability, "_EARLY_BYTES", 4096)
-    monkeypatch.setattr(durability, "_PERIOD_S", 600.0)
+    monkeypatch.setattr(durability, "begin_write", watched)
+    monkeypatch.setattr(durability, "EARLY_BYTES", 4096)
+    monkeypatch.setattr(durability, "SYNC_PERIOD_S", 600.0)
     with RecordingWriter(tmp_path / "a.dat", SENSOR, durability=LIVE) as writer:
         for _ in range(3):
             writer.append(frames(writer.next_frame, 40))

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from spiked.render import Camera, Splats
+from spiked.render import Camera
+from spiked.scene import Scene
 from spiked.sensor import Intrinsics
 
 
@@ -10,13 +11,13 @@ def camera(width: int = 45, height: int = 35, focal: float = 40.0) -> Camera:
     return Camera(Intrinsics(focal, focal * 1.05, width / 2 + 0.7, height / 2 - 0.4), width, height)
 
 
-def splats(count: int, colours: int, seed: int, size: float = 0.06) -> Splats:
+def splats(count: int, colours: int, seed: int, size: float = 0.06) -> Scene:
     """Splats that fill the view of `camera` from the origin, a few of them beside and behind it."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(0.8, 3.0, count)
     means = np.stack([rng.uniform(-0.7, 0.7, count) * z, rng.uniform(-0.6, 0.6, count) * z, z], 1)
     means[: count // 10, 2] *= -1
-    return Splats(
+    return Scene(
         means.astype(np.float32),
         rng.normal(size=(count, 4)).astype(np.float32),
         (np.log(size) + rng.normal(0, 0.6, (count, 3))).astype(np.float32),

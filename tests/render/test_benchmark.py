@@ -1,4 +1,4 @@
-"""The benchmark measures what it says; its figures are not judged here."""
+"""The benchmark measures what it states; no figure has a bound here."""
 
 import numpy as np
 

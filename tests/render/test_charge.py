@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from spiked.errors import ConfigurationError
-from spiked.render.charge import CELL_PX, ChargeLoss
+from spiked.render.charge import WARP_CELL_PX, ChargeLoss
 from spiked.sensor import BitOrder, Mosaic, Sensor
 
 WIDTH, HEIGHT, FRAMES = 88, 40, 24
@@ -19,7 +19,7 @@ STEP = np.array([1.3, 0.4])
 
 
 def nodes() -> tuple[int, int]:
-    return -(-HEIGHT // CELL_PX) + 1, -(-WIDTH // CELL_PX) + 1
+    return -(-HEIGHT // WARP_CELL_PX) + 1, -(-WIDTH // WARP_CELL_PX) + 1
 
 
 def back(step: np.ndarray) -> np.ndarray:

@@ -12,8 +12,10 @@ import pytest
 import render_scenes as scenes
 import torch
 
+from spiked import render
 from spiked.errors import ConfigurationError
-from spiked.render import Camera, Gradients, Image, Rasteriser, Splats, reference
+from spiked.render import Camera, Gradients, Rasteriser, RenderedImage, reference
+from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Mosaic
 
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "colours")
@@ -36,7 +38,7 @@ class Case:
         values = size if name != "three colours" else (*size, 3)
         self.d_values = rng.normal(size=values).astype(np.float32)
 
-    def forward(self, threads: int = 1) -> tuple[Rasteriser, Image]:
+    def forward(self, threads: int = 1) -> tuple[Rasteriser, RenderedImage]:
         rasteriser = Rasteriser(self.camera, threads)
         image = rasteriser.forward(
             self.splats,
@@ -210,7 +212,7 @@ def test_any_size_of_image(width: int, height: int) -> None:
     assert np.abs(image.values - values.detach().numpy()).max() < 1e-4
 
 
-def one_splat(**changes: object) -> Splats:
+def one_splat(**changes: object) -> Scene:
     arrays = {
         "means": [[0, 0, 2]],
         "quats": [[1, 0, 0, 0]],
@@ -218,12 +220,16 @@ def one_splat(**changes: object) -> Splats:
         "opacity_logits": [1],
         "colours": [[0.5]],
     } | changes
-    return Splats(**{name: np.array(value, np.float32) for name, value in arrays.items()})
+    return Scene(**{name: np.array(value, np.float32) for name, value in arrays.items()})
+
+
+def test_former_names_of_the_splat_arrays_are_the_scene() -> None:
+    assert render.Splats is render.SplatArrays is Scene
 
 
 def test_an_empty_scene_is_background() -> None:
     camera = scenes.camera()
-    empty = Splats(*(np.zeros(shape, np.float32) for shape in ((0, 3), (0, 4), (0, 3), (0,), (0, 1))))
+    empty = Scene(*(np.zeros(shape, np.float32) for shape in ((0, 3), (0, 4), (0, 3), (0,), (0, 1))))
     rasteriser = Rasteriser(camera, 1)
     image = rasteriser.forward(empty, [np.eye(3)], [np.zeros(3)], background=0.25)
     assert (image.values == 0.25).all()
@@ -285,7 +291,7 @@ def test_extreme_splats_stay_finite(changes: dict[str, object]) -> None:
 def test_an_opaque_pile_hides_what_is_behind() -> None:
     """Through the early stop: sixty opaque layers in front of a bright one."""
     depths = np.linspace(1, 2, 61)
-    layers = Splats(
+    layers = Scene(
         np.stack([0 * depths, 0 * depths, depths], 1).astype(np.float32),
         np.tile(np.float32([1, 0, 0, 0]), (61, 1)),
         np.full((61, 3), 1.0, np.float32),

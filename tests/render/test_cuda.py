@@ -47,7 +47,7 @@ def small_rasterisation(
             torch.zeros(1, 3),
         )
         pose = (turn.double(), (-turn @ view[:3, 3]).double())
-        values, alpha, depth = reference._render_one(splats, seen, pose, 0.0, near_plane)
+        values, alpha, depth = reference.render_pose(splats, seen, pose, 0.0, near_plane)
         images.append(torch.cat([values + (1 - alpha)[:, :, None] * behind, depth[:, :, None]], 2))
         alphas.append(alpha[:, :, None])
         radii.append(torch.ones(len(means), 2))

@@ -13,7 +13,7 @@ import torch
 
 from spiked.errors import ConfigurationError
 from spiked.pose import exp_so3
-from spiked.render import Camera, Gradients, Image, Rasteriser, reference
+from spiked.render import Camera, Gradients, Rasteriser, RenderedImage, reference
 from spiked.sensor import Intrinsics, Mosaic
 
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "colours")
@@ -33,7 +33,7 @@ class Case:
         self.channels = Mosaic.GRBG.channels(*size) if name == "mosaic" else None
         self.d_values = rng.normal(size=size if name != "three colours" else (*size, 3)).astype(np.float32)
 
-    def forward(self, threads: int = 1) -> tuple[Rasteriser, Image]:
+    def forward(self, threads: int = 1) -> tuple[Rasteriser, RenderedImage]:
         rasteriser = Rasteriser(self.camera, threads)
         image = rasteriser.forward_moving(
             self.splats,
@@ -113,7 +113,7 @@ def test_a_camera_that_does_not_move_sees_what_a_still_one_sees() -> None:
     moving_gradients = rasteriser.backward(case.d_values)
     still = rasteriser.forward(case.splats, case.rotations[:1], case.centres[:1], background=BACKGROUND)
     still_gradients = rasteriser.backward(case.d_values)
-    for field in fields(Image):
+    for field in fields(RenderedImage):
         assert relative(getattr(moving, field.name), getattr(still, field.name)) < 1e-5
     for name in PARAMETERS:
         assert relative(getattr(moving_gradients, name), getattr(still_gradients, name)) < 1e-4
@@ -154,7 +154,7 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
         assert bits == reference_bits
 
 
-def passage(camera: Camera, motion_px: float, poses: int) -> tuple[np.ndarray, np.ndarray]:
+def camera_motion(camera: Camera, motion_px: float, poses: int) -> tuple[np.ndarray, np.ndarray]:
     """Poses of a camera that turns and shifts so that the image moves by about `motion_px`, mostly to one side."""
     times = np.linspace(-0.5, 0.5, poses)
     angle = motion_px / camera.intrinsics.fx
@@ -171,18 +171,18 @@ def test_few_sub_frames_are_close_to_many_exact_renders(sub_frames: int, bound: 
     start = rng.uniform(0, 0.3, (64, 96)).astype(np.float32)
     stop = rng.uniform(0.7, 1, (64, 96)).astype(np.float32)
     many = 64
-    rotations, centres = passage(camera, 2.0, many + 1)
+    rotations, centres = camera_motion(camera, 2.0, many + 1)
     edges = np.arange(many + 1)[:, None, None] / many
     overlap = np.clip(np.minimum(stop, edges[1:]) - np.maximum(start, edges[:-1]), 0, None)
     rasteriser = Rasteriser(camera, 1)
-    middle_rotations, middle_centres = passage(camera, 2.0, 2 * many + 1)
+    middle_rotations, middle_centres = camera_motion(camera, 2.0, 2 * many + 1)
     exact = rasteriser.forward(
         splats,
         middle_rotations[1::2],
         middle_centres[1::2],
         weights=(overlap / (stop - start)).astype(np.float32),
     ).values
-    rotations, centres = passage(camera, 2.0, sub_frames + 1)
+    rotations, centres = camera_motion(camera, 2.0, sub_frames + 1)
     windows = np.stack([start, stop]) * np.float32(sub_frames)
     image = rasteriser.forward_moving(splats, rotations, centres, windows).values
     inner = (slice(4, -4), slice(4, -4))

@@ -8,13 +8,15 @@ from pathlib import Path
 import numpy as np
 import psutil
 from numpy.typing import NDArray
-from spiked_service.api.announce import BusAnnouncer
-from spiked_service.events import Bus
-from spiked_service.keeping import Keeping
-from spiked_service.snapshot import Snapshot
+from spiked_service.api.bus_notifier import BusNotifier
+from spiked_service.captures.archive import DataStore
+from spiked_service.daemon import open_data_store
+from spiked_service.events.bus import Bus
+from spiked_service.store.snapshot import Snapshot
 
 from spiked.recording import RecordingWriter, open_recording
-from spiked.sensor import Sensor
+from spiked.sensor import Intrinsics, Sensor
+from spiked.simulate import MotionKind, SimulatedCamera
 
 SENSOR = Sensor(96, 64, 20_000.0)
 SMALL = "sim:?width=96&height=64"
@@ -29,26 +31,26 @@ def wait_for(condition: Callable[[], object], what: str) -> None:
         time.sleep(0.02)
 
 
-def over(keeping: Keeping, capture_id: str) -> Snapshot:
+def over(data_store: DataStore, capture_id: str) -> Snapshot:
     """The capture when it is over."""
-    wait_for(lambda: keeping.captures.get(capture_id).row.state.over, "the capture is over")
-    return keeping.captures.get(capture_id)
+    wait_for(lambda: data_store.captures.get(capture_id).row.state.over, "the capture is over")
+    return data_store.captures.get(capture_id)
 
 
-def received(keeping: Keeping, capture_id: str) -> int:
+def received(data_store: DataStore, capture_id: str) -> int:
     """Frames that have come so far."""
-    counters = keeping.captures.get(capture_id).counters
+    counters = data_store.captures.get(capture_id).counters
     return 0 if counters is None else counters.received
 
 
 @contextmanager
-def kept(data: Path) -> Iterator[Keeping]:
+def kept(data: Path) -> Iterator[DataStore]:
     """A service on a data folder."""
-    keeping = Keeping(data, BusAnnouncer(Bus()))
+    data_store = open_data_store(data, BusNotifier(Bus()))
     try:
-        yield keeping
+        yield data_store
     finally:
-        keeping.close()
+        data_store.close()
 
 
 def random_recording(path: Path, frames: int, sensor: Sensor = SENSOR) -> NDArray[np.uint8]:
@@ -57,6 +59,24 @@ def random_recording(path: Path, frames: int, sensor: Sensor = SENSOR) -> NDArra
     with RecordingWriter(path, sensor) as writer:
         writer.append(content)
     return content
+
+
+def still_recording(path: Path) -> Path:
+    """A recording of a camera that stands still: there is no path in it."""
+    return _room_recording(path, 400, flow_px=1e-6, parallax=1e-6)
+
+
+def moving_recording(path: Path) -> Path:
+    """A recording of a camera that moves: path and scene are found."""
+    return _room_recording(path, 500, flow_px=0.3, parallax=0.5)
+
+
+def _room_recording(path: Path, frames: int, flow_px: float, parallax: float) -> Path:
+    sensor = Sensor(160, 96, 20_000.0, intrinsics=Intrinsics.from_fov(160, 96, 60))
+    camera = SimulatedCamera(sensor, seed=4, motion=MotionKind.ARC, flow_px=flow_px, parallax=parallax)
+    with RecordingWriter(path, sensor) as writer:
+        writer.append(camera.next_frames(frames))
+    return path
 
 
 def assert_holds(path: Path, frames: NDArray[np.uint8]) -> None:
@@ -72,6 +92,6 @@ def children() -> list[psutil.Process]:
     found = []
     for child in psutil.Process().children():
         with suppress(psutil.NoSuchProcess):  # a zombie has no command line
-            if "spiked_service.worker" in child.cmdline()[1:3]:
+            if "spiked_service.workers" in child.cmdline():
                 found.append(child)
     return found

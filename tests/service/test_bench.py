@@ -1,4 +1,4 @@
-"""`spiked bench` measures what it says; how fast things are is not judged here."""
+"""`spiked bench` measures what it states; no figure has a bound here."""
 
 import json
 import re
@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from spiked_service.benchmarks import files, sustained, tracking
-from spiked_service.benchmarks.growth import peak_bytes
-from spiked_service.benchmarks.report import Machine, document, text
-from spiked_service.cli import app
+from spiked_service.cli.bench import files, sustained, tracking
+from spiked_service.cli.bench.growth import peak_bytes
+from spiked_service.cli.bench.report import Machine, document, text
+from spiked_service.cli.main import app
 from typer.testing import CliRunner
 
 from spiked.errors import ConfigurationError
+from spiked.measurement import Measurement
 from spiked.render import benchmark as renderer
-from spiked.render.benchmark import Row
 from spiked.ring import RingError
 from spiked.sensor import Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
@@ -30,8 +30,8 @@ def test_files_are_written_and_decoded(tmp_path: Path) -> None:
 def test_a_stream_is_accounted_for_frame_by_frame(tmp_path: Path) -> None:
     outcome = sustained.run(Sensor(64, 40, 2000.0), 0.5, record=tmp_path)
     assert outcome.frames == 1000
-    assert set(outcome.lost) == {"tracking", "recorder"}
-    assert set(outcome.consumer_shares) == {"tracking", "recorder", "preview"}
+    assert set(outcome.lost) == {"windows", "recorder"}
+    assert set(outcome.consumer_shares) == {"windows", "recorder", "preview"}
     assert all(0 <= lost <= outcome.frames for lost in outcome.lost.values())
     assert not list(tmp_path.iterdir())
 
@@ -57,7 +57,7 @@ def test_tracking_wants_one_recording_in_a_folder(tmp_path: Path) -> None:
 
 def test_rows_as_text_and_as_a_document() -> None:
     machine = Machine("a processor", 2, "a system", 0.1, 1e11, 1e10)
-    rows = [Row("work", 1.5, "ms", 0.6, "of peak", ">= 0.55", 0.02, 2), Row("more", 3, "GB/s")]
+    rows = [Measurement("work", 1.5, "ms", 0.6, "of peak", ">= 0.55", 0.02, 2), Measurement("more", 3, "GB/s")]
     lines = text(machine, rows)
     assert "a processor" in lines[0]
     assert "0.6 of peak" in lines[1]

@@ -67,5 +67,5 @@ def test_a_wrong_mosaic_is_said_and_corrected_on_request(tmp_path: Path) -> None
     report = json.loads((tmp_path / "wrong" / "report.json").read_text())
     assert any("mosaic" in warning for warning in report["warnings"])
     done = spiked("reconstruct", recording, "-o", tmp_path / "right", "--steps", 20, "--mosaic", "auto")
-    assert "by its pixels the mosaic is GRBG" in " ".join(done.stderr.split())
+    assert "the mosaic detected from the pixels is GRBG" in " ".join(done.stderr.split())
     assert json.loads((tmp_path / "right" / "report.json").read_text())["warnings"] == []

@@ -5,9 +5,18 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
-from spiked_service.config import LogLevel, SettingOrigin, Settings, load_settings, reloadable, setting
+from spiked_service.settings.settings import (
+    LogLevel,
+    SettingOrigin,
+    Settings,
+    load_settings,
+    pass_on,
+    reloadable,
+    setting,
+)
 
 from spiked.errors import ConfigurationError
 
@@ -65,6 +74,36 @@ def test_a_wrong_file_is_refused_with_the_nearest_right(tmp_path: Path, text: st
     assert all(part in str(refused.value) for part in says), refused.value
 
 
+NUMBERS = [
+    name for name, one in Settings.model_fields.items() if {int, float} & {one.annotation, *get_args(one.annotation)}
+]
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_every_number_is_finite_and_bounded(name: str) -> None:
+    for value in ("inf", "-inf", "nan", "1e99", "9" * 40, "-1"):
+        with pytest.raises(ConfigurationError, match=f"{name}: ") as refused:
+            load_settings({name: value})
+        assert value in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("text", ['["/a", "/b c"]', "/a, /b c", ' ["/a","/b c"] '])
+def test_a_list_may_be_json(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    assert load_settings({"source_folders": text}).settings.source_folders == ["/a", "/b c"]
+    monkeypatch.setenv("SPIKED_SOURCE_FOLDERS", text)
+    assert load_settings().settings.source_folders == ["/a", "/b c"]
+
+
+@pytest.mark.parametrize("text", ['["/a", "/b"', '["/a", 3]', '[{"a": 1}]'])
+def test_a_list_that_is_wrong_json_is_refused(text: str) -> None:
+    with pytest.raises(ConfigurationError, match="--set source_folders: "):
+        load_settings({"source_folders": text})
+
+
+def test_an_address_in_brackets_is_no_json() -> None:
+    assert load_settings({"allowed_hosts": "[::1], camera.lab"}).settings.allowed_hosts == ["[::1]", "camera.lab"]
+
+
 def test_a_wrong_environment_or_flag_is_refused_by_its_own_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPIKED_LIMIT_RENDER", "3")
     with pytest.raises(ConfigurationError, match=r"SPIKED_LIMIT_RENDER: .* SPIKED_LIMIT_RENDERS\?"):
@@ -74,7 +113,7 @@ def test_a_wrong_environment_or_flag_is_refused_by_its_own_name(monkeypatch: pyt
     with pytest.raises(ConfigurationError, match=r"SPIKED_ZMQ: .*'maybe'"):
         load_settings()
     monkeypatch.delenv("SPIKED_ZMQ")
-    with pytest.raises(ConfigurationError, match=r"--retention-dyas: .* retention_days\?"):
+    with pytest.raises(ConfigurationError, match=r"--set retention_dyas: .* retention_days\?"):
         load_settings(dict([setting("retention-dyas=3")]))
     with pytest.raises(ConfigurationError, match="NAME=VALUE"):
         setting("port")
@@ -119,3 +158,32 @@ def test_config_show_prints_each_origin(tmp_path: Path) -> None:
     assert rows["host"] == ("127.0.0.1", "default")
     table = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
     assert any(line.split()[:3] == ["port", "9000", "file"] for line in table.splitlines())
+
+
+def test_the_switches_of_compiled_code_are_settings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in ("SPIKED_RENDER", "SPIKED_SIMD"):
+        monkeypatch.setenv(name, "")  # as good as not set; and whatever is put there is taken away again
+    assert (load_settings().settings.render, load_settings().settings.simd) == (None, None)
+    monkeypatch.setenv("SPIKED_RENDER", "cpu")
+    assert load_settings().settings.render == "cpu"
+    with pytest.raises(ConfigurationError, match=r"SPIKED_RENDER: .*'gpu'"):
+        monkeypatch.setenv("SPIKED_RENDER", "gpu")
+        load_settings()
+    monkeypatch.setenv("SPIKED_RENDER", "")
+    (tmp_path / "own.toml").write_text('render = "cpu"\nsimd = "baseline"\n')
+    pass_on(load_settings(file=tmp_path / "own.toml").settings)
+    run = subprocess.run(
+        [sys.executable, "-m", "spiked_service", "version"], capture_output=True, text=True, check=True
+    )
+    assert "instruction sets: baseline\n" in run.stdout
+    assert "renderer: cpu (SPIKED_RENDER asks for it)" in run.stdout
+
+
+def test_a_forced_renderer_does_not_keep_the_settings_from_being_shown() -> None:
+    run = subprocess.run(
+        [sys.executable, "-m", "spiked_service", "config", "show"],
+        env={**os.environ, "SPIKED_RENDER": "cpu", "SPIKED_SIMD": "baseline"},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    assert "renderer: cpu" in run.stdout

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from spiked_service.cli import app
-from spiked_service.commands.convert import Form, read_content, write_content
-from spiked_service.geometry import Geometry
+from spiked_service.cli.commands.convert import Form, read_content, write_content
+from spiked_service.cli.main import app
 from typer.testing import CliRunner
 
 from spiked.errors import ConfigurationError, RecordingError
-from spiked.recording import Gap, RecordingWriter, open_recording
+from spiked.recording import Gap, RecordingGeometry, RecordingWriter, open_recording
 from spiked.sensor import BitOrder, Layout, Sensor
 
 REAL = Path(__file__).parents[3] / "shared" / "wire" / "sps10_002_ep82_contiguous.bin"
@@ -25,7 +24,7 @@ SENSORS = {
 
 
 def converted(source: Path, out: Path, to: Form) -> Path:
-    write_content(read_content(source, None, Geometry()), out, to)
+    write_content(read_content(source, None, RecordingGeometry()), out, to)
     return out
 
 
@@ -78,7 +77,7 @@ def test_a_size_that_a_form_cannot_hold_writes_nothing(tmp_path: Path) -> None:
 def test_what_holds_no_frame_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.bin").write_bytes(bytes(20_000))
     with pytest.raises(RecordingError, match="no whole frame"):
-        write_content(read_content(tmp_path / "a.bin", Form.USB, Geometry()), tmp_path / "b.dat", Form.COMPACT)
+        write_content(read_content(tmp_path / "a.bin", Form.USB, RecordingGeometry()), tmp_path / "b.dat", Form.COMPACT)
     assert not (tmp_path / "b.dat").exists()
 
 

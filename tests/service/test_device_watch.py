@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from spiked_service.api.announce import BusAnnouncer
-from spiked_service.api.devices import DeviceWatch
+from spiked_service.api.bus_notifier import BusNotifier
+from spiked_service.api.routes.devices import DeviceWatch
 from spiked_service.api.sources import Sources
-from spiked_service.events import Bus, Topic
-from spiked_service.keeping import Keeping
-from spiked_service.live import LiveSettings
+from spiked_service.daemon import open_data_store
+from spiked_service.events.bus import Bus, Topic
+from spiked_service.settings.reload import ReloadableSettings
 from spiked_service.store.rows import Plan
 
 from .survival import over, random_recording, received, wait_for
@@ -17,8 +17,8 @@ def test_a_device_that_streams_and_rests_is_told_once_each_time(tmp_path: Path) 
     random_recording(tmp_path / "noise.dat", 500)
     source = f"replay:{tmp_path / 'noise.dat'}?repeat=9999"
     bus = Bus()
-    keeping = Keeping(tmp_path / "data", BusAnnouncer(bus))
-    watch = DeviceWatch(keeping.captures, Sources(LiveSettings({"devices": [source]})), bus)
+    data_store = open_data_store(tmp_path / "data", BusNotifier(bus))
+    watch = DeviceWatch(data_store.captures, Sources(ReloadableSettings({"devices": [source]})), bus)
     heard = bus.subscribe([Topic.DEVICE])
 
     def states() -> list[tuple[str, str | None]]:
@@ -33,12 +33,12 @@ def test_a_device_that_streams_and_rests_is_told_once_each_time(tmp_path: Path) 
     try:
         assert states() == [("idle", None)]
         assert states() == []
-        capture_id = keeping.captures.start(Plan(source, reconstruct=False)).id
-        wait_for(lambda: received(keeping, capture_id) > 100, "frames come")
+        capture_id = data_store.captures.start(Plan(source, reconstruct=False)).id
+        wait_for(lambda: received(data_store, capture_id) > 100, "frames come")
         assert states()[-1] == ("streaming", capture_id)
         assert states() == []
-        keeping.captures.stop(capture_id)
-        over(keeping, capture_id)
+        data_store.captures.stop(capture_id)
+        over(data_store, capture_id)
         assert states() == [("idle", None)]
     finally:
-        keeping.close()
+        data_store.close()

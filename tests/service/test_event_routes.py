@@ -16,10 +16,10 @@ import pytest
 import uvicorn
 from fastapi import FastAPI
 from pydantic import BaseModel
-from spiked_service.api.events import event_routes
 from spiked_service.api.problems import install
-from spiked_service.events import Bus, Topic
-from spiked_service.limits import Gate
+from spiked_service.api.routes.events import event_routes
+from spiked_service.base.limits import ConcurrencyLimit
+from spiked_service.events.bus import Bus, Topic
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -37,10 +37,10 @@ class Service:
 
     def __init__(self) -> None:
         self.bus = Bus()
-        self.gate = Gate("event clients", CLIENTS)
+        self.concurrency = ConcurrencyLimit("event clients", CLIENTS)
         app = FastAPI()
         install(app)
-        app.include_router(event_routes(self.bus, self.gate), prefix="/api/v1")
+        app.include_router(event_routes(self.bus, self.concurrency), prefix="/api/v1")
         config = uvicorn.Config(app, log_level="warning", ws_per_message_deflate=False, timeout_graceful_shutdown=1)
         self.server = uvicorn.Server(config)
         self.listener = socket.create_server(("127.0.0.1", 0))
@@ -84,7 +84,7 @@ def test_a_client_gets_its_topics_in_order(service: Service) -> None:
         got = receive(client, 10)
     assert [message["data"]["number"] for message in got] == list(range(1, 20, 2))
     assert {message["topic"] for message in got} == {"pose"}
-    wait_for(lambda: service.bus.subscribers() == 0 and service.gate.inside == 0)
+    wait_for(lambda: service.bus.subscribers() == 0 and service.concurrency.active == 0)
 
 
 def test_a_client_that_comes_back_goes_on_where_it_was(service: Service) -> None:
@@ -112,7 +112,7 @@ def test_only_so_many_clients(service: Service) -> None:
     assert httpx.get(f"http://{service.address}").status_code == 503
     for client in clients:
         client.close()
-    wait_for(lambda: service.gate.inside == 0)
+    wait_for(lambda: service.concurrency.active == 0)
     service.client().close()
 
 
@@ -122,7 +122,7 @@ def test_a_client_that_talks_is_shown_out(service: Service) -> None:
         with pytest.raises(ConnectionClosed) as closed:
             client.recv(timeout=DEADLINE_S)
     assert closed.value.rcvd is not None and closed.value.rcvd.code == 1003
-    wait_for(lambda: service.gate.inside == 0)
+    wait_for(lambda: service.concurrency.active == 0)
 
 
 def raw_client(service: Service) -> socket.socket:
@@ -184,16 +184,16 @@ def test_a_client_that_reads_nothing_stops_nobody_and_learns_what_it_lost(servic
             if seen["pose"] + lost["pose"] == rounds * burst and seen["preview"] + lost["preview"] == rounds:
                 break
         assert lost["preview"] / rounds > lost["pose"] / (rounds * burst) > 0
-    wait_for(lambda: service.gate.inside == 0)
+    wait_for(lambda: service.concurrency.active == 0)
 
 
 def test_a_client_that_is_stuck_is_left(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("spiked_service.api.events._STUCK_S", 0.3)
+    monkeypatch.setattr("spiked_service.api.streams.STUCK_S", 0.3)
     with closing(raw_client(service)):
         wait_for(lambda: service.bus.subscribers() == 1)
         for number in range(4000):
             service.bus.publish(Topic.POSE, Note(number=number, filling="x" * 4000))
-        wait_for(lambda: service.bus.subscribers() == 0 and service.gate.inside == 0)
+        wait_for(lambda: service.bus.subscribers() == 0 and service.concurrency.active == 0)
 
 
 def test_clients_that_vanish_with_messages_on_their_way_cause_no_noise(
@@ -206,7 +206,7 @@ def test_clients_that_vanish_with_messages_on_their_way_cause_no_noise(
         gone.close()
         for number in range(300):
             service.bus.publish(Topic.POSE, Note(number=number))
-        wait_for(lambda: service.bus.subscribers() == 0 and service.gate.inside == 0)
+        wait_for(lambda: service.bus.subscribers() == 0 and service.concurrency.active == 0)
     assert not [record for record in caplog.records if record.name == "asyncio"]
 
 
@@ -244,4 +244,4 @@ def test_server_sent_events_resume_by_the_browsers_own_header(service: Service) 
     assert got[2:4] == ["id: 2", "event: job"]
     assert json.loads(got[4].removeprefix("data: "))["data"]["number"] == 1
     assert got[6] == "id: 3"
-    wait_for(lambda: service.bus.subscribers() == 0 and service.gate.inside == 0)
+    wait_for(lambda: service.bus.subscribers() == 0 and service.concurrency.active == 0)

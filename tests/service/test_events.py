@@ -7,8 +7,8 @@ import time
 
 import msgpack
 from pydantic import BaseModel
-from spiked_service.events import PUBLISHED, Bus, Message, Subscription, Topic
-from spiked_service.payloads import PreviewPayload
+from spiked_service.events.bus import PUBLISHED, Bus, Message, Subscription, Topic
+from spiked_service.events.payloads import PreviewPayload
 
 
 class Note(BaseModel):

@@ -90,10 +90,18 @@ def test_javascript_prints_events(daemon: Callable[..., Any]) -> None:
         assert reload_until(one, lines).split()[1] == "log"
 
 
-def test_zmq_prints_poses(daemon: Callable[..., Any]) -> None:
-    one = daemon()
+def test_the_zmq_example_prints_the_state(daemon: Callable[..., Any]) -> None:
+    one = daemon("--no-capture", "--device", "sim:")
+    plan = {"source": "sim:?width=64&height=48", "frames": 64, "reconstruct": False}
+    assert one.http.post("captures", json=plan).status_code == 201
+    wait_for(lambda: one.http.get("captures").json()["items"][0]["state"] == "complete", "the capture is complete")
     zmq = one.http.get("system").json()["zmq"]
     assert all(zmq[name].startswith("tcp://127.0.0.1:") for name in ("events", "state", "previews"))
+    ports = [zmq[name].rpartition(":")[2] for name in ("events", "state")]
+    with running(sys.executable, str(EXAMPLES / "zmq_events.py"), *ports) as lines:
+        printed = [lines.get(timeout=DEADLINE_S).split() for _ in range(2)]
+    assert sorted(line[:2] for line in printed) == [["now:", "capture"], ["now:", "device"]]
+    assert ["now:", "capture", "complete"] in printed
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Trouble rehearsed from the command line."""
+"""Faults injected by flags of the command line."""
 
 import time
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from spiked_driver import FaultySource
 from spiked_driver.spec import open_source
-from spiked_service.commands.fault_flags import with_faults
+from spiked_service.cli.commands.fault_flags import with_faults
 
 from spiked.errors import ConfigurationError
 
@@ -31,7 +31,7 @@ def test_no_flags_change_nothing() -> None:
 
 @pytest.mark.parametrize(
     ("sources", "message"),
-    [([], "--drop, --stall: name the source"), (["sim:", "usb0"], r"not with a real camera \(usb0\)")],
+    [([], "--drop, --stall: give the source"), (["sim:", "usb0"], r"not into usb0")],
 )
 def test_trouble_needs_a_source_that_can_have_it(sources: list[str], message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):

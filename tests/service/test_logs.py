@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 import structlog
-from spiked_service.config import LogFormat, LogLevel
-from spiked_service.events import Bus, Topic
-from spiked_service.logs import configure_logs, logger, set_level
+from spiked_service.events.bus import Bus, Topic
+from spiked_service.events.logging import configure_logs, logger, set_level
+from spiked_service.settings.settings import LogFormat, LogLevel
 from websockets.sync.client import connect
 
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import httpx
 from prometheus_client.parser import text_string_to_metric_families
-from spiked_service.events import Bus, Topic
-from spiked_service.health import Health, Verdict
-from spiked_service.limits import Gate
-from spiked_service.metrics import Metrics, Reading, Readings
-from spiked_service.payloads import PosePayload
+from spiked_service.base.health import CheckStatus, Health
+from spiked_service.base.limits import ConcurrencyLimit
+from spiked_service.events.bus import Bus, Topic
+from spiked_service.events.payloads import PosePayload
+from spiked_service.operations.metrics import CaptureSample, Metrics, MetricsSource
 from spiked_service.store.rows import ConsumerCounters, Counters
 
 from spiked.ring import DeviceState, Policy
@@ -40,23 +40,22 @@ def scraped(metrics: Metrics) -> Scraped:
     return Scraped(metrics.exposition().decode())
 
 
-def made(readings: list[Reading], bus: Bus | None = None, health: Health | None = None) -> Metrics:
+def made(samples: list[CaptureSample], bus: Bus | None = None, health: Health | None = None) -> Metrics:
     return Metrics(
-        Readings(lambda: list(readings), lambda: {"streaming": 1}, lambda: {"queued": 2}, dict, lambda: Path("/")),
+        MetricsSource(lambda: list(samples), lambda: {"streaming": 1}, lambda: {"queued": 2}, dict, lambda: Path("/")),
         bus or Bus(),
         health or Health(),
-        Gate("renders", 3),
-        Gate("event clients", 5),
+        {"renders": ConcurrencyLimit("renders", 3), "event_clients": ConcurrencyLimit("event clients", 5)},
     )
 
 
 def test_frames_add_up_over_captures_of_a_device() -> None:
-    readings = [Reading("a", "usb0", counters(100, 5), over=False)]
-    metrics = made(readings)
+    samples = [CaptureSample("a", "usb0", counters(100, 5), over=False)]
+    metrics = made(samples)
     assert scraped(metrics)("spiked_frames_received_total", device="usb0") == 100
-    readings[:] = [Reading("a", "usb0", counters(150, 5), over=True)]
+    samples[:] = [CaptureSample("a", "usb0", counters(150, 5), over=True)]
     assert scraped(metrics)("spiked_frames_received_total", device="usb0") == 150
-    readings[:] = [Reading("b", "usb0", counters(10), over=False)]
+    samples[:] = [CaptureSample("b", "usb0", counters(10), over=False)]
     now = scraped(metrics)
     assert now("spiked_frames_received_total", device="usb0") == 160
     assert now("spiked_frames_lost_total", device="usb0", cause="usb") == 5
@@ -87,10 +86,13 @@ def test_latency_of_poses_and_what_listeners_lost() -> None:
 
 def test_states_limits_and_checks() -> None:
     health = Health()
-    health.add("disk", lambda: (Verdict.FAILED, "full"))
+    health.add("disk", lambda: (CheckStatus.FAILED, "full"))
     now = scraped(made([], health=health))
     assert now("spiked_reconstructions", state="queued") == 2
-    assert now("spiked_inside_limit", what="renders") == 3
+    for name in ("spiked_concurrent_limit", "spiked_inside_limit"):  # the second is its deprecated name
+        assert now(name, what="renders") == 3
+    assert now("spiked_concurrent", what="renders") == now("spiked_inside", what="renders") == 0
+    assert now("spiked_rejected_total", what="renders") == now("spiked_refused_total", what="renders") == 0
     assert now("spiked_check_failed", check="disk") == 1
     assert now("spiked_disk_free_bytes") > 0
     build = next(labels for name, labels in now.samples if name == "spiked_build_info")

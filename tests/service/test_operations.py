@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import re
 import signal
 import socket
 import ssl
@@ -15,9 +16,9 @@ from typing import Any
 
 import httpx
 import pytest
-from spiked_service.health import Finding, Health, Pulse, Verdict, failed
-from spiked_service.live import LiveSettings
-from spiked_service.systemd import Notifier
+from spiked_service.base.health import CheckResult, CheckStatus, EventLoopHeartbeat, Health, failed
+from spiked_service.operations.systemd import SystemdNotifier
+from spiked_service.settings.reload import ReloadableSettings
 
 from spiked.errors import ConfigurationError
 
@@ -83,7 +84,7 @@ def test_a_daemon_says_ready_alive_reloading_and_stopping(
 def test_a_service_that_does_not_live_is_not_vouched_for(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WATCHDOG_USEC", "40000")
     lives = True
-    notifier = Notifier()
+    notifier = SystemdNotifier()
     notifier.watch(lambda: lives)
     systemd.until("WATCHDOG=1")
     lives = False
@@ -99,14 +100,14 @@ def test_abstract_sockets_and_no_systemd(monkeypatch: pytest.MonkeyPatch) -> Non
     one = Systemd(f"\0{name}")
     monkeypatch.setenv("NOTIFY_SOCKET", f"@{name}")
     with closing(one.socket):
-        Notifier().ready("here")
+        SystemdNotifier().ready("here")
         assert one.until("READY=1") == ["READY=1\nSTATUS=here"]
-    Notifier().ready("nobody listens any more")
+    SystemdNotifier().ready("nobody listens any more")
     monkeypatch.setenv("NOTIFY_SOCKET", "vsock:2:1")
     with pytest.raises(ConfigurationError, match="NOTIFY_SOCKET"):
-        Notifier()
+        SystemdNotifier()
     monkeypatch.delenv("NOTIFY_SOCKET")
-    Notifier().ready("nobody listens")
+    SystemdNotifier().ready("nobody listens")
 
 
 def value(daemon: Any, key: str) -> Any:
@@ -141,6 +142,10 @@ def test_the_system_tells_of_itself(daemon: Callable[..., Any], tmp_path: Path) 
     assert system["pid"] == one.process.pid
     assert system["data_folder"] == str(tmp_path / "data")
     assert 0 < system["disk"]["free_bytes"] <= system["disk"]["total_bytes"]
+    assert system["disk"]["recording_of"] == "400x250 at 20 kHz"
+    doctor = {item["name"]: item["finding"] for item in one.http.get("doctor").json()["items"]}["disk space"]
+    minutes = int(re.search(r"(\d+) minutes of 400x250 at 20 kHz", doctor)[1])
+    assert minutes == pytest.approx(system["disk"]["recording_s"] / 60, rel=0.1, abs=1), "one forecast"
     assert system["memory_bytes"] > 10e6
     assert system["uptime_s"] >= 0
     assert one.http.get("tokens").json() == {"items": []}
@@ -150,34 +155,36 @@ def test_the_system_tells_of_itself(daemon: Callable[..., Any], tmp_path: Path) 
 
 def test_a_failing_or_broken_check_makes_the_service_unready() -> None:
     health = Health()
-    health.add("sound", lambda: (Verdict.OK, ""), life=True)
-    health.add("full", lambda: (Verdict.WARNING, "it is getting full"))
+    health.add("sound", lambda: (CheckStatus.OK, ""), life=True)
+    health.add("full", lambda: (CheckStatus.WARNING, "it is getting full"))
     assert [finding.name for finding in health.readiness()] == ["sound", "full"]
     assert not failed(health.readiness())
 
-    def broken() -> tuple[Verdict, str]:
+    def broken() -> tuple[CheckStatus, str]:
         raise OSError("gone")
 
     health.add("broken", broken)
     assert not failed(health.life())
     assert failed(health.readiness())
-    assert health.readiness()[-1] == Finding("broken", Verdict.FAILED, "the check itself failed: OSError('gone')")
+    assert health.readiness()[-1] == CheckResult(
+        "broken", CheckStatus.FAILED, "the check itself failed: OSError('gone')"
+    )
 
 
 def test_an_event_loop_that_hangs_is_seen() -> None:
-    pulse = Pulse(period_s=0.01, limit_s=0.1)
-    seen = [pulse.check()[0]]
+    heartbeat = EventLoopHeartbeat(period_s=0.01, limit_s=1)
+    seen = [heartbeat.check()[0]]
 
     async def loop() -> None:
-        beating = asyncio.create_task(pulse.beat())
+        beating = asyncio.create_task(heartbeat.beat())
         await asyncio.sleep(0.05)
-        seen.append(pulse.check()[0])
-        time.sleep(0.2)  # what a loop must never do
-        seen.append(pulse.check()[0])
+        seen.append(heartbeat.check()[0])
+        time.sleep(1.2)  # what a loop must never do
+        seen.append(heartbeat.check()[0])
         beating.cancel()
 
     asyncio.run(loop())
-    assert seen == [Verdict.OK, Verdict.OK, Verdict.FAILED]
+    assert seen == [CheckStatus.OK, CheckStatus.OK, CheckStatus.FAILED]
 
 
 def certificate(folder: Path, name: str) -> tuple[Path, Path]:
@@ -229,7 +236,7 @@ def test_listeners_keep_the_old_settings_when_one_refuses_the_new(
 ) -> None:
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     monkeypatch.setenv("SPIKED_LIMIT_RENDERS", "2")
-    live = LiveSettings()
+    live = ReloadableSettings()
     seen = []
     live.on_change(lambda now: seen.append(now.limit_renders))
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
-from spiked_service.api.page import mount_page
+from spiked_service.api.routes.page import mount_page
 
 
 def client(folder: Path) -> TestClient:
@@ -37,4 +37,5 @@ def test_below_the_page_a_wrong_method_of_the_api_is_told_as_one(tmp_path: Path)
 def test_without_a_built_page_the_service_says_how_to_build_it(tmp_path: Path) -> None:
     http = client(tmp_path)
     assert "make page" in http.get("/").text
+    assert "make page" in http.get("/docs/").text
     assert http.get("/assets/index.js").status_code == 404

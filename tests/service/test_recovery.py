@@ -22,21 +22,21 @@ SHM = Path("/dev/shm")
 _SERVICE = """
 import sys
 from pathlib import Path
-from spiked_service.api.announce import BusAnnouncer
-from spiked_service.events import Bus
-from spiked_service.config import LogFormat, LogLevel
-from spiked_service.keeping import Keeping
-from spiked_service.logs import configure_logs
-from spiked_service.reconstruction_options import ReconstructionOptions
+from spiked_service.api.bus_notifier import BusNotifier
+from spiked_service.events.bus import Bus
+from spiked_service.settings.settings import LogFormat, LogLevel
+from spiked_service.daemon import open_data_store
+from spiked_service.events.logging import configure_logs
+from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.rows import Plan
 configure_logs(LogLevel.INFO, LogFormat.JSON)
-keeping = Keeping(Path(sys.argv[1]), BusAnnouncer(Bus()))
+data_store = open_data_store(Path(sys.argv[1]), BusNotifier(Bus()))
 for source in sys.argv[2:]:
     live = source.startswith("sim:")
     plan = Plan(source, reconstruct=live, options=ReconstructionOptions(steps=5))
-    print(keeping.captures.start(plan).id, flush=True)
+    print(data_store.captures.start(plan).id, flush=True)
 for line in sys.stdin:
-    for snapshot in keeping.captures.live():
+    for snapshot in data_store.captures.live():
         print(snapshot.id, snapshot.counters.received if snapshot.counters else 0, end=";")
     print(flush=True)
 """
@@ -93,8 +93,8 @@ def test_after_a_kill_recordings_are_whole_and_jobs_are_taken_up(tmp_path: Path)
         one.kill()
     path = data / "captures" / record / "recording.dat"
 
-    with kept(data) as keeping:
-        row = over(keeping, record).row
+    with kept(data) as data_store:
+        row = over(data_store, record).row
         assert (row.state, row.reason) == (CaptureState.FAILED, "the service ended during the capture")
         assert row.verdict is not None and row.verdict.grade is Grade.DEGRADED
         assert row.recording is not None and row.recording.frames + row.recording.lost > before - 1000
@@ -103,33 +103,33 @@ def test_after_a_kill_recordings_are_whole_and_jobs_are_taken_up(tmp_path: Path)
         assert_holds(path, frames)
         assert "as they were written" not in str(verify(path).reasons)
         assert not any((SHM / f"spiked-{key}").exists() for key in (live, record))
-        wait_for(lambda: keeping.captures.get(live).reconstructions[0].state is JobState.COMPLETE, "taken up again")
-        snapshot = keeping.captures.get(live)
+        wait_for(lambda: data_store.captures.get(live).reconstructions[0].state.over, "taken up again")
+        snapshot = data_store.captures.get(live)
         job = snapshot.reconstructions[0]
         assert (job.live, job.attempts) == (False, 2)
         assert snapshot.row.recording is not None and job.frames == snapshot.row.recording.frames
-        assert keeping.captures.list().items[0].id == record
+        assert data_store.captures.list().items[0].id == record
     assert unfinished(data) == []
 
 
 def test_a_job_without_a_recording_fails_honestly_after_a_kill(tmp_path: Path) -> None:
     data = tmp_path / "data"
-    with kept(data) as keeping:
-        capture_id = keeping.captures.start(Plan(SMALL, record=False)).id
-        wait_for(lambda: received(keeping, capture_id) > 100, "frames come")
-        row = keeping.captures.get(capture_id).reconstructions[0]
+    with kept(data) as data_store:
+        capture_id = data_store.captures.start(Plan(SMALL, record=False)).id
+        wait_for(lambda: received(data_store, capture_id) > 100, "frames come")
+        row = data_store.captures.get(capture_id).reconstructions[0]
         # As a kill would leave it: the row says that it runs, and nothing of the capture's end is noted.
-        keeping.catalogue.reconstructions.put(row)
-        capture = keeping.captures.get(capture_id).row
-        keeping.captures.stop(capture_id)
-        keeping.captures.stop(capture_id)
-        over(keeping, capture_id)
-        keeping.catalogue.captures.put(capture)
-        keeping.catalogue.reconstructions.put(row)
-    with kept(data) as keeping:
-        wait_for(lambda: keeping.reconstructions.get(row.id).state is JobState.FAILED, "it is told")
-        assert "because the service ended while it ran" in keeping.reconstructions.get(row.id).reason
-        assert keeping.captures.get(capture_id).row.state is CaptureState.FAILED
+        data_store.catalogue.reconstructions.put(row)
+        capture = data_store.captures.get(capture_id).row
+        data_store.captures.stop(capture_id)
+        data_store.captures.stop(capture_id)
+        over(data_store, capture_id)
+        data_store.catalogue.captures.put(capture)
+        data_store.catalogue.reconstructions.put(row)
+    with kept(data) as data_store:
+        wait_for(lambda: data_store.reconstructions.rows.get(row.id).state is JobState.FAILED, "it is told")
+        assert "because the service ended while it ran" in data_store.reconstructions.rows.get(row.id).reason
+        assert data_store.captures.get(capture_id).row.state is CaptureState.FAILED
 
 
 @pytest.mark.slow
@@ -146,11 +146,11 @@ def test_any_process_killed_at_any_moment(tmp_path: Path, seed: int) -> None:
             os.kill(victim.pid, signal.SIGKILL)
             time.sleep(chance.random())
         one.kill()
-    with kept(data) as keeping:
-        row = over(keeping, capture_id).row
+    with kept(data) as data_store:
+        row = over(data_store, capture_id).row
         if row.verdict is None:  # acquisition was killed before the camera was open
             assert (row.state, row.recording) == (CaptureState.FAILED, None) and "killed" in row.reason, row
-        path = keeping.captures.recording(capture_id)
+        path = data_store.captures.recording(capture_id)
         if row.recording is not None and row.recording.frames:
             assert open_recording(path).warnings == ()
             assert_holds(path, frames)

@@ -8,13 +8,15 @@ from typing import Any
 import httpx
 import pytest
 from fastapi import FastAPI, Request
+from spiked_service.api.auth.security import HEADERS, Security
+from spiked_service.api.auth.wrong_tokens import WrongTokens
 from spiked_service.api.problems import install
+from spiked_service.base.limits import ConcurrencyLimit, OverloadedError, RateLimit
 from spiked_service.daemon import check_access
-from spiked_service.limits import Gate, OverloadedError, RateLimit
-from spiked_service.live import LiveSettings
-from spiked_service.security import HEADERS, Security
-from spiked_service.tokens import Tokens
+from spiked_service.settings.reload import ReloadableSettings
+from spiked_service.settings.tokens import Tokens
 from starlette.testclient import TestClient
+from structlog.testing import capture_logs
 
 from spiked.errors import ConfigurationError
 
@@ -42,7 +44,7 @@ def client(tmp_path: Path, **settings: object) -> TestClient:
     async def system(request: Request) -> Any:
         return request.state.caller.name
 
-    live = LiveSettings(settings)
+    live = ReloadableSettings(settings)
     app.add_middleware(Security, settings=live, tokens=Tokens(tmp_path))
     return TestClient(app, base_url="http://127.0.0.1:8650", client=("10.0.0.9", 5))
 
@@ -170,24 +172,68 @@ def test_the_bucket_fills_again_and_callers_have_their_own() -> None:
     assert [limit.wait_s("a") for _ in range(2)] == [0, 0.5]
     for number in range(10_000):
         limit.wait_s(str(number))
-    assert len(limit._callers) <= 4096
+    assert limit.callers == 4096
 
 
 def test_a_gate_lets_so_many_in() -> None:
-    gate = Gate("renders", 1)
-    with gate():
+    concurrency = ConcurrencyLimit("renders", 1)
+    with concurrency():
         with pytest.raises(OverloadedError, match="1 renders at a time"):
-            gate.enter()
-        gate.limit = 2
-        with gate():
-            assert gate.inside == 2
-    assert (gate.inside, gate.refused) == (0, 1)
+            concurrency.acquire()
+        concurrency.limit = 2
+        with concurrency():
+            assert concurrency.active == 2
+    assert (concurrency.active, concurrency.rejected) == (0, 1)
 
 
 def test_beyond_loopback_or_where_asked_for_there_must_be_a_token(tmp_path: Path) -> None:
     for settings in ({"host": "0.0.0.0"}, {"require_token": True}):
-        now = LiveSettings(settings).now
+        now = ReloadableSettings(settings).now
         with pytest.raises(ConfigurationError, match="spiked token create"):
             check_access(now, Tokens(tmp_path))
         check_access(now, Tokens(tmp_path, "from the settings"))
-    check_access(LiveSettings({"host": "::1"}).now, Tokens(tmp_path))
+    check_access(ReloadableSettings({"host": "::1"}).now, Tokens(tmp_path))
+
+
+def guess(http: TestClient, token: str) -> httpx.Response:
+    return http.get("/api/v1/system", headers={"authorization": f"Bearer {token}"})
+
+
+def test_who_guesses_tokens_waits_and_is_logged(tmp_path: Path) -> None:
+    tokens = Tokens(tmp_path)
+    known, new = tokens.create("known"), tokens.create("new")
+    http = client(tmp_path, require_token=True)
+    assert guess(http, known).status_code == 200
+    with capture_logs() as lines:
+        assert [guess(http, f"guess {number}").status_code for number in range(11)] == [401] * 11
+        told = guess(http, "guess 11")
+    assert "wrong tokens from 10.0.0.9" in problem(told, 429)
+    assert told.headers["retry-after"] == "1"
+    assert guess(http, new).status_code == 429  # even the right one: a guess that is right tells nothing
+    form = http.post("/sign-in", data={"token": new})
+    assert form.status_code == 429 and "wait 1 seconds" in form.text
+    assert guess(http, known).status_code == 200  # nobody is locked out by a neighbour
+    assert guess(http, "guess 3").status_code == 401  # the same mistake again is no guess
+    assert http.get("/healthz", headers={"authorization": "Bearer x"}).status_code == 200
+    (line,) = (line for line in lines if line["event"] == "wrong token")  # the next line has those of ten seconds
+    assert line["address"] == "10.0.0.9" and line["count"] == 1
+
+
+def test_the_wait_doubles_up_to_a_minute_and_is_forgotten() -> None:
+    now_s = 0.0
+    wrong = WrongTokens(clock=lambda: now_s)
+    waits = []
+    for number in range(20):
+        while wait_s := wrong.wait_s("10.0.0.9", f"guess {number}", right=False):
+            waits.append(wait_s)
+            now_s += wait_s
+    assert waits == [1, 2, 4, 8, 16, 32, 60, 60, 60]
+    assert wrong.wait_s("10.0.0.10", "guess", right=False) == 0
+    now_s += 1000
+    assert [wrong.wait_s("10.0.0.9", f"later {number}", right=False) for number in range(11)] == [0] * 11
+    for number in range(11):
+        wrong.wait_s(f"2001:db8::{number:x}", f"guess {number}", right=False)
+    assert wrong.wait_s("2001:db8::ffff", "guess", right=True) > 0  # who has one address of a network has them all
+    for number in range(5000):
+        wrong.wait_s(f"10.1.{number // 256}.{number % 256}", "guess", right=False)
+    assert wrong.callers == 4096

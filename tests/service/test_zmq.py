@@ -10,8 +10,8 @@ import msgpack
 import pytest
 import zmq
 from pydantic import BaseModel
-from spiked_service.events import Bus, Topic
-from spiked_service.zmq import ZmqServer
+from spiked_service.api.zmq import ZmqServer
+from spiked_service.events.bus import Bus, Topic
 
 from spiked.errors import ConfigurationError
 

@@ -11,8 +11,10 @@ import pytest
 from spiked.errors import ConfigurationError, RecordingError, SceneError
 from spiked.evaluate import psnr
 from spiked.recording import open_recording
+from spiked.render import Camera, Rasteriser
+from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Layout, Mosaic, Sensor
-from spiked.simulate import SimulatedCamera
+from spiked.simulate import SensorNoise, SimulatedCamera
 from spiked.simulate.record import camera_of_files, simulate
 from spiked.trajectory import Trajectory
 
@@ -65,6 +67,42 @@ def test_a_missing_scene_is_a_clear_error(tmp_path: Path) -> None:
     (tmp_path / "path.tum").write_text("0 0 0 0 0 0 0 1\n1 0 0 1 0 0 0 1\n")
     with pytest.raises(SceneError, match=r"none\.ply"):
         camera_of_files(Sensor(64, 40, 20000.0), tmp_path / "none.ply", tmp_path / "path.tum")
+
+
+def wall(*, brightest: float) -> Scene:
+    """A wall two units ahead, grey in patches from black to `brightest`."""
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[-1.5:1.5:60j, -2:2:80j]
+    n = x.size
+    return Scene(
+        np.stack([x.ravel(), y.ravel(), np.full(n, 2.0)], 1).astype(np.float32),
+        np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        np.tile(np.log(np.float32([0.04, 0.04, 0.01])), (n, 1)),
+        np.full(n, 4, np.float32),
+        np.repeat(rng.uniform(0.2, 1, (n // 16, 1)), 16, 0).astype(np.float32) * np.float32(brightest),
+    )
+
+
+@pytest.mark.parametrize(
+    ("white", "gain", "expected"),
+    [(0.12, None, 1.0), (0.12, 0.24, 2.0), (None, None, 0.35), (None, 0.2, 0.2)],
+    ids=["our own", "our own, brighter", "of another program", "of another program, darker"],
+)
+def test_a_scene_is_recorded_at_the_radiance_at_which_it_is_rendered(
+    tmp_path: Path, white: float | None, gain: float | None, expected: float
+) -> None:
+    scene, sensor = wall(brightest=white or 1), Sensor(96, 64, 20000.0, intrinsics=Intrinsics.from_fov(96, 64, 50))
+    scene.write_ply(tmp_path / "wall.ply", white)
+    (tmp_path / "path.tum").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
+    camera = camera_of_files(sensor, tmp_path / "wall.ply", tmp_path / "path.tum", noise=SensorNoise.none(), gain=gain)
+    path = simulate(camera, tmp_path / "wall", "wall", 512, views=1)
+    recorded = np.unpackbits(open_recording(path).read(0, 512)).mean()
+    assert sensor.intrinsics is not None
+    rasteriser = Rasteriser(Camera(sensor.intrinsics, 96, 64))
+    rendered = rasteriser.forward(scene, np.eye(3)[None], np.zeros((1, 3))).values.mean()
+    assert recorded == pytest.approx(expected * rendered, rel=0.02)
+    shown = cv2.imread(str(path.parent / "views" / "00.png"), cv2.IMREAD_GRAYSCALE) / 255
+    assert shown.mean() == pytest.approx(rendered / (white or 1), rel=0.02)
 
 
 @pytest.mark.skipif(not LIVING.exists(), reason="needs ../shared/streams and ../shared/scenes")

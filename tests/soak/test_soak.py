@@ -106,16 +106,24 @@ def a_scene(daemon: Any, recording: Path) -> str:
     return str(job["id"])
 
 
-def soak(daemon: Any, tmp_path: Path, seconds: float, may_grow: int) -> None:
-    recording = recorded(tmp_path / "small", WIDTH, HEIGHT)
+def soak(
+    daemon: Any,
+    tmp_path: Path,
+    seconds: float,
+    may_grow: int,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    pace: float = 1.0,
+) -> None:
+    rate_hz = pace * RATE_HZ
+    recording = recorded(tmp_path / "camera", *size)
     scene = a_scene(daemon, recorded(tmp_path / "room", 400, 250))
-    repeats = int(seconds * RATE_HZ / 1280) + 1
+    repeats = int(seconds * rate_hz / 1280) + 1
     address = daemon.address.rstrip("/")
     with (
         clients("events", address, str(EVENT_CLIENTS)) as listeners,
         clients("views", address, str(VIEW_CLIENTS), scene, str(VIEW_PERIOD_S)) as viewers,
     ):
-        source = f"replay:{recording}?pace=1&repeat={repeats}"
+        source = f"replay:{recording}?pace={pace}&repeat={repeats}"
         started = daemon.http.post("captures", json={"source": source, "options": {"steps": 20}})
         assert started.status_code == 201, started.text
         capture = f"captures/{started.json()['id']}"
@@ -133,7 +141,8 @@ def soak(daemon: Any, tmp_path: Path, seconds: float, may_grow: int) -> None:
     counters = final["counters"]
     assert counters["received"] + sum(counters["lost"].values()) == counters["next_frame"]
     assert sum(counters["lost"].values()) == 0
-    assert final["recording"]["frames"] == counters["next_frame"] > 0.9 * seconds * RATE_HZ
+    assert final["recording"]["frames"] == counters["next_frame"]
+    assert counters["next_frame"] > 0.3 * seconds * rate_hz  # a busy machine simulates more slowly, and loses nothing
     assert final["verdict"]["grade"] == "good", final["verdict"]
 
     assert all(client["disorder"] == 0 and "closed" not in client for client in events)
@@ -170,3 +179,11 @@ def test_many_clients_for_ten_minutes(daemon: Callable[..., Any], tmp_path: Path
     if os.statvfs(tmp_path).f_bavail * os.statvfs(tmp_path).f_frsize < 20 << 30:
         pytest.skip("needs 20 GiB for the recording")
     soak(daemon(), tmp_path, 600, FLAT_BYTES)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_camera_of_full_size_for_ten_minutes(daemon: Callable[..., Any], tmp_path: Path) -> None:
+    if os.statvfs(tmp_path).f_bavail * os.statvfs(tmp_path).f_frsize < 20 << 30:
+        pytest.skip("needs 20 GiB for the recording")
+    soak(daemon(), tmp_path, 600, FLAT_BYTES, size=(400, 250), pace=0.1)

@@ -17,7 +17,7 @@ from spiked_driver import Chunk, open_source
 from spiked_driver.libusb import load_libusb
 
 from spiked.errors import SpikedError
-from spiked.ring import Condition, Gap
+from spiked.ring import DeviceStatus, Gap
 
 _BLOCK = 8
 _TELL_S = 0.1
@@ -31,16 +31,16 @@ def main() -> None:
     def tell(**event: Any) -> None:
         print(json.dumps({"at": time.monotonic() - start_s, **event}), flush=True)
 
-    stop, slow = threading.Event(), threading.Event()
-    threading.Thread(target=_listen, args=(stop, slow), daemon=True).start()
+    stop, pause, resume = threading.Event(), threading.Event(), threading.Event()
+    threading.Thread(target=_listen, args=(stop, pause, resume), daemon=True).start()
     if len(sys.argv) > 2:
         load_libusb()  # nobody may not look for libraries everywhere
         os.setuid(int(sys.argv[2]))
     try:
-        source = open_source(sys.argv[1])
+        source = open_source(sys.argv[1], warn=lambda text: tell(warning=text))
         source.open()
         tell(opened=True)
-        last: Condition | None = None
+        last: DeviceStatus | None = None
         run = [0, 0, 0]
         told_s = 0.0
         view = np.zeros((_BLOCK, source.sensor.frame_bytes), np.uint8)
@@ -49,7 +49,7 @@ def main() -> None:
             numbers = []
             if isinstance(item, Chunk):
                 numbers = view[: item.frames, :8].copy().view("<i8")[:, 0].tolist()
-            if isinstance(item, Gap) or source.condition != last or time.monotonic() - told_s > _TELL_S:
+            if isinstance(item, Gap) or source.device_status != last or time.monotonic() - told_s > _TELL_S:
                 tell(run=run)
                 told_s = time.monotonic()
             for offset, number in enumerate(numbers):
@@ -60,12 +60,13 @@ def main() -> None:
                 run[2] += 1
             if isinstance(item, Gap):
                 tell(gap=[item.first, item.count, item.cause])
-            if source.condition != last:
-                last = source.condition
+            if source.device_status != last:
+                last = source.device_status
                 tell(state=last.state, reason=last.reason)
-            if slow.is_set():
-                slow.clear()
-                time.sleep(1.0)
+            if pause.is_set():
+                pause.clear()
+                resume.wait()
+                resume.clear()
         tell(run=run)
         before_s = time.monotonic()
         source.close()
@@ -74,10 +75,11 @@ def main() -> None:
         tell(error=str(error))
 
 
-def _listen(stop: threading.Event, slow: threading.Event) -> None:
+def _listen(stop: threading.Event, pause: threading.Event, resume: threading.Event) -> None:
     for line in sys.stdin:
-        (slow if line == "doze\n" else stop).set()
+        {"pause\n": pause, "resume\n": resume}.get(line, stop).set()
     stop.set()
+    resume.set()
 
 
 if __name__ == "__main__":

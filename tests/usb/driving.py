@@ -1,8 +1,9 @@
-"""The driver in a process of its own, and what it has told so far."""
+"""The driver in a process of its own, and what it has observed so far."""
 
 import json
 import os
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -19,7 +20,7 @@ PATIENCE_S = 40.0
 
 
 @dataclass
-class Told:
+class Observed:
     """What the driver said, in order."""
 
     states: list[tuple[str, str]] = field(default_factory=list)
@@ -28,6 +29,7 @@ class Told:
     """First, count, cause."""
     runs: dict[tuple[int, int], int] = field(default_factory=dict)
     """Frames that followed one another: capture index and camera number of the first, and how many."""
+    warnings: list[str] = field(default_factory=list)
     opened: bool = False
     error: str | None = None
     closed_s: float | None = None
@@ -84,40 +86,50 @@ class Driver:
             text=True,
             env={**rig.environment, "PYTHONPATH": path},
         )
-        self.told = Told()
+        self.observed = Observed()
         self._lines: queue.Queue[str] = queue.Queue()
         threading.Thread(target=self._listen, daemon=True).start()
 
-    def wait_for(self, condition: Callable[[Told], Any]) -> Told:
-        """Until the condition is fulfilled. Raises TimeoutError with what was told."""
+    def wait_for(self, condition: Callable[[Observed], Any]) -> Observed:
+        """Until the condition is fulfilled. Raises TimeoutError with what was observed."""
         seconds = self._patience_s
         deadline_s = time.monotonic() + seconds
-        while not condition(self.told):
+        while not condition(self.observed):
             try:
                 self._hear(self._lines.get(timeout=max(0.0, deadline_s - time.monotonic())))
             except queue.Empty as error:
-                raise TimeoutError(f"not so within {seconds:g} s: {str(self.told)[:5000]}") from error
-        return self.told
+                raise TimeoutError(f"not so within {seconds:g} s: {str(self.observed)[:5000]}") from error
+        return self.observed
 
-    def wait_for_state(self, *states: str, after: int = 0) -> Told:
+    def wait_for_state(self, *states: str, after: int = 0) -> Observed:
         """Until one of the states came, the first `after` states left out."""
-        return self.wait_for(lambda told: any(state in states for state, _ in told.states[after:]))
+        return self.wait_for(lambda observed: any(state in states for state, _ in observed.states[after:]))
 
-    def doze(self) -> None:
-        """Do nothing for a second, as on a busy host."""
-        self._command("doze\n")
+    def pause(self) -> None:
+        """Read nothing until `resume`, as a busy host does."""
+        self._command("pause\n")
 
-    def wait_for_frames(self, count: int) -> Told:
+    def resume(self) -> None:
+        """End a pause."""
+        self._command("resume\n")
+
+    def suspend(self, seconds: float) -> None:
+        """Stop the process wherever it is, for so long."""
+        self._process.send_signal(signal.SIGSTOP)
+        time.sleep(seconds)
+        self._process.send_signal(signal.SIGCONT)
+
+    def wait_for_frames(self, count: int) -> Observed:
         """Until so many more frames came than by now."""
-        now = self.told.received
-        return self.wait_for(lambda told: told.received >= now + count)
+        now = self.observed.received
+        return self.wait_for(lambda observed: observed.received >= now + count)
 
-    def stop(self) -> Told:
+    def stop(self) -> Observed:
         """Stop it and wait for its end; frames and gaps are accounted for without a hole."""
         self._command("stop\n")
-        self.wait_for(lambda told: told.closed_s is not None or told.error)
-        self.told.end  # noqa: B018
-        return self.told
+        self.wait_for(lambda observed: observed.closed_s is not None or observed.error)
+        self.observed.end  # noqa: B018
+        return self.observed
 
     def close(self) -> None:
         """End the process."""
@@ -138,31 +150,33 @@ class Driver:
 
     def _hear(self, line: str) -> None:
         if not line:
-            raise RuntimeError(f"the driver's process ended with {self._process.wait()}: {self.told}")
+            raise RuntimeError(f"the driver's process ended with {self._process.wait()}: {self.observed}")
         match json.loads(line):
             case {"run": [index, number, count]}:
-                self.told.runs[index, number] = count
+                self.observed.runs[index, number] = count
             case {"gap": [first, count, cause]}:
-                self.told.gaps.append((first, count, cause))
+                self.observed.gaps.append((first, count, cause))
             case {"state": state, "reason": reason, "at": at}:
-                self.told.states.append((state, reason))
-                self.told.times.setdefault(state, []).append(at)
+                self.observed.states.append((state, reason))
+                self.observed.times.setdefault(state, []).append(at)
+            case {"warning": text}:
+                self.observed.warnings.append(text)
             case {"opened": True}:
-                self.told.opened = True
+                self.observed.opened = True
             case {"closed_s": seconds}:
-                self.told.closed_s = seconds
+                self.observed.closed_s = seconds
             case {"error": message}:
-                self.told.error = message
+                self.observed.error = message
 
 
-def check_sent(told: Told, report: Report, *, offsets: int = 1) -> None:
+def check_sent(observed: Observed, report: Report, *, offsets: int = 1) -> None:
     """Every frame that was received is one that the camera sent, and index and camera's number go together.
 
     They differ by one and the same number, or by `offsets` of them if the camera counted anew in between. What was not
     received is in gaps: on a loaded machine the camera may drop frames at any time.
     """
-    assert len(told.offsets) == offsets, f"index and number differ by {told.offsets}; runs {told.runs}"
-    for (_, number), count in told.runs.items():
+    assert len(observed.offsets) == offsets, f"index and number differ by {observed.offsets}; runs {observed.runs}"
+    for (_, number), count in observed.runs.items():
         assert not count or _within(report, number, count), f"frames {number} to {number + count - 1} were not all sent"
 
 

@@ -7,11 +7,13 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from driving import Driver
 from spiked_driver.usb_cameras import UDEV_RULES
 from virtual_camera.host import CameraSettings
 from virtual_camera.rig import VirtualCameras
 
 Cameras = Callable[..., VirtualCameras]
+Drive = Callable[..., Driver]
 
 
 def spiked(*arguments: str, rig: VirtualCameras | None = None, code: int = 0) -> str:
@@ -49,6 +51,36 @@ def test_the_doctor_sees_the_slow_port_and_the_small_budget(cameras: Cameras, pi
     assert "16 MiB for all cameras, 65 MiB are wanted" in findings["usbfs memory"]["finding"]
     assert "disk speed" in findings
     assert "problem  camera 1-2" in spiked("devices", "--doctor", "--data", str(tmp_path), rig=rig, code=1)
+
+
+def test_the_doctor_shows_and_checks_the_bridge(cameras: Cameras, pictures: Path, tmp_path: Path) -> None:
+    chips = {"2-1": (0, 0, 2), "2-2": (1, 1, 0), "2-3": (2, 0, 4), "2-4": (0, 0, 3), "2-5": (7, 0, 9)}
+    rig = cameras(*(CameraSettings(str(pictures), port=port, chip=chip) for port, chip in chips.items()))
+    found = json.loads(spiked("devices", "--doctor", "--json", "--data", str(tmp_path), rig=rig, code=1))
+    bridges = {item["name"].removeprefix("bridge "): item for item in found if item["name"].startswith("bridge")}
+    assert {port: item["status"] for port, item in bridges.items()} == {
+        "2-1": "ok",
+        "2-2": "warning",
+        "2-3": "problem",
+        "2-4": "problem",
+        "2-5": "warning",
+    }
+    assert bridges["2-1"]["finding"] == "FT601: FIFO mode 245, 100 MHz, one channel"
+    assert "FIFO mode 600, 66 MHz, four channels" in bridges["2-2"]["finding"]
+    assert "carries 200 MB/s at 50 MHz, and the camera sends 260" in bridges["2-3"]["finding"]
+    assert "no channel to the host" in bridges["2-4"]["finding"]
+    assert "unknown clock, unknown channels" in bridges["2-5"]["finding"]
+    assert "FT60X configuration programmer" in bridges["2-2"]["what_to_do"]
+
+
+def test_the_doctor_asks_a_bridge_that_is_being_read(cameras: Cameras, pictures: Path, drive: Drive) -> None:
+    rig = cameras(CameraSettings(str(pictures), rate_hz=1000, buffer_frames=2000))
+    driver = drive(rig, "usb0?rate=1000&transfer_kib=256")
+    driver.wait_for_frames(100)
+    text = spiked("devices", "--doctor", rig=rig)
+    assert "bridge 2-1: FT601: FIFO mode 245" in text
+    driver.wait_for_frames(100)
+    assert driver.stop().gaps == []
 
 
 def test_the_rules_come_ready_to_install() -> None:

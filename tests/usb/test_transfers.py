@@ -16,7 +16,7 @@ import pytest
 import usb.backend.libusb1
 from spiked_driver import framing, transfers
 from spiked_driver.libusb import OutOfUsbMemoryError, Transfer
-from spiked_driver.transfers import AsynchronousReads, Buffers
+from spiked_driver.transfers import AsynchronousBulkReader, Buffers
 from spiked_driver.usb_budget import TransferPlan
 from virtual_camera.faults import Fault, Kind
 from virtual_camera.host import CameraSettings
@@ -57,10 +57,10 @@ def test_bytes_come_in_the_cameras_order_each_read_asked_for(
     rig = cameras(CameraSettings(str(pictures)))
     size = 1 << 17
     answer = probe(
-        rig, "read", file=tmp_path / "wire", count=5, transfer_bytes=size, arrivals=23, asynchronous=asynchronous
+        rig, "read", file=tmp_path / "wire", count=5, transfer_bytes=size, transfers=23, asynchronous=asynchronous
     )
     assert answer["lengths"] == [size] * 23
-    assert answer["troubles"] == []
+    assert answer["errors"] == []
     assert answer["chip"] == [0x0403, 0x601F, 0]
     taken = numbers(tmp_path / "wire")
     assert taken == list(range(len(taken)))
@@ -74,19 +74,19 @@ def test_bytes_come_in_the_cameras_order_each_read_asked_for(
 
 def test_a_short_transfer_is_data(cameras: Cameras, pictures: Path, tmp_path: Path) -> None:
     rig = cameras(CameraSettings(str(pictures), faults=(Fault(4, Kind.CUT, offset=700), Fault(20, Kind.CUT, offset=3))))
-    answer = probe(rig, "read", file=tmp_path / "wire", count=4, transfer_bytes=1 << 17, arrivals=8)
+    answer = probe(rig, "read", file=tmp_path / "wire", count=4, transfer_bytes=1 << 17, transfers=8)
     assert answer["lengths"][0] == 4 * FRAME_BYTES + 700
     assert sum(length < 1 << 17 for length in answer["lengths"]) == 2
     assert numbers(tmp_path / "wire")[:25] == list(range(25))
 
 
-@pytest.mark.parametrize(("kind", "trouble"), [(Kind.STALL, "STALLED"), (Kind.BABBLE, "BABBLE")])
+@pytest.mark.parametrize(("kind", "error"), [(Kind.STALL, "STALLED"), (Kind.BABBLE, "BABBLE")])
 def test_trouble_comes_after_the_bytes_before_it(
-    cameras: Cameras, pictures: Path, tmp_path: Path, kind: Kind, trouble: str
+    cameras: Cameras, pictures: Path, tmp_path: Path, kind: Kind, error: str
 ) -> None:
     rig = cameras(CameraSettings(str(pictures), faults=(Fault(30, kind),)))
-    answer = probe(rig, "read", file=tmp_path / "wire", count=4, transfer_bytes=1 << 16, arrivals=50)
-    assert answer["troubles"] == [trouble]
+    answer = probe(rig, "read", file=tmp_path / "wire", count=4, transfer_bytes=1 << 16, transfers=50)
+    assert answer["errors"] == [error]
     taken = numbers(tmp_path / "wire")
     assert taken == list(range(len(taken)))
     # What a babbling camera sent last is lost with its transfer.
@@ -110,6 +110,15 @@ def test_what_had_come_before_stopping_is_not_lost(cameras: Cameras, pictures: P
     assert taken == list(range(len(taken)))
     assert len(taken) >= (sum(answer["left"]) + 2 * size) // FRAME_BYTES - 1
     assert answer["again"] == size
+
+
+def test_an_underrun_is_before_the_bytes_of_the_reads_that_end_it(cameras: Cameras, pictures: Path) -> None:
+    """The camera fills each new read at once, so all others have completed before it, and it soon has bytes as well."""
+    count, size = 8, 1 << 16
+    rig = cameras(CameraSettings(str(pictures)))
+    found = [waiting for waiting in probe(rig, "underruns", count=count, transfer_bytes=size, transfers=50) if waiting]
+    assert found
+    assert max(found) <= (count - 1) * size
 
 
 def test_closing_with_everything_in_flight_is_quick(cameras: Cameras, pictures: Path) -> None:
@@ -143,22 +152,22 @@ class Inert:
 
 def test_transfers_that_never_end_are_left_alone_after_the_deadline() -> None:
     context = Inert()
-    reads = AsynchronousReads(context, Buffers(TransferPlan(4, 1 << 16, 1e6)))  # type: ignore[arg-type]
-    reads.start()
-    assert not reads.stop(0.05)
-    assert not reads.close()
+    reader = AsynchronousBulkReader(context, Buffers(TransferPlan(4, 1 << 16, 1e6)))  # type: ignore[arg-type]
+    reader.start()
+    assert not reader.stop(0.05)
+    assert not reader.close()
     assert context.freed == []
-    assert reads in transfers._abandoned
-    transfers._abandoned.remove(reads)
+    assert reader in transfers._abandoned
+    transfers._abandoned.remove(reader)
 
 
 def test_transfers_that_were_never_queued_are_freed() -> None:
     context = Inert(refuse=True)
-    reads = AsynchronousReads(context, Buffers(TransferPlan(4, 1 << 16, 1e6)))  # type: ignore[arg-type]
+    reader = AsynchronousBulkReader(context, Buffers(TransferPlan(4, 1 << 16, 1e6)))  # type: ignore[arg-type]
     with pytest.raises(OutOfUsbMemoryError):
-        reads.start()
-    assert reads.stop(0.05)
-    assert reads.close()
+        reader.start()
+    assert reader.stop(0.05)
+    assert reader.close()
     assert {id(transfer) for transfer in context.freed} == {id(transfer) for transfer in context.made}
 
 

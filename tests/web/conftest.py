@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from spiked_service.api.page import PAGE
+from spiked_service.api.routes.page import PAGE
 
 from spiked.sensor import Sensor
 from spiked.simulate import SimulatedCamera
@@ -34,9 +34,13 @@ FLAGS = [
 FRAMES = 1024
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """Debian's Chromium, driven by Playwright."""
+    """Debian's Chromium, driven by Playwright.
+
+    One a file: until Playwright is closed, its event loop counts as running in this thread, and tests of other files
+    that call `asyncio.run` in the same process would fail.
+    """
     chromium = shutil.which("chromium")
     if chromium is None:
         pytest.skip("there is no chromium (apt-get install chromium)")
@@ -82,6 +86,8 @@ def visit(browser: Any) -> Iterator[Visit]:
 
     yield go
     for context in opened:
+        for page in context.pages:
+            page.unroute_all(behavior="ignoreErrors")  # a request that is answered right now would fail the next test
         context.close()
     assert faults == []
 

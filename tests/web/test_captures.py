@@ -1,5 +1,6 @@
 """The Captures page: found, looked at, reconstructed once more, compared, deleted and brought back."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,22 @@ def test_a_capture_is_found_and_looked_at(studied: Studied, visit: Callable[...,
     row.get_by_text("complete").wait_for()  # its reconstruction
     until(lambda: row.locator("img").evaluate("image => image.naturalWidth") > 0, "a thumbnail")
     page.get_by_label("Search captures").fill("no such thing")
-    page.get_by_text("Nothing is found").wait_for()
+    page.get_by_text("No capture matches").wait_for()
     page.get_by_label("Search captures").fill("DESK")
     row.wait_for()
     assert "search=DESK" in address(page)
 
+    row.get_by_role("link").click()
+    notes = page.get_by_label("Notes on the capture")
+    notes.fill("the lamp was off")
+    notes.blur()
+    until(
+        lambda: studied.http.get(f"captures/{studied.capture_id}").json()["notes"] == "the lamp was off", "kept notes"
+    )
+    page.go_back()
+    page.get_by_label("Search captures").fill("lamp")
+    row.wait_for()
+    assert "the lamp was off" in row.inner_text()
     row.get_by_role("link").click()
     page.get_by_text("Over time").wait_for()
     assert studied.capture_id in address(page)
@@ -108,7 +120,64 @@ def test_set_up_tells_where_each_setting_comes_from(studied: Studied, visit: Cal
     row.wait_for()
     assert "flag" in row.inner_text()
     page.get_by_role("button", name="Reload").click()
-    page.get_by_text("The configuration was read again").wait_for()
+    page.get_by_text("Configuration reloaded").wait_for()
     for link in page.locator(".links a").all():
         answer = studied.http.get(studied.address + link.get_attribute("href"), follow_redirects=True)
         assert answer.status_code == 200, answer.url
+
+
+def reason_in(page: Any, where: str) -> str:
+    """Reason of a reconstruction in a part of the page."""
+    text: str = page.locator(where).locator(".reason").first.inner_text()
+    return text
+
+
+def test_the_reason_of_a_failed_reconstruction_is_shown_everywhere(
+    studied: Studied, visit: Callable[..., Any], room: Path
+) -> None:
+    plan = {"source": f"replay:{room}", "frames": 48, "name": "too short"}
+    capture = finished(studied.http, studied.http.post("captures", json=plan).json()["id"])
+    job = studied.http.get(f"reconstructions/{capture['reconstruction_ids'][0]}").json()
+    assert job["state"] == "failed" and job["reason"]
+    reason = f"Failed: {job['reason']}"
+    page = visit(f"{studied.address}?page=captures")
+    row = page.get_by_role("row").filter(has_text="too short")
+    row.locator(".reason").wait_for()
+    assert row.locator(".reason").inner_text() == reason
+    row.get_by_role("link").click()
+    page.locator("table.jobs .reason").wait_for()
+    assert reason_in(page, "table.jobs") == reason
+    page.goto(f"{studied.address}?page=scene&capture={capture['id']}")
+    page.get_by_text("The reconstruction has failed").wait_for()
+    assert reason_in(page, ".veil") == reason_in(page, ".inspector") == reason
+    studied.http.delete(f"captures/{capture['id']}")
+
+
+def test_the_reason_of_a_degraded_reconstruction_is_shown_everywhere(
+    studied: Studied, visit: Callable[..., Any]
+) -> None:
+    """The path of the room is good: the answers of the service are changed on their way."""
+    reason = "predicted path error 4.2 %"
+
+    def degraded(job: dict[str, Any]) -> dict[str, Any]:
+        return {**job, "tracking_state": "degraded", "reason": reason}
+
+    def changed(route: Any) -> None:
+        answer = route.fetch()
+        body = answer.json()
+        page_of_jobs = "items" in body
+        body = {**body, "items": [degraded(one) for one in body["items"]]} if page_of_jobs else degraded(body)
+        route.fulfill(response=answer, json=body)
+
+    page = visit("about:blank")
+    page.route(re.compile(r"/reconstructions(\?|/[0-9a-f-]+$)"), changed)
+    page.goto(f"{studied.address}?page=captures")
+    row = page.get_by_role("row").filter(has=page.get_by_text("complete, degraded")).first
+    row.wait_for()
+    assert row.locator(".reason").inner_text() == f"degraded: {reason}"
+    page.goto(f"{studied.address}?page=captures&capture={studied.capture_id}")
+    page.locator("table.jobs .reason").first.wait_for()
+    assert reason_in(page, "table.jobs") == f"degraded: {reason}"
+    page.goto(f"{studied.address}?page=scene&capture={studied.capture_id}")
+    page.locator(".inspector .reason").wait_for()
+    assert reason_in(page, ".inspector") == f"degraded: {reason}"

@@ -87,7 +87,7 @@ def test_a_first_visit_and_a_service_that_is_gone(
     page = visit(one.address)
     page.get_by_text("connected", exact=True).wait_for()
     one.process.kill()
-    page.get_by_text("What is shown below may be old").wait_for()
+    page.get_by_text("The data below may be out of date").wait_for()
     keep(page, pictures_folder / "live-disconnected.webp")
     assert violations(page) == []
     page.goto("about:blank")
@@ -97,7 +97,7 @@ def test_the_theme_is_chosen_and_remembered(studied: Studied, visit: Callable[..
     page = visit(studied.address, theme="dark")
     paper = "() => getComputedStyle(document.documentElement).backgroundColor"
     dark = page.evaluate(paper)
-    page.get_by_role("button", name="Theme: as the system").click()
+    page.get_by_role("button", name="Theme: system").click()
     page.get_by_role("button", name="Theme: dark").click()
     light = page.evaluate(paper)
     assert light != dark

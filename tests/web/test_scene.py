@@ -104,7 +104,7 @@ def test_each_layer_is_drawn_and_the_frustum_moves(studied: Studied, visit: Call
 
 @pytest.mark.slow
 def test_states_are_told_without_colours(studied: Studied, visit: Callable[..., Any], pictures_folder: Path) -> None:
-    """By dashes and widths, on the path and on the band over time, and in words."""
+    """By dashes and widths, on the path and on the timeline, and as text."""
     trajectory = studied.http.get(f"reconstructions/{studied.reconstruction_id}/trajectory?format=json").json()
     path = np.float64(trajectory["positions"]) * [1, -1, -1]  # as three.js has its axes
     middle, size = (path.max(0) + path.min(0)) / 2, float(np.ptp(path, axis=0).max())
@@ -139,13 +139,15 @@ def test_states_are_told_without_colours(studied: Studied, visit: Callable[..., 
     still(page)
     keep(page, pictures_folder / "scene-states.webp")
     lit = picture(page, ".track canvas").max(axis=2) > 0.3
-    signs = {}
+    styles = {}
     for state, part in zip(STATES, np.array_split(lit, len(STATES), axis=1), strict=True):
         inner = part[:, 8:-8]
-        signs[state] = (int(inner.any(1).sum()), float(inner.any(0).mean()))
-    for one, (height_px, share) in signs.items():
-        alike = [name for name, sign in signs.items() if abs(sign[0] - height_px) < 1 and abs(sign[1] - share) < 0.15]
-        assert alike == [one], signs
+        styles[state] = (int(inner.any(1).sum()), float(inner.any(0).mean()))
+    for one, (height_px, share) in styles.items():
+        alike = [
+            name for name, style in styles.items() if abs(style[0] - height_px) < 1 and abs(style[1] - share) < 0.15
+        ]
+        assert alike == [one], styles
     slider = page.get_by_label("Frame", exact=True)
     most = int(slider.get_attribute("max"))
     for i, state in enumerate(STATES):
@@ -286,6 +288,26 @@ def test_half_a_million_splats(studied: Studied, visit: Callable[..., Any]) -> N
     until(lambda: contrast(page) > 0.03, "they are to be seen")
 
 
+def test_an_earlier_version_is_chosen(studied: Studied, visit: Callable[..., Any]) -> None:
+    versions = studied.http.get(f"reconstructions/{studied.reconstruction_id}/versions").json()["items"]
+    first, last = versions[0], versions[-1]
+    assert first["version"] < last["version"]
+    page = open_scene(visit, f"{studied.address}?page=scene&capture={studied.capture_id}&frame=200")
+    assert shown_version(page) == last["version"]
+    choice = page.get_by_role("combobox", name="Version")
+    until(lambda: choice.locator("option").count() == len(versions), "all versions are listed")
+    choice.select_option(str(first["version"]))
+    until(lambda: shown_version(page) == first["version"], "the first version is on the canvas")
+    assert f"version={first['version']}" in address(page)
+    poses = page.locator(".inspector dl.stats div:has(dt:text-is('Poses')) dd")
+    until(lambda: int(re.sub(r"\D", "", poses.inner_text())) == first["poses"], "the figures are those of the version")
+    page.reload()
+    until(lambda: shown_version(page) == first["version"], "the address holds the version")
+    choice.select_option("")
+    until(lambda: shown_version(page) == last["version"], "the newest is back")
+    assert "version=" not in address(page)
+
+
 def test_the_scene_on_a_phone(studied: Studied, visit: Callable[..., Any]) -> None:
     page = open_scene(visit, f"{studied.address}?page=scene", viewport=PHONE, touch=True)
     assert page.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
@@ -299,5 +321,5 @@ def test_without_webgl_the_page_says_so(studied: Studied, visit: Callable[..., A
     page = visit("about:blank")
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     page.goto(f"{studied.address}?page=scene")
-    page.get_by_text("This browser gives no WebGL 2").wait_for()
+    page.get_by_text("This browser has no WebGL 2").wait_for()
     assert json.loads(studied.http.get("system").text)["pid"]

@@ -16,4 +16,4 @@ def test_the_types_are_those_that_the_service_describes(tmp_path: Path) -> None:
     schema, types = tmp_path / "openapi.json", tmp_path / "schema.d.ts"
     subprocess.run([sys.executable, "-m", "spiked_service", "openapi", "--out", str(schema)], check=True)
     subprocess.run([GENERATOR, schema, "-o", types, "--default-non-nullable=false"], check=True, cwd=WEB)
-    assert (WEB / "src" / "api" / "schema.d.ts").read_text() == types.read_text(), "run make api"
+    assert (WEB / "src" / "shared" / "api" / "schema.d.ts").read_text() == types.read_text(), "run make api"

@@ -8,7 +8,7 @@ import pytest
 from pydantic import BaseModel, ValidationError
 from spiked_service.api.schemas.base import In
 from spiked_service.api.schemas.uploads import UploadSidecar
-from spiked_service.reconstruction_options import IntrinsicsOption, ReconstructionOptions
+from spiked_service.settings.reconstruction_options import IntrinsicsOption, ReconstructionOptions
 
 from spiked.recording import sidecar
 

@@ -2,14 +2,19 @@
 
 import hashlib
 import json
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import cv2
 import httpx
+import numpy as np
 import pytest
 
 from spiked.client import ApiError, GeometryModel, IntrinsicsModel, ReconstructionOptions
 
+from ..survival import moving_recording
 from .conftest import write_recording
 
 CHUNK = {"Content-Type": "application/octet-stream"}
@@ -36,7 +41,7 @@ def patch(service: Any, upload: str, offset: int, content: bytes, **headers: str
     return answer
 
 
-def test_an_upload_becomes_a_capture_that_can_be_reconstructed(service: Any, recording: Path) -> None:
+def test_an_upload_becomes_a_capture(service: Any, recording: Path) -> None:
     told: list[tuple[int, int]] = []
     capture = service.client.upload(recording, notes="from a friend", progress=lambda *now: told.append(now))
     size = recording.stat().st_size
@@ -51,8 +56,18 @@ def test_an_upload_becomes_a_capture_that_can_be_reconstructed(service: Any, rec
     assert capture.recording.frames == 200
     assert capture.verdict.grade == "good"
     assert service.http.get(f"captures/{capture.id}/recording").content == recording.read_bytes()
+    small = service.http.get(f"captures/{capture.id}/thumbnail")
+    assert (small.status_code, small.headers["content-type"]) == (200, "image/webp")
+    picture = cv2.imdecode(np.frombuffer(small.content, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert picture is not None and picture.shape[1] == 200 and picture.std() > 10
+    assert service.http.get(f"captures/{capture.id}/thumbnail").headers["etag"] == small.headers["etag"]
+
+
+def test_an_upload_can_be_reconstructed(service: Any, tmp_path: Path) -> None:
+    capture = service.client.upload(moving_recording(tmp_path / "arc.dat"))
     job = service.client.start_reconstruction(capture.id, options=ReconstructionOptions(steps=5))
-    assert service.client.wait_for_reconstruction(job.id, 120).state == "complete"
+    done = service.client.wait_for_reconstruction(job.id, 120)
+    assert (done.state, done.reason) == ("complete", "")
 
 
 def test_a_broken_upload_goes_on_where_it_broke(service: Any, recording: Path) -> None:
@@ -67,15 +82,75 @@ def test_a_broken_upload_goes_on_where_it_broke(service: Any, recording: Path) -
     assert early.status_code == 409
     assert f"1000 of {len(content)}" in early.json()["detail"]
     assert patch(service, upload, 1000, content[1000:] + b"x").status_code == 409
-    assert patch(service, upload, service.http.get(f"uploads/{upload}").json()["offset_bytes"], b"").status_code == 200
-    now = service.http.get(f"uploads/{upload}").json()["offset_bytes"]
-    assert patch(service, upload, now, content[now:]).json()["offset_bytes"] == len(content)
+    assert patch(service, upload, 1000, b"").status_code == 200
+    assert patch(service, upload, 1000, content[1000:]).json()["offset_bytes"] == len(content)
     done = service.http.post(f"uploads/{upload}:complete")
     assert done.status_code == 201
     assert service.http.post(f"uploads/{upload}:complete").json()["id"] == done.json()["id"]
     assert patch(service, upload, len(content), b"").status_code == 409
     assert upload not in [one["id"] for one in service.http.get("uploads").json()["items"]]
     assert service.http.delete(f"uploads/{upload}").status_code == 204
+
+
+@pytest.mark.parametrize("length_said", [True, False])
+def test_of_a_chunk_that_is_too_long_nothing_stays(daemon: Any, tmp_path: Path, length_said: bool) -> None:
+    one = daemon("--set", f"limit_chunk_bytes={2 << 20}")
+    upload = one.http.post("uploads", json={"name": "a.dat", "bytes": 5 << 20}).json()["id"]
+    part = next((tmp_path / "data" / "uploads").glob("*.part"))
+    assert patch(one, upload, 0, bytes(1000)).json()["offset_bytes"] == 1000
+
+    def pieces(size: int) -> Any:
+        """Sent without a length."""
+        return bytes(size) if length_said else (bytes(65_536) for _ in range(size >> 16))
+
+    def refused(at: int, size: int, status: int) -> None:
+        answer = patch(one, upload, at, pieces(size))
+        assert answer.status_code == status, answer.text
+        assert one.http.get(f"uploads/{upload}").json()["offset_bytes"] == at
+        assert part.stat().st_size == at
+
+    refused(1000, 3 << 20, 413)
+    at = 1000 + (4 << 20)
+    for offset in range(1000, at, 2 << 20):
+        assert patch(one, upload, offset, bytes(2 << 20)).status_code == 200
+    refused(at, 1 << 20, 409)
+    assert patch(one, upload, at, bytes((5 << 20) - at)).json()["offset_bytes"] == 5 << 20
+
+
+def test_what_is_promised_to_one_upload_is_promised_to_no_other(daemon: Any, tmp_path: Path) -> None:
+    one = daemon("--set", f"limit_upload_bytes={2**50}")
+    free = one.http.get("system").json()["disk"]["free_bytes"]
+
+    def start_upload(share: float) -> httpx.Response:
+        answer: httpx.Response = one.http.post("uploads", json={"name": "a.dat", "bytes": int(share * free)})
+        return answer
+
+    with ThreadPoolExecutor(8) as threads:
+        answers = list(threads.map(lambda _: start_upload(0.6), range(8)))
+    assert sorted(answer.status_code for answer in answers) == [201] + 7 * [507]
+    told = next(answer for answer in answers if answer.status_code == 507).json()["detail"]
+    assert "do not fit" in told and f"beside the {0.6 * free / 1e9:.1f} GB that running captures and uploads" in told
+    frames = round(0.6 * free / (96 * 64 / 8))
+    capture = {"source": "sim:?width=96&height=64", "reconstruct": False, "frames": frames}
+    refused = one.http.post("captures", json=capture)
+    assert refused.status_code == 507
+    assert "this capture needs" in refused.json()["detail"] and "are free for captures" in refused.json()["detail"]
+    assert one.http.get("captures").json()["items"] == []
+    one.process.kill()  # what was promised is promised by the next service too
+    one.process.wait()
+    one = daemon("--set", f"limit_upload_bytes={2**50}")
+    assert start_upload(0.6).status_code == 507
+    (upload,) = one.http.get("uploads").json()["items"]
+    assert one.http.delete(f"uploads/{upload['id']}").status_code == 204
+    started = one.http.post("captures", json=capture)
+    assert started.status_code == 201
+    assert start_upload(0.6).status_code == 507, "a running capture's needs are promised too"
+    one.http.post(f"captures/{started.json()['id']}:stop")
+    deadline = time.monotonic() + 60
+    while one.http.get(f"captures/{started.json()['id']}").json()["state"] not in ("complete", "failed"):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    assert start_upload(0.6).status_code == 201
 
 
 def test_an_upload_survives_the_service(daemon: Any, recording: Path) -> None:
@@ -153,7 +228,7 @@ def test_announcements_that_cannot_be(service: Any, body: dict[str, Any]) -> Non
 def test_more_than_the_settings_allow_is_told_at_once(service: Any) -> None:
     answer = service.http.post("uploads", json={"name": "a", "bytes": 2**41})
     assert answer.status_code == 413
-    assert "may have" in answer.json()["detail"]
+    assert "exceed the limit of" in answer.json()["detail"]
 
 
 def test_more_than_the_disk_has_is_told_at_once(daemon: Any) -> None:

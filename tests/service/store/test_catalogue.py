@@ -9,17 +9,17 @@ from pathlib import Path
 
 import psutil
 import pytest
-from spiked_service.ids import is_id, new_id
-from spiked_service.reconstruction_options import ReconstructionOptions
+from spiked_service.base.ids import is_id, new_id
+from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.catalogue import Catalogue, StoreError, UnknownIdError
 from spiked_service.store.rows import (
     CaptureRow,
     CaptureState,
     Grade,
     JobState,
-    Judgement,
     Origin,
     Plan,
+    Quality,
     ReconstructionRow,
     Recorded,
     VersionRow,
@@ -56,7 +56,7 @@ def test_a_row_comes_back_as_it_was_put_after_closing_too(tmp_path: Path) -> Non
     row = capture(
         "Wohnzimmer",
         sensor=Sensor(400, 250, 20_000.0, mosaic=Mosaic.BGGR, intrinsics=Intrinsics(1, 2, 3, 4)),
-        verdict=Judgement(Grade.DEGRADED, ("5 frames were lost",)),
+        verdict=Quality(Grade.DEGRADED, ("5 frames were lost",)),
         recording=Recorded(100, 1_250_000),
         warnings=("one", "two"),
         ended_at=NOW,

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from spiked_service.ids import new_id
+from spiked_service.base.ids import new_id
 from spiked_service.store.folder import DataFolder
 
 from spiked.errors import ConfigurationError

@@ -6,10 +6,11 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from spiked_service.api.announce import BusAnnouncer
-from spiked_service.events import Bus
-from spiked_service.ids import new_id
-from spiked_service.keeping import Keeping
+from spiked_service.api.bus_notifier import BusNotifier
+from spiked_service.base.ids import new_id
+from spiked_service.captures.archive import DataStore
+from spiked_service.daemon import open_data_store
+from spiked_service.events.bus import Bus
 from spiked_service.store.retention import Policy
 from spiked_service.store.rows import CaptureRow, CaptureState, JobState, Origin, Plan, ReconstructionRow, UploadRow
 
@@ -18,84 +19,84 @@ MIB = 1 << 20
 
 
 @pytest.fixture
-def keeping(tmp_path: Path) -> Iterator[Keeping]:
-    one = Keeping(tmp_path / "data", BusAnnouncer(Bus()))
+def data_store(tmp_path: Path) -> Iterator[DataStore]:
+    one = open_data_store(tmp_path / "data", BusNotifier(Bus()))
     yield one
     one.close()
 
 
-def capture(keeping: Keeping, days_old: float, **more: object) -> str:
+def capture(data_store: DataStore, days_old: float, **more: object) -> str:
     """A capture with a recording of 1 MiB and a reconstruction of 1 MiB."""
     ended = NOW - timedelta(days=days_old)
     row = CaptureRow(new_id(), Origin.LIVE, Plan("sim:"), CaptureState.COMPLETE, ended, ended_at=ended)
     row = replace(row, **more)  # type: ignore[arg-type]
-    keeping.catalogue.captures.put(row)
-    keeping.folder.capture(row.id).mkdir()
-    keeping.folder.recording(row.id).write_bytes(bytes(MIB))
+    data_store.catalogue.captures.put(row)
+    data_store.folder.capture(row.id).mkdir()
+    data_store.folder.recording(row.id).write_bytes(bytes(MIB))
     job = ReconstructionRow(new_id(), row.id, False, JobState.COMPLETE, ended)
-    keeping.catalogue.reconstructions.put(job)
-    keeping.folder.reconstruction(job.id).mkdir()
-    (keeping.folder.reconstruction(job.id) / "scene-000001.ply").write_bytes(bytes(MIB))
+    data_store.catalogue.reconstructions.put(job)
+    data_store.folder.reconstruction(job.id).mkdir()
+    (data_store.folder.reconstruction(job.id) / "scene-000001.ply").write_bytes(bytes(MIB))
     return row.id
 
 
-def there(keeping: Keeping, *ids: str) -> list[bool]:
-    return [keeping.catalogue.captures.find(one) is not None for one in ids]
+def there(data_store: DataStore, *ids: str) -> list[bool]:
+    return [data_store.catalogue.captures.find(one) is not None for one in ids]
 
 
-def test_without_limits_everything_stays(keeping: Keeping) -> None:
-    old = capture(keeping, 10_000)
-    keeping.retention.apply(NOW)
-    assert keeping.catalogue.captures.get(old).deleted_at is None
+def test_without_limits_everything_stays(data_store: DataStore) -> None:
+    old = capture(data_store, 10_000)
+    data_store.retention.apply(NOW)
+    assert data_store.catalogue.captures.get(old).deleted_at is None
 
 
-def test_old_ones_are_removed_then_gone_unless_kept_or_running(keeping: Keeping) -> None:
-    keeping.retention.policy = Policy(days=30, deleted_days=7)
-    old, young = capture(keeping, 31), capture(keeping, 29)
-    kept, running = capture(keeping, 31, keep=True), capture(keeping, 31, state=CaptureState.STREAMING)
-    keeping.retention.apply(NOW)
-    assert keeping.catalogue.captures.get(old).deleted_at is not None
-    assert there(keeping, old, young, kept, running) == [True] * 4
-    assert [row.id for row in keeping.captures.list(deleted=True).items] == [old]
-    assert keeping.captures.restore(old).row.deleted_at is None
-    keeping.captures.update(old, keep=True)
-    keeping.retention.apply(NOW)
-    assert keeping.catalogue.captures.get(old).deleted_at is None
-    keeping.catalogue.captures.set(old, deleted_at=NOW - timedelta(days=6.9))
-    keeping.retention.apply(NOW)
-    assert there(keeping, old) == [True]
-    keeping.catalogue.captures.set(old, deleted_at=NOW - timedelta(days=7))
-    jobs = keeping.catalogue.reconstructions_of(old)
-    keeping.retention.apply(NOW)
-    assert there(keeping, old, young, kept, running) == [False, True, True, True]
-    assert not keeping.folder.capture(old).exists()
-    assert not keeping.folder.reconstruction(jobs[0].id).exists()
-    assert keeping.catalogue.reconstructions_of(old) == []
+def test_old_ones_are_removed_then_gone_unless_kept_or_running(data_store: DataStore) -> None:
+    data_store.retention.policy = Policy(days=30, deleted_days=7)
+    old, young = capture(data_store, 31), capture(data_store, 29)
+    kept, running = capture(data_store, 31, keep=True), capture(data_store, 31, state=CaptureState.STREAMING)
+    data_store.retention.apply(NOW)
+    assert data_store.catalogue.captures.get(old).deleted_at is not None
+    assert there(data_store, old, young, kept, running) == [True] * 4
+    assert [row.id for row in data_store.captures.list(deleted=True).items] == [old]
+    assert data_store.captures.restore(old).row.deleted_at is None
+    data_store.captures.update(old, keep=True)
+    data_store.retention.apply(NOW)
+    assert data_store.catalogue.captures.get(old).deleted_at is None
+    data_store.catalogue.captures.set(old, deleted_at=NOW - timedelta(days=6.9))
+    data_store.retention.apply(NOW)
+    assert there(data_store, old) == [True]
+    data_store.catalogue.captures.set(old, deleted_at=NOW - timedelta(days=7))
+    jobs = data_store.catalogue.reconstructions_of(old)
+    data_store.retention.apply(NOW)
+    assert there(data_store, old, young, kept, running) == [False, True, True, True]
+    assert not data_store.folder.capture(old).exists()
+    assert not data_store.folder.reconstruction(jobs[0].id).exists()
+    assert data_store.catalogue.reconstructions_of(old) == []
 
 
-def test_beyond_a_size_removed_ones_go_first_then_the_oldest(keeping: Keeping) -> None:
-    kept = capture(keeping, 5, keep=True)
-    oldest, older, deleted = capture(keeping, 4), capture(keeping, 3), capture(keeping, 2, deleted_at=NOW)
-    youngest = capture(keeping, 1)
-    assert sum(keeping.retention.used_bytes().values()) >= 10 * MIB
+def test_beyond_a_size_removed_ones_go_first_then_the_oldest(data_store: DataStore) -> None:
+    kept = capture(data_store, 5, keep=True)
+    oldest, older, deleted = capture(data_store, 4), capture(data_store, 3), capture(data_store, 2, deleted_at=NOW)
+    youngest = capture(data_store, 1)
+    assert sum(data_store.retention.used_bytes().values()) >= 10 * MIB
     for limit, expected in (
         (11, [True, True, True, True, True]),
         (9, [True, True, True, False, True]),
         (7, [True, False, True, False, True]),
         (3, [True, False, False, False, False]),
     ):
-        keeping.retention.policy = Policy(bytes=limit * MIB)
-        keeping.retention.apply(NOW)
-        assert there(keeping, kept, oldest, older, deleted, youngest) == expected
+        data_store.retention.policy = Policy(bytes=limit * MIB)
+        data_store.retention.apply(NOW)
+        assert there(data_store, kept, oldest, older, deleted, youngest) == expected
 
 
-def test_uploads_that_nobody_goes_on_with_are_dropped(keeping: Keeping) -> None:
+def test_uploads_that_nobody_goes_on_with_are_dropped(data_store: DataStore) -> None:
     stale, fresh = (
         UploadRow(new_id(), "a.dat", 10, NOW - timedelta(days=days), NOW - timedelta(days=days)) for days in (1.1, 0.9)
     )
     for row in (stale, fresh):
-        keeping.catalogue.uploads.put(row)
-        keeping.folder.upload(row.id).touch()
-    keeping.retention.apply(NOW)
-    assert [row.id for row in keeping.catalogue.uploads.where()] == [fresh.id]
-    assert keeping.folder.contents()[2] == {fresh.id}
+        data_store.catalogue.uploads.put(row)
+        data_store.folder.upload(row.id).touch()
+    data_store.retention.apply(NOW)
+    assert [row.id for row in data_store.catalogue.uploads.where()] == [fresh.id]
+    assert data_store.folder.contents()[2] == {fresh.id}

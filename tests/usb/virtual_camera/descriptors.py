@@ -25,6 +25,8 @@ class Identity:
     manufacturer: str = "FTDI"
     name: str = "FTDI SuperSpeed-FIFO Bridge"
     serial: str = "000000000001"
+    chip: tuple[int, int, int] = (0, 0, 2)
+    """Codes of the bridge's clock, FIFO mode and channels: 100 MHz, 245 mode, one channel."""
 
     def device(self, speed: Speed) -> bytes:
         """The device descriptor, 18 bytes."""
@@ -50,9 +52,9 @@ class Identity:
         return bytes((2 + len(text), 3)) + text
 
     def chip_configuration(self) -> bytes:
-        """The 152 bytes of vendor request 0xCF: one channel, 245 mode, 100 MHz, strings as in the descriptors."""
+        """The 152 bytes of vendor request 0xCF, strings as in the descriptors."""
         strings = b"".join(self.string(index) or b"" for index in (1, 2, 3)).ljust(128, b"\0")
-        power = struct.pack("<BBHBBBB", 9, 0xE0, 96, 0, 0, 0, 2)
+        power = struct.pack("<BBHBBBB", 9, 0xE0, 96, 0, *self.chip)
         return struct.pack("<HH", self.vendor, self.product) + strings + power + struct.pack("<HBBII", 0, 0, 0, 0, 0)
 
 

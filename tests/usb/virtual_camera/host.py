@@ -16,7 +16,7 @@ import numpy as np
 from .core import Camera
 from .descriptors import Identity, Speed
 from .faults import Fault, Kind
-from .stream import COMPACT_BYTES, Stream
+from .stream import COMPACT_BYTES, MAGIC, Stream
 from .testbed import Testbed
 from .usbfs import Client, Limits, Node
 
@@ -39,6 +39,12 @@ class CameraSettings:
     nbytes: int = 0
     buffer_frames: int = 64
     stamp: bool = True
+    fifo: bool = False
+    """Without room the oldest frames are kept, not the newest."""
+    magic: int = MAGIC
+    """First word of each header."""
+    chip: tuple[int, int, int] = (0, 0, 2)
+    """The bridge's codes for clock, FIFO mode and channels."""
     faults: tuple[Fault, ...] = ()
 
     def build(self) -> Camera:
@@ -51,9 +57,12 @@ class CameraSettings:
             nbytes=self.nbytes,
             buffer_frames=self.buffer_frames,
             stamp=self.stamp,
+            fifo=self.fifo,
+            magic=self.magic,
             faults=self.faults,
         )
-        return Camera(stream, Identity(serial=self.serial), Speed.HIGH if self.usb2 else Speed.SUPER)
+        identity = Identity(serial=self.serial, chip=tuple(self.chip))  # type: ignore[arg-type]
+        return Camera(stream, identity, Speed.HIGH if self.usb2 else Speed.SUPER)
 
 
 def settings_from(values: dict[str, Any]) -> CameraSettings:
@@ -221,11 +230,13 @@ class Host:
                 return {
                     "sent": [[run.first, run.count] for run in stream.sent],
                     "next_frame": stream.next_frame,
+                    "start_s": stream.start_s,
                     "dropped": stream.dropped,
                     "done": [asdict(fault) for fault in stream.done],
                     "requests": [asdict(request) for request in socketed.camera.requests],
                     "bad_requests": socketed.camera.bad_requests,
                     "in_flight_bytes": node.in_flight_bytes() if node else 0,
+                    "room_bytes": node.room_bytes() if node else 0,
                     "plugged": node is not None,
                     "port": socketed.port,
                     "direct_memory": all(client.memory.direct for client in node.clients) if node else None,

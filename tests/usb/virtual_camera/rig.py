@@ -33,6 +33,8 @@ class Report:
     sent: tuple[Run, ...]
     """Frames that went towards the host, by the camera's own numbers."""
     next_frame: int
+    start_s: float
+    """Monotonic: with a rate, frame k is there 1 + k frames later."""
     dropped: int
     """Frames that the host did not take in time."""
     done: tuple[str, ...]
@@ -41,6 +43,8 @@ class Report:
     """Index and length of the last read requests."""
     bad_requests: int
     in_flight_bytes: int
+    room_bytes: int
+    """Bytes that the camera can send into the reads that are queued."""
     plugged: bool
     port: str
     direct_memory: bool | None
@@ -135,6 +139,10 @@ class VirtualCameras:
         values["done"] = tuple(fault["kind"] for fault in values["done"])
         values["requests"] = tuple((request["index"], request["length"]) for request in values["requests"])
         return Report(**values)
+
+    def hurry(self) -> None:
+        """Before all that is not real-time: a camera is not kept waiting by a busy host. Raises PermissionError."""
+        os.sched_setscheduler(self._process.pid, os.SCHED_FIFO, os.sched_param(30))
 
     def close(self) -> None:
         """End the cameras."""

@@ -24,10 +24,10 @@ class Run:
     count: int
 
 
-def wire_frames(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def wire_frames(frames: NDArray[np.uint8], magic: int = MAGIC) -> NDArray[np.uint8]:
     """Compact frames, uint8 [n, 12500], as they are on the wire, uint8 [n, 13016], with both counters 0."""
     wire = np.zeros((len(frames), FRAME_BYTES), np.uint8)
-    wire[:, :8] = np.array([MAGIC, WORD1], "<u4").view(np.uint8)
+    wire[:, :8] = np.array([magic, WORD1], "<u4").view(np.uint8)
     lines = wire[:, 16:].reshape(len(frames), ROWS, ROW_BYTES + 2)
     lines[:, :, :ROW_BYTES] = frames.reshape(len(frames), ROWS, ROW_BYTES)
     lines[:, :, ROW_BYTES:] = np.arange(ROWS, dtype="<u2").view(np.uint8).reshape(ROWS, 2)
@@ -41,6 +41,9 @@ class Stream:
     in whole frames and counted. What the host has room for is sent by the clock even if this process is late: a camera
     is not slowed down by a busy machine. Without a rate (0) there is always a next frame and none is dropped. With
     `stamp` the first 8 bytes of pixels are the frame's number, so that no two frames are the same.
+
+    What is kept of frames without room is the newest `buffer_frames`, or with `fifo` the oldest, as in the real camera:
+    then old frames come first, and the count jumps behind them.
     """
 
     def __init__(
@@ -52,17 +55,23 @@ class Stream:
         nbytes: int = 0,
         buffer_frames: int = 64,
         stamp: bool = True,
+        fifo: bool = False,
+        magic: int = MAGIC,
         faults: tuple[Fault, ...] = (),
     ) -> None:
-        self._wire = wire_frames(frames)
+        self._wire = wire_frames(frames, magic)
         self._words = self._wire[:, :16].view("<u4")
         self._rate_hz = rate_hz
         self._lines, self._nbytes = lines, nbytes
         self._buffer_frames = buffer_frames
         self._stamp = stamp
+        self._fifo = fifo
+        self._room_since_s = 0.0
+        self._kept_to = 0  # the first frame that is not yet in the buffer, or dropped
         self._faults: list[Fault] = list(faults)
         heapq.heapify(self._faults)
-        self._start_s = time.monotonic()
+        self.start_s = time.monotonic()
+        """With a rate, frame k is there 1 + k frames later."""
         self._silent_until_s = 0.0
         self._pieces: list[memoryview] = []
         self._breaks: list[Fault | None] = []
@@ -93,12 +102,12 @@ class Stream:
         wait_s = self._silent_until_s - now_s
         if self._rate_hz:
             frames = -(-wanted_bytes // FRAME_BYTES)
-            wait_s = max(wait_s, self._start_s + (self.next_frame + frames) / self._rate_hz - now_s)
+            wait_s = max(wait_s, self.start_s + (self.next_frame + frames) / self._rate_hz - now_s)
         return max(0.0, wait_s)
 
     def _due(self, time_s: float) -> int:
         """Frames that were taken by then."""
-        return int((time_s - self._start_s) * self._rate_hz)
+        return int((time_s - self.start_s) * self._rate_hz)
 
     def pull(self, limit: int, now_s: float, room_since_s: float) -> tuple[list[memoryview], Fault | None]:
         """The next bytes, `limit` at most, and what happens then. They are valid until the next call.
@@ -126,7 +135,10 @@ class Stream:
         """Put the next frames in front, up to the next fault; false if none is due."""
         if self.wait_s(now_s) > 0:
             return False
-        self._skip_missed(self._due(room_since_s) - self._buffer_frames)
+        if self._fifo:
+            self._fill_buffer(room_since_s)
+        else:
+            self._skip_missed(self._due(room_since_s) - self._buffer_frames)
         while self._faults and self._faults[0].frame <= self.next_frame:
             if not self._misbehave(heapq.heappop(self._faults), now_s):
                 return bool(self._pieces)
@@ -165,6 +177,21 @@ class Stream:
         if self._rate_hz and oldest > self.next_frame:
             self.dropped += oldest - self.next_frame
             self.next_frame = oldest
+
+    def _fill_buffer(self, room_since_s: float) -> None:
+        """What came without room, up to when there was some again: kept as far as the buffer goes, else dropped."""
+        if not self._rate_hz or room_since_s == self._room_since_s:
+            return
+        self._room_since_s = room_since_s
+        kept_to = max(self._kept_to, self.next_frame)
+        drops = sum(fault.count for fault in self._faults if fault.kind is Kind.DROP and fault.frame <= kept_to)
+        free = self._buffer_frames - (kept_to - drops - self.next_frame)
+        came = max(0, self._due(room_since_s) - kept_to)
+        missed = max(0, came - free)
+        if missed:
+            self.dropped += missed
+            self.add(Fault(kept_to + came - missed, Kind.DROP, count=missed))
+        self._kept_to = kept_to + came
 
     def _misbehave(self, fault: Fault, now_s: float) -> bool:
         """Put what is wrong in front of the next frame; false if nothing may follow for now."""

@@ -329,19 +329,19 @@ class Node:
 
     def pump(self) -> None:
         """Let the camera send into the transfers in flight, in their order, and say what is to be reaped."""
-        self._tell_room()
+        self.camera.make_room(self.room_bytes())
         for client in self.clients:
             while client.pending and not self.gone and self._send(client):
                 pass
             client.answer_waiting()
-        self._tell_room()
+        self.camera.make_room(self.room_bytes())
         self._show()
 
-    def _tell_room(self) -> None:
-        room = sum(
+    def room_bytes(self) -> int:
+        """What the camera can send into the bulk transfers in flight."""
+        return sum(
             urb.length - urb.actual for client in self.clients for urb in client.pending if urb.kind == _URB_BULK
         )
-        self.camera.make_room(room)
 
     def _send(self, client: Client) -> bool:
         urb = _first_bulk(client.pending)

@@ -1,0 +1,45 @@
+"""Published versions of a reconstruction: which are kept, and what a reader of an older index finds."""
+
+from pathlib import Path
+
+import numpy as np
+from spiked_service.results.versions import Publisher, at, newest, versions
+
+from spiked.scene import Scene
+from spiked.trajectory import Trajectory
+
+
+def test_files_of_the_last_three_versions_are_kept_and_old_versions_thinned(tmp_path: Path) -> None:
+    publisher = Publisher(tmp_path)
+    assert newest(tmp_path) is None
+    trajectory = Trajectory(np.array([0.5]), np.eye(3)[None], np.zeros((1, 3)))
+    seen = []
+    for number in range(1, 61):
+        published = publisher.publish(Scene.empty(1), trajectory, white=0.1 * number)
+        assert newest(tmp_path) == published
+        seen.append(published)
+        assert all((tmp_path / old.scene).exists() and (tmp_path / old.trajectory).exists() for old in seen[-3:])
+    kept = versions(tmp_path)
+    assert [one.version for one in kept] == publisher.kept
+    assert len(kept) <= 35 and kept[0].version == 1 and kept[-1].version == 60
+    assert at(tmp_path, kept[5].version) == kept[5]
+    assert at(tmp_path, 2) is None
+    files = {path.name for path in tmp_path.iterdir()}
+    assert files == {name for one in kept for name in (one.scene, one.trajectory)} | {"published.json"}
+    assert Publisher(tmp_path).publish(Scene.empty(1), trajectory, 0.1).version == 61
+
+
+def test_a_held_version_outlasts_many_and_can_be_made_the_newest_again(tmp_path: Path) -> None:
+    publisher = Publisher(tmp_path)
+    trajectory = Trajectory(np.array([0.5, 1.5]), np.eye(3)[None].repeat(2, 0), np.ones((2, 3)))
+    for number in range(1, 9):
+        best = publisher.publish(Scene.empty(1), trajectory, white=0.1 * number, psnr_db=20.0 + number)
+    publisher.hold()
+    for _ in range(200):
+        publisher.publish(Scene.empty(1), trajectory, white=5.0)
+    again = publisher.again(best)
+    assert newest(tmp_path) == again and again.version == 209
+    assert (again.white, again.psnr_db, again.poses) == (best.white, best.psnr_db, best.poses)
+    assert best.version in publisher.kept and len(publisher.kept) <= 36
+    assert (tmp_path / again.scene).read_bytes() == (tmp_path / best.scene).read_bytes()
+    assert (tmp_path / again.trajectory).read_bytes() == (tmp_path / best.trajectory).read_bytes()

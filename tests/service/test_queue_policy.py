@@ -1,0 +1,46 @@
+"""Order, limit, precedence and retries of the queue."""
+
+from datetime import UTC, datetime
+from typing import Any
+
+from spiked_service.reconstructions.queue_policy import QueuePolicy
+from spiked_service.store.rows import JobState, ReconstructionRow, Stage
+
+BEGAN = datetime(2026, 1, 1, tzinfo=UTC)
+
+
+def row(name: str, live: bool = True, **fields: Any) -> ReconstructionRow:
+    return ReconstructionRow(name, "capture", live, JobState.RUNNING, BEGAN, **fields)
+
+
+def test_a_live_one_returns_to_the_queue_when_others_refine_up_to_the_limit() -> None:
+    policy = QueuePolicy()
+    refining = row("refining", stage=Stage.REFINING)
+    tracking = row("tracking", stage=Stage.TRACKING)
+    from_recording = row("from recording", live=False, stage=Stage.TRACKING)
+    assert policy.must_yield(row("new"), [refining], False)
+    assert policy.must_yield(row("new"), [from_recording], False)
+    assert not policy.must_yield(row("new"), [tracking], False)
+    assert not policy.must_yield(row("new", live=False), [refining], False), "it is from the queue already"
+    policy.limit = 2
+    assert not policy.must_yield(row("new"), [refining], False)
+
+
+def test_a_live_one_returns_to_the_queue_when_a_queued_one_could_run_instead() -> None:
+    policy = QueuePolicy()
+    assert policy.must_yield(row("new"), [], True)
+    assert not policy.must_yield(row("new"), [row("tracking", stage=Stage.TRACKING)], True), "none could start"
+    policy.limit = 2
+    assert policy.must_yield(row("new"), [row("tracking", stage=Stage.TRACKING)], True)
+
+
+def test_retries_are_delayed_and_counted_for_each_reconstruction() -> None:
+    policy = QueuePolicy(delays_s=(0.0, 3600.0))
+    assert policy.due("one") and not policy.delays
+    assert policy.retry("one") and policy.due("one")
+    assert policy.retry("one") and policy.delays
+    assert not policy.due("one") and policy.due("other")
+    assert not policy.retry("one"), "there were as many retries as delays"
+    policy.reset_retries("one")
+    assert policy.due("one") and not policy.delays
+    assert policy.retry("one"), "they are counted anew"

@@ -4,6 +4,8 @@ PYTHON ?= python3.11
 # The reference renderer of the tests is all that uses torch. Installed first and by number, so that a CPU wheel offered by
 # the machine's pip configuration is taken and the default build, several times its size, is not.
 TORCH ?= torch==2.13.0
+# Tests that run at the same time. Most wait for a daemon, a browser or a clock; files stay whole because they share fixtures.
+JOBS ?= 2
 BUILD_REQUIRES := "scikit-build-core>=0.10" "nanobind>=2.4" "cmake>=3.25" ninja
 
 # Debian packages for tests of the USB camera: a mocked kernel, a fuzzer, and, for the slow ones, a guest's real kernel.
@@ -18,7 +20,7 @@ WEB := $(shell find web -path web/node_modules -prune -o -type f -print)
 PAGE := service/spiked_service/page/index.html
 NPM_CI := web/node_modules/.package-lock.json
 
-.PHONY: demo test test-slow validation lint bench page api wheel clean
+.PHONY: demo check hooks test test-slow validation lint bench page api docs wheel clean
 .DELETE_ON_ERROR:
 
 # Without Node the daemon runs all the same; its page then says how to build it.
@@ -26,9 +28,19 @@ demo: $(VENV)/.native
 	@$(MAKE) --no-print-directory page || echo "the page is not built; the API works without it" >&2
 	$(BIN)/spiked serve --device sim: --frames 1280 --follow
 
+# before each commit: linters, types, and the fast tests of what differs from the main branch
+check: lint
+	cd web && npm run --silent test
+	@tests=$$($(BIN)/python tests/changed.py); \
+	if [ -n "$$tests" ]; then $(BIN)/pytest -q -x -m "not slow" $$tests; else echo "no test imports what changed"; fi
+
+# every commit is then checked by the linters and the types
+hooks: $(VENV)/.native $(NPM_CI)
+	$(BIN)/pre-commit install
+
 test: lint $(PAGE) $(VENV)/.chromium $(VENV)/.mocks
 	cd web && npm run --silent test
-	$(BIN)/pytest -m "not slow"
+	$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not slow"
 
 test-slow: $(VENV)/.native $(PAGE) $(VENV)/.chromium $(VENV)/.mocks $(VENV)/.guest
 	$(BIN)/pytest -m slow
@@ -55,6 +67,11 @@ api: $(VENV)/.native $(NPM_CI)
 	$(BIN)/spiked openapi --out web/openapi.json
 	$(BIN)/python tests/client/generate.py web/openapi.json
 	cd web && npm run --silent types
+
+# The documentation as a site in build/site, which a browser reads from disk.
+docs: $(VENV)/.packages
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo "open build/site/index.html"
 
 wheel: $(VENV)/.native $(PAGE)
 	$(BIN)/pip wheel --quiet --no-build-isolation --no-deps --wheel-dir dist .
@@ -94,7 +111,7 @@ $(VENV)/.mocks $(VENV)/.guest: $(VENV)/.python
 $(VENV)/.packages: $(VENV)/.python pyproject.toml
 	$(BIN)/pip install --quiet $(BUILD_REQUIRES)
 	$(BIN)/pip install --quiet $(TORCH)
-	$(BIN)/pip install --quiet --no-build-isolation --editable '.[test,lint]'
+	$(BIN)/pip install --quiet --no-build-isolation --editable '.[test,lint,docs]'
 	touch $@
 
 # Without build isolation CMake finds the same nanobind each time and compiles only what changed.

@@ -102,6 +102,14 @@ def test_a_white_and_a_gain_far_from_sense_are_refused(service: Any, done: Captu
     assert service.http.get(f"captures/{done.id}/preview", params=extreme).status_code == 200
 
 
+@pytest.mark.parametrize("number", ["0.0", "1e1", "0x1", "", "\u0663"])
+def test_an_integer_in_a_query_is_written_in_digits(service: Any, done: CaptureOut, number: str) -> None:
+    for what in ("stats", "preview"):
+        answer = service.http.get(f"captures/{done.id}/{what}", params={"frame": number})
+        assert answer.status_code == 422, answer.text
+    assert service.http.get("captures", params={"limit": number}).status_code == 422
+
+
 def test_a_frame_that_was_not_recorded_has_no_picture(service: Any, done: CaptureOut) -> None:
     answer = service.http.get(f"captures/{done.id}/preview", params={"frame": FRAMES})
     assert answer.status_code == 404

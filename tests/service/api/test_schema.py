@@ -44,6 +44,8 @@ BEYOND_SCHEMA = {
     "/api/v1/uploads": "geometry and sidecar fit each other and the size, which has a limit of its own",
 }
 """Where what the schema allows may be refused with 422 or 413 all the same, and why; test_rules has the other rules."""
+TOO_LARGE = ("/api/v1/captures", "/api/v1/uploads")
+"""Where 507 says that the disk has no room for what is asked: no failure of the service."""
 _ACCEPTED = ["2xx", "3xx", "401", "403", "404", "409", "429", "5xx"]
 
 
@@ -55,6 +57,8 @@ def configuration(known: dict[str, str]) -> str:
         accepted = json.dumps([*_ACCEPTED, "413", "422"])
         lines += ["[[operations]]", f'include-path = "{path}"', 'include-method = "POST"']
         lines += [f"checks.positive_data_acceptance.expected-statuses = {accepted}"]
+        if path in TOO_LARGE:
+            lines += ['checks.not_a_server_error.expected-statuses = ["2xx", "3xx", "4xx", "507"]']
     return "\n".join(lines) + "\n"
 
 

@@ -4,11 +4,13 @@ from typing import Annotated, Any
 
 from fastapi import Query
 
-from spiked_service.api.schemas.base import LARGEST_INTEGER
+from spiked_service.api.schemas.base import IN_DIGITS, LARGEST_INTEGER
 from spiked_service.results.image_encoding import ImageFormat
 
 Version = Annotated[
-    int | None, Query(ge=1, le=LARGEST_INTEGER, description="Default: the newest; `GET versions` lists them.")
+    int | None,
+    IN_DIGITS,
+    Query(ge=1, le=LARGEST_INTEGER, description="Default: the newest; `GET versions` lists them."),
 ]
 WishedImage = Annotated[ImageFormat | None, Query(description="Takes precedence over Accept; the default is PNG.")]
 

@@ -12,7 +12,7 @@ from spiked_service.api import files
 from spiked_service.api.problems import NotReadyError, problems
 from spiked_service.api.results import Result, Results
 from spiked_service.api.routes.parameters import BINARY, NOT_MODIFIED, PICTURES, WishedImage
-from spiked_service.api.schemas.base import LARGEST_INTEGER
+from spiked_service.api.schemas.base import IN_DIGITS, LARGEST_INTEGER
 from spiked_service.api.schemas.captures import StatsOut
 from spiked_service.api.schemas.views import ViewRequest
 from spiked_service.api.views import image_format, views_response
@@ -26,6 +26,7 @@ from spiked_service.workers.messages import PreviewKind
 
 Frame = Annotated[
     int | None,
+    IN_DIGITS,
     Query(ge=0, le=LARGEST_INTEGER, description="Absolute index of a recorded frame. Default: the newest frames."),
 ]
 Gain = Annotated[float, Query(ge=0.001, le=1000, description="Factor of the brightness.")]

@@ -11,6 +11,7 @@ from spiked_service.api.auth.scopes import needs
 from spiked_service.api.problems import problems
 from spiked_service.api.results import Results, SceneFormat
 from spiked_service.api.routes.parameters import BINARY, ETAG, NOT_MODIFIED, PICTURES, Version, WishedImage
+from spiked_service.api.schemas.base import IN_DIGITS
 from spiked_service.api.schemas.reconstructions import TrajectoryOut
 from spiked_service.api.schemas.views import ViewRequest
 from spiked_service.api.trajectories import Range, TrajectoryFormat
@@ -22,9 +23,11 @@ from spiked_service.store.rows import ReconstructionRow
 
 FromS = Annotated[float | None, Query(ge=0, le=1e9, description="First time, seconds since the start of the capture.")]
 ToS = Annotated[float | None, Query(ge=0, le=1e9, description="End time, not included, in seconds.")]
-Step = Annotated[int, Query(ge=1, le=1_000_000, description="Every n-th pose.")]
+Step = Annotated[int, IN_DIGITS, Query(ge=1, le=1_000_000, description="Every n-th pose.")]
 MaxSplats = Annotated[
-    int | None, Query(ge=1, le=10_000_000, description="Most splats: a fixed sample is returned. Default: all.")
+    int | None,
+    IN_DIGITS,
+    Query(ge=1, le=10_000_000, description="Most splats: a fixed sample is returned. Default: all."),
 ]
 
 _TEXT: dict[str, Any] = {"schema": {"type": "string"}}

@@ -1,11 +1,12 @@
 """What the models of the API share."""
 
+import re
 from datetime import UTC, datetime
 from itertools import combinations, permutations
 from typing import Annotated, Any, Generic, TypeVar
 
 from fastapi import Query
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StrictFloat, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, StrictFloat, model_validator
 
 from spiked.sensor import Intrinsics
 
@@ -120,7 +121,16 @@ Vector = tuple[Finite, Finite, Finite]
 Quaternion = tuple[Finite, Finite, Finite, Finite]
 
 
-Limit = Annotated[int, Query(ge=1, le=200, description="Most items of an answer.")]
+def _in_digits(text: object) -> object:
+    """Of a query, where Pydantic also takes "0.0"."""
+    if isinstance(text, str) and re.fullmatch(r"[+-]?\d+", text, re.ASCII) is None:
+        raise ValueError("not an integer")
+    return text
+
+
+IN_DIGITS = BeforeValidator(_in_digits)
+"""An integer of a query: digits and a sign."""
+Limit = Annotated[int, IN_DIGITS, Query(ge=1, le=200, description="Most items of an answer.")]
 Cursor = Annotated[
     str | None,
     Query(min_length=1, max_length=64, description="`next_cursor` of the page before."),

@@ -82,7 +82,7 @@ class Counted(View):
         length = np.float32(self.end - self.begin)
         return self.counts / length, np.full(self.counts.shape, np.sqrt(0.2) / length, np.float32)
 
-    def preview_rate(self, room: Image) -> Image:
+    def preview_rate(self, out: Image) -> Image:
         return self.rate
 
 
@@ -235,7 +235,7 @@ def rows() -> list[Row]:
     for spacing, degree in ((8, 3), (32, 3), (128, 3), (8, 1), (16, 1)):
         name = f"path: spline of degree {degree}, {spacing} frames a knot"
         table.append(Row(name, path=True, patches=splines(spacing, degree)))
-    held, forgotten = (refine, "HELD", 1e9), (Odometry, "information", lambda _: None)
+    held, forgotten = (refine, "LANDMARK_DAMPING", 1e9), (Odometry, "information", lambda _: None)
     for stream in (GREY, KINKED):
         for name, patches in (
             ("as it is", None),

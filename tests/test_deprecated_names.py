@@ -39,6 +39,10 @@ def test_device_status_of_a_ring() -> None:
     with RingWriter.create(SENSOR, slots=8) as writer:
         with warned("RingWriter.publish_condition", "publish_device_status"):
             writer.publish_condition(DeviceStatus(DeviceState.ARMED, "why"))  # type: ignore[attr-defined]
+        with warned("RingWriter.has_room", "has_space"):
+            assert writer.has_room()  # type: ignore[attr-defined]
+        with warned("RingWriter.wait_for_room", "wait_for_space"):
+            assert writer.wait_for_room(0.0)  # type: ignore[attr-defined]
         status = writer.status().writer
         with warned("WriterStatus.condition", "device_status"):
             assert status.condition == DeviceStatus(DeviceState.ARMED, "why")  # type: ignore[attr-defined]

@@ -242,19 +242,19 @@ def test_slots_acquired_ahead_are_committed_in_order_with_gaps_between(writer: R
     assert values == [1, Gap(8, 8, LossCause.USB), 2]
 
 
-def test_a_writer_that_can_wait_has_room_while_no_reader_would_lose(writer: RingWriter) -> None:
+def test_a_writer_that_can_wait_has_space_while_no_reader_would_lose(writer: RingWriter) -> None:
     reader, skipping = attach(writer), attach(writer, Policy.LATEST)
     for _ in range(8):
-        assert writer.has_room()
+        assert writer.has_space()
         put(writer, 8)
-    assert not writer.wait_for_room(0.01)
+    assert not writer.wait_for_space(0.01)
     reader.next(0)
-    assert not writer.has_room()  # the block is being read
+    assert not writer.has_space()  # the block is being read
     reader.next(0)
-    assert writer.has_room()
+    assert writer.has_space()
     reader.close()
     for _ in range(20):
-        assert writer.has_room()
+        assert writer.has_space()
         put(writer, 8)
     skipping.close()
 
@@ -266,7 +266,7 @@ def test_a_successor_may_begin_before_what_a_killed_reader_gave_back(writer: Rin
         put(writer, 8)
         drain(recorder)
     given_back = recorder.status().readers[0].next_frame
-    while writer.has_room():
+    while writer.has_space():
         put(writer, 8)
     recorder.close()  # what it still had in its memory is lost with it
     start = given_back - 8 * (slots // 4)

@@ -44,7 +44,7 @@ def write(seed: int, blocks: int, readers: int, patient: bool) -> None:
         assert writer.wait_for_readers(readers, DEADLINE_S)
         for _ in range(blocks):
             if patient:
-                assert writer.wait_for_room(DEADLINE_S)
+                assert writer.wait_for_space(DEADLINE_S)
             elif chance.random() < 0.2:
                 time.sleep(chance.random() * 0.004)
             view = writer.acquire()

@@ -241,7 +241,7 @@ def _pump(source: Source, packer: SlotPacker, timing: _Timing | None, stop: Stop
     while not packer.full:
         if stop.is_set():
             return EndReason.STOPPED
-        if source.can_block and packer.needs_slot and not packer.writer.wait_for_room(READ_WAIT_S):
+        if source.can_block and packer.needs_slot and not packer.writer.wait_for_space(READ_WAIT_S):
             continue
         item = source.read_into(packer.view())
         seen_ns = time.monotonic_ns()

@@ -79,7 +79,7 @@ class Channels(IntEnum):
 
 _BUS_BYTES = {0x601E: 2, 0x601F: 4}
 """Bytes per clock of the bus between camera and chip, by product id."""
-_SET_IT = "set it with FTDI's FT60X configuration programmer to one channel, FIFO mode 245, 100 MHz"
+_REMEDY = "set it with FTDI's FT60X configuration programmer to one channel, FIFO mode 245, 100 MHz"
 
 
 @dataclass(frozen=True)
@@ -120,14 +120,14 @@ class ChipConfiguration:
     def impossible(self, wire_bytes_s: float) -> str | None:
         """Why the chip cannot carry that many bytes a second, and what to do; None if it can."""
         if self.channels is Channels.ONE_TO_CAMERA:
-            return f"its bridge has no channel to the host: {_SET_IT}"
+            return f"its bridge has no channel to the host: {_REMEDY}"
         if self.fifo_clock is None:
             return None
         carries = 1e6 * self.fifo_clock.mhz * _BUS_BYTES.get(self.product_id, 4)
         if carries >= wire_bytes_s:
             return None
         what = f"its bridge's bus carries {carries / 1e6:.0f} MB/s at {self.fifo_clock.mhz} MHz"
-        return f"{what}, and the camera sends {wire_bytes_s / 1e6:.0f}: {_SET_IT}"
+        return f"{what}, and the camera sends {wire_bytes_s / 1e6:.0f}: {_REMEDY}"
 
     def unusual(self) -> str | None:
         """Settings that differ from an SPS10's and may still work, and what to do; None if there are none."""
@@ -140,4 +140,4 @@ class ChipConfiguration:
             odd.append("unknown clock")
         if not odd:
             return None
-        return f"its bridge has {' and '.join(odd)}, and only the first channel is read: if no frames come, {_SET_IT}"
+        return f"its bridge has {' and '.join(odd)}, and only the first channel is read: if no frames come, {_REMEDY}"

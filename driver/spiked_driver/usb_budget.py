@@ -85,8 +85,8 @@ def plan_transfers(
         f"{needed / 2**20:.0f} MiB in flight, to hide {1e3 * wanted * transfer_bytes / rate_bytes:.0f} ms of a busy "
         f"host at {rate_bytes / 1e6:.0f} MB/s, are more than usbfs_memory_mb={limit_bytes >> 20} allows"
     )
-    hides_ms = 1e3 * fits * transfer_bytes / rate_bytes
-    most = f"{fits} transfers of {transfer_bytes >> 10} KiB fit, which hide {hides_ms:.0f} ms"
+    buffered_ms = 1e3 * fits * transfer_bytes / rate_bytes
+    most = f"{fits} transfers of {transfer_bytes >> 10} KiB fit, which hide {buffered_ms:.0f} ms"
     if buffer_s is not None or fits < MIN_TRANSFERS:
         raise SourceError(f"{what}; {most}: request less, or {how_to_raise(needed)}")
     return TransferPlan(fits, transfer_bytes, rate_bytes, f"{what}; {most}; to get all, {how_to_raise(needed)}")

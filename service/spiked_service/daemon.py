@@ -50,9 +50,9 @@ from spiked_service.results.view_renderer import ViewRenderer
 from spiked_service.settings.reload import ReloadableSettings
 from spiked_service.settings.settings import Settings
 from spiked_service.settings.tokens import Tokens, token_of
+from spiked_service.store.disk_space import DiskSpace
 from spiked_service.store.folder import DataFolder, default_folder
 from spiked_service.store.retention import Retention
-from spiked_service.store.room import Room
 
 _log = logger("spiked.daemon")
 
@@ -140,14 +140,14 @@ def open_data_store(data: Path | None, notifier: Notifier) -> DataStore:
     except BaseException:
         folder.close()
         raise
-    room = Room(folder, catalogue)
+    disk_space = DiskSpace(folder, catalogue)
     policy = QueuePolicy()
     rows = ReconstructionRepository(folder, catalogue, notifier, policy)
     reconstructions = Reconstructions(folder, catalogue, notifier, policy, rows)
-    captures = Captures(folder, catalogue, room, reconstructions, notifier)
+    captures = Captures(folder, catalogue, disk_space, reconstructions, notifier)
     retention = Retention(folder, catalogue, captures, lambda text: notifier.log("info", text))
     recovery = Recovery(folder, catalogue, rows, notifier, orphans)
-    return DataStore(folder, catalogue, room, reconstructions, captures, retention, recovery, notifier)
+    return DataStore(folder, catalogue, disk_space, reconstructions, captures, retention, recovery, notifier)
 
 
 def build_services(
@@ -178,7 +178,7 @@ def build_services(
         folder=folder,
         captures=captures,
         reconstructions=reconstructions,
-        uploads=Uploads(folder, data_store.catalogue, data_store.room, lambda: settings.now.limit_upload_bytes),
+        uploads=Uploads(folder, data_store.catalogue, data_store.disk_space, lambda: settings.now.limit_upload_bytes),
         results=Results(reconstructions.rows, captures, trajectories),
         views=ViewRenderer(renders),
         sources=sources,

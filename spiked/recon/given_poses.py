@@ -9,7 +9,7 @@ from spiked.trajectory import Trajectory
 
 KNOT_FRAMES = 8
 """Spacing of the knots of the final path."""
-AROUND = 2
+NEIGHBOUR_POSES = 2
 """Given poses before and after a time between which its pose is interpolated."""
 
 
@@ -23,7 +23,7 @@ class GivenPoses:
     def at(self, time: float) -> tuple[Array, Array]:
         """Rotation [3, 3], camera to world, and centre [3] at a time in frames."""
         near = min(max(int(np.searchsorted(self._frames, time)), 1), len(self._frames) - 1)
-        around = slice(max(0, near - AROUND), near + AROUND)
+        around = slice(max(0, near - NEIGHBOUR_POSES), near + NEIGHBOUR_POSES)
         rotations, centres = self._poses.rotations[around], self._poses.centres[around]
         rotation, centre = Spline.fit(self._frames[around], rotations, centres, 1e9, degree=1).poses([time])
         return rotation[0], centre[0]

@@ -21,7 +21,7 @@ from spiked.recon.mapping.pose_alignment import TrajectoryPrior
 from spiked.recon.mapping.scene_psnr import scene_psnr_db
 from spiked.recon.mapping.trainer import MapTrainer
 from spiked.recon.odometry.odometry import Odometry
-from spiked.recon.odometry.self_calibration import FIRST_DEG, SAME_FOCAL, Focal
+from spiked.recon.odometry.self_calibration import FIRST_DEG, FOCAL_TOLERANCE, Focal
 from spiked.recon.options import Options
 from spiked.recon.refiner import Refiner
 from spiked.recon.report import Sample, Status, Tracked, WorkLog
@@ -194,8 +194,8 @@ class Reconstructor:
         return self.odometry.points[np.isfinite(self.odometry.points[:, 0])]
 
     def _focal_moved(self) -> bool:
-        """Whether the focal length changed by more than `SAME_FOCAL` since the map was begun."""
-        return bool(abs(np.log(self.odometry.intrinsics.fx / self.camera.intrinsics.fx)) > SAME_FOCAL)
+        """Whether the focal length changed by more than `FOCAL_TOLERANCE` since the map was begun."""
+        return bool(abs(np.log(self.odometry.intrinsics.fx / self.camera.intrinsics.fx)) > FOCAL_TOLERANCE)
 
     def finish(
         self,

@@ -11,11 +11,11 @@ from spiked.recon.odometry.sparse_map import TrackedView
 from spiked.recon.odometry.tracking_state import State
 from spiked.spline import Path
 
-NEWEST = 16
+PROTECTED_VIEWS = 16
 """Newest views whose images are not dropped: a live map is seeded from them."""
 DROPPED_SHARE = 0.25
 """Share of the images that is dropped at a time."""
-REACH = 1.5
+POSE_REACH_LENGTHS = 1.5
 """Lengths of a view over which its pose is valid, before and after its middle."""
 
 
@@ -100,7 +100,7 @@ class ViewStore:
         """
         if len(self._kept) <= self._most_images:
             return False
-        newest = min(NEWEST, self._most_images // 4)
+        newest = min(PROTECTED_VIEWS, self._most_images // 4)
         for _ in range(int(DROPPED_SHARE * self._most_images)):
             at = np.array([self._travelled_px[view_id] for view_id in self._kept])
             least = 1 + int(np.argmin((at[2:] - at[:-2])[:-newest]))
@@ -139,7 +139,7 @@ class ViewStore:
         reach = np.array([record.tracked.length for record in posed])
         after = np.clip(np.searchsorted(times, frames), 1, len(times) - 1)
         near = np.where(np.abs(times[after - 1] - frames) < np.abs(times[after] - frames), after - 1, after)
-        covered = np.abs(times[near] - frames) <= REACH * reach[near]
+        covered = np.abs(times[near] - frames) <= POSE_REACH_LENGTHS * reach[near]
         for record in self._records:
             if record.tracked.rotation is None:
                 covered &= np.abs(frames - record.time) > 0.5 * record.tracked.length

@@ -45,7 +45,7 @@ def benchmark(sensor: Sensor, *, blocks: int = 4000, block_frames: int = 8) -> B
                 raise RingError(f"the reading process did not attach to {writer.name} within {_START_S:g} s")
             start_s = time.perf_counter()
             for _ in range(blocks):
-                while not writer.wait_for_room(1.0):
+                while not writer.wait_for_space(1.0):
                     pass
                 writer.acquire()[:] = block
                 writer.commit(block_frames)

@@ -32,7 +32,7 @@ PREFIX = "spiked-"
 MIN_SLOTS = 8
 """Least number of slots: an eighth of them may be acquired ahead."""
 
-_HEADER = struct.Struct("<8sQQQI")  # magic and version, owner, keeper, forgone, length of the JSON that follows
+_HEADER = struct.Struct("<8sQQQI")  # magic and version, owner, keeper, absent_readers, length of the JSON that follows
 _MAGIC = b"spkring2"
 _WORDS = slice(8, 32)
 _CONTROL_OFFSET = mmap.PAGESIZE
@@ -109,12 +109,12 @@ class Segment:
         return int(self._words[1])
 
     @property
-    def forgone(self) -> int:
+    def absent_readers(self) -> int:
         """Number of awaited readers that will not attach."""
         return int(self._words[2])
 
-    @forgone.setter
-    def forgone(self, count: int) -> None:
+    @absent_readers.setter
+    def absent_readers(self, count: int) -> None:
         self._words[2] = count
 
     def unlink(self) -> None:

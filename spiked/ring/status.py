@@ -115,7 +115,7 @@ class Ring:
 
     def remove_dead_readers(self, consumer: str) -> None:
         """Free the places of dead readers of this name and stop waiting for one to attach."""
-        self._segment.forgone += 1
+        self._segment.absent_readers += 1
         for index in range(READER_PLACES):
             place = self._segment.control.place(index)
             owner = place.owner()

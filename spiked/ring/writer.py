@@ -24,7 +24,7 @@ _LOOK_AGAIN_S = 0.1
 """Interval at which a waiting writer checks its readers, seconds: a killed reader wakes nobody."""
 
 
-@renamed_attributes(publish_condition="publish_device_status")
+@renamed_attributes(publish_condition="publish_device_status", has_room="has_space", wait_for_room="wait_for_space")
 class RingWriter:
     """Fills slots and publishes them without waiting for readers. Used by one thread.
 
@@ -39,7 +39,7 @@ class RingWriter:
         self._control = segment.control
         self._counters: WriterCounters = self._control.writer()
         self._reserved = int(self._counters.slots)
-        self._spoilt = int(self._control.reserved())  # a former writer may have started slots beyond
+        self._reserved_before = int(self._control.reserved())  # a former writer may have started slots beyond
         self.publish_device_status(DeviceStatus(DeviceState.ABSENT))
 
     @classmethod
@@ -56,7 +56,7 @@ class RingWriter:
     ) -> Self:
         """A new ring `spiked-<ring_id>` for compact frames of that sensor; without `slots`, of about DEFAULT_BYTES.
 
-        `wait_for_room` keeps the frames of a killed reader for `takeover_grace_s`, so that a successor can continue
+        `wait_for_space` keeps the frames of a killed reader for `takeover_grace_s`, so that a successor can continue
         from them. While the process `keeper` lives (see `own_identity`), only that process removes the ring's name.
 
         Raises RingError if the name is taken, the sizes are not possible, or there is too little shared memory.
@@ -108,7 +108,7 @@ class RingWriter:
             raise RingError(f"{ahead} slots of ring {self.name} are acquired and not committed: no more than an eighth")
         number = self._reserved
         self._reserved += 1
-        self._control.reserve(max(self._reserved, self._spoilt))
+        self._control.reserve(max(self._reserved, self._reserved_before))
         return self._segment.slot(number, self.geometry.block_frames)
 
     def commit(self, frames: int) -> None:
@@ -145,24 +145,24 @@ class RingWriter:
         """Publish the status of the device to all processes."""
         self._control.publish_condition(encode(device_status.state), device_status.reason)
 
-    def has_room(self) -> bool:
+    def has_space(self) -> bool:
         """Whether another slot can be acquired without any lossless or priority reader losing frames."""
         return not any(
             self._holds_back(reader) and (is_alive(reader.owner) or self._in_takeover_grace(reader.owner))
             for reader in read_places(self._segment)
         )
 
-    def wait_for_room(self, timeout_s: float) -> bool:
-        """Wait for `has_room`. For sources that can block, as recordings; a camera cannot."""
-        return self._wait(self.has_room, timeout_s)
+    def wait_for_space(self, timeout_s: float) -> bool:
+        """Wait for `has_space`. For sources that can block, as recordings; a camera cannot."""
+        return self._wait(self.has_space, timeout_s)
 
     def wait_for_readers(self, count: int, timeout_s: float) -> bool:
-        """Wait until `count` readers are attached or forgone, so that they get the capture from its first frame."""
+        """Wait until `count` readers are attached or given up, so that they get the capture from its first frame."""
 
         def attached() -> int:
             return sum(is_alive(reader.owner) for reader in read_places(self._segment))
 
-        return self._wait(lambda: attached() + self._segment.forgone >= count, timeout_s)
+        return self._wait(lambda: attached() + self._segment.absent_readers >= count, timeout_s)
 
     def status(self) -> RingStatus:
         """Counters of the writer and of every reader."""

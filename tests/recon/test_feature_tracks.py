@@ -82,9 +82,9 @@ def test_what_has_no_texture_or_lies_outside_is_not_found() -> None:
 
 def test_a_pyramid_may_take_the_room_of_another() -> None:
     one, other = picture(scene((0.0, 0.0)), 1.0), picture(scene((3.0, 0.0), 1), 1.0)
-    room = pyramid(one, 2)
-    again = pyramid(other, 2, room)
-    assert all(a is b for a, b in zip(room, again, strict=True))
+    buffers = pyramid(one, 2)
+    again = pyramid(other, 2, buffers)
+    assert all(a is b for a, b in zip(buffers, again, strict=True))
     for a, b in zip(again, pyramid(other, 2), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -197,8 +197,8 @@ def test_tracks_that_go_on_as_they_went_are_not_searched(
     monkeypatch: pytest.MonkeyPatch, jump_px: float, looks_again: bool
 ) -> None:
     tracks, searches = steady(), []
-    sought = Tracks._sought
-    monkeypatch.setattr(Tracks, "_sought", lambda *all_: searches.append(1) or sought(*all_))
+    sought = Tracks._searched
+    monkeypatch.setattr(Tracks, "_searched", lambda *all_: searches.append(1) or sought(*all_))
     tracks.add(4, picture(scene((1.5 + jump_px, 0.0)), 1.0))
     assert bool(searches) == looks_again
 

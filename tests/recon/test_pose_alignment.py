@@ -138,7 +138,7 @@ def test_places_are_taken_out_a_few_at_a_time_with_the_same_result(monkeypatch: 
         blocks = np.einsum("pri,prj->pij", rows[:, :, :3], rows)
         sums.append(ViewNormals(np.einsum("pri,prj->ij", rows[:, :, 3:9], rows[:, :, 3:]), keys, blocks, 1.0))
     at_once = marginalise_landmarks(sums, first, shares, 7)
-    monkeypatch.setattr("spiked.recon.mapping.pose_alignment.CHUNK", 18 * 7 * 4)
+    monkeypatch.setattr("spiked.recon.mapping.pose_alignment.CHUNK_FLOATS", 18 * 7 * 4)
     for one, other in zip(at_once, marginalise_landmarks(sums, first, shares, 7), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(one).max())
 

@@ -11,7 +11,7 @@ from spiked.pose import exp_so3
 from spiked.recon import Options, Reconstructor, State
 from spiked.recon.odometry.bundle_adjustment import Bundle
 from spiked.recon.odometry.initialisation import Views
-from spiked.recon.odometry.self_calibration import UNSURE, Focal, try_fields
+from spiked.recon.odometry.self_calibration import MAX_FOCAL_SIGMA, Focal, try_fields
 from spiked.recording import open_recording
 from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
@@ -84,7 +84,7 @@ def test_a_path_is_degraded_where_the_focal_length_is_hardly_known() -> None:
     reconstructor = Reconstructor(replace(known, intrinsics=None), Options(steps=0))
     reconstructor.feed(0, camera.next_frames(200))
     reconstructor.finish()
-    assert reconstructor.focal is not None and reconstructor.focal.relative_sigma > UNSURE
+    assert reconstructor.focal is not None and reconstructor.focal.relative_sigma > MAX_FOCAL_SIGMA
     status = reconstructor.status()
     assert status.state is State.DEGRADED and "depend on a focal length only known to about" in status.reason
 

@@ -59,7 +59,7 @@ def test_splats_are_added_where_the_error_is() -> None:
     error = np.zeros((50, 80), np.float32)
     error[20:30, 60:70] = -1
     rng = np.random.default_rng(0)
-    chosen = DensifyStrategy(share=0.1).choose(error, replaced=3, cap=400, room=1000, rng=rng)
+    chosen = DensifyStrategy(share=0.1).choose(error, replaced=3, cap=400, headroom=1000, rng=rng)
     assert chosen is not None
     rows, columns = chosen
     assert len(rows) == 43 and len(set(zip(rows, columns, strict=True))) == 43

@@ -20,7 +20,7 @@ from spiked_service.operations.metrics_sources import metrics_source_of
 from spiked_service.results.versions import Published, pose_file, versions
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.catalogue import StoreError, UnknownIdError
-from spiked_service.store.room import NoRoomError
+from spiked_service.store.disk_space import DiskFullError
 from spiked_service.store.rows import CaptureState, Grade, JobState, Plan, ReconstructionRow, Stage
 from spiked_service.workers.backoff import Backoff
 from spiked_service.workers.messages import Role
@@ -478,13 +478,13 @@ def test_a_disk_that_is_filled_during_a_capture_accounts_for_every_frame(
         assert sum(gap.count for gap in open_recording(path).gaps) == row.recording.lost
         assert str(verify(path).reasons) == f"('{row.recording.lost} frames were lost in 2 gaps',)"
 
-        filler.write_bytes(bytes(filler.stat().st_size + data_store.room.storable_bytes))
+        filler.write_bytes(bytes(filler.stat().st_size + data_store.disk_space.storable_bytes))
         assert data_store.check_disk()[0] is CheckStatus.FAILED
         for plan, needs in (
             (recorded_only(source), "this capture needs 19.8 MB"),
             (recorded_only(SMALL), "an unlimited capture needs"),
         ):
-            with pytest.raises(NoRoomError, match=f"{needs}.* free for captures at {small_disk}"):
+            with pytest.raises(DiskFullError, match=f"{needs}.* free for captures at {small_disk}"):
                 data_store.captures.start(plan)
         assert len(data_store.captures.list().items) == 1
         filler.unlink()

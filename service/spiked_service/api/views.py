@@ -123,6 +123,6 @@ def _zip(content: dict[str, bytes | str]) -> bytes:
     return buffer.getvalue()
 
 
-def image_format(wished: ImageFormat | None, accept: str) -> ImageFormat:
+def image_format(requested: ImageFormat | None, accept: str) -> ImageFormat:
     """By the query, else by the Accept header, else PNG."""
-    return wished or ImageFormat.accepted(accept) or ImageFormat.PNG
+    return requested or ImageFormat.accepted(accept) or ImageFormat.PNG

@@ -46,8 +46,8 @@ class ZmqServer:
         self._context = zmq.Context()
         try:
             self._events, self._state, self._previews = (
-                self._bound(kind, room, first_port and first_port + offset)
-                for offset, (kind, room) in enumerate(
+                self._bound(kind, queue, first_port and first_port + offset)
+                for offset, (kind, queue) in enumerate(
                     [(zmq.PUB, QUEUE_MESSAGES), (zmq.ROUTER, QUEUE_PICTURES), (zmq.PUB, QUEUE_PICTURES)]
                 )
             )
@@ -80,10 +80,10 @@ class ZmqServer:
             return CheckStatus.FAILED, f"{' and '.join(dead)} stopped working; the log says why: restart the service"
         return CheckStatus.OK, f"events at {self.endpoints.events}"
 
-    def _bound(self, kind: int, room: int, port: int) -> "zmq.Socket[bytes]":
+    def _bound(self, kind: int, queue: int, port: int) -> "zmq.Socket[bytes]":
         socket = self._context.socket(kind)
         socket.set(zmq.LINGER, 0)
-        socket.set(zmq.SNDHWM, room)
+        socket.set(zmq.SNDHWM, queue)
         socket.set(zmq.MAXMSGSIZE, REQUEST_BYTES)
         socket.set(zmq.HEARTBEAT_IVL, 10_000)
         socket.set(zmq.SNDTIMEO, 1000)

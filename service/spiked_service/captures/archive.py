@@ -11,9 +11,9 @@ from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue import Reconstructions
 from spiked_service.settings.settings import Settings
 from spiked_service.store.catalogue import Catalogue
+from spiked_service.store.disk_space import DiskSpace
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.retention import Policy, Retention
-from spiked_service.store.room import Room
 
 _CLEAN_S = 60.0
 _SCARCE_BYTES = 1 << 30
@@ -26,7 +26,7 @@ class DataStore:
         self,
         folder: DataFolder,
         catalogue: Catalogue,
-        room: Room,
+        disk_space: DiskSpace,
         reconstructions: Reconstructions,
         captures: Captures,
         retention: Retention,
@@ -36,7 +36,7 @@ class DataStore:
         """Start the maintenance, which also starts the queue of the reconstructions."""
         self.folder = folder
         self.catalogue = catalogue
-        self.room = room
+        self.disk_space = disk_space
         self.reconstructions = reconstructions
         self.captures = captures
         self.retention = retention
@@ -64,7 +64,7 @@ class DataStore:
     def check_disk(self) -> tuple[CheckStatus, str]:
         """Whether there is disk space for captures."""
         space = self.folder.space()
-        if self.room.storable_bytes < self.room.least_bytes:
+        if self.disk_space.storable_bytes < self.disk_space.least_bytes:
             free = f"{space.free_bytes >> 20} MiB are free at {self.folder.path}"
             return CheckStatus.FAILED, f"{free}, too little to store a capture: free disk space there"
         scarce = min(_SCARCE_BYTES, space.total_bytes // 10)

@@ -17,8 +17,8 @@ from spiked_service.captures.sources import device_of, realtime
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue import Reconstructions
 from spiked_service.store.catalogue import Catalogue, Page, StoreError
+from spiked_service.store.disk_space import DiskSpace, recording_bytes
 from spiked_service.store.folder import DataFolder
-from spiked_service.store.room import Room, recording_bytes
 from spiked_service.store.rows import CaptureRow, CaptureState, Origin, Plan
 from spiked_service.store.snapshot import Snapshot
 from spiked_service.workers.messages import PreviewTaken
@@ -36,11 +36,11 @@ class Captures:
         self,
         folder: DataFolder,
         catalogue: Catalogue,
-        room: Room,
+        disk_space: DiskSpace,
         reconstructions: Reconstructions,
         notifier: Notifier,
     ) -> None:
-        self._room = room
+        self._disk_space = disk_space
         self._folder = folder
         self._catalogue = catalogue
         self._reconstructions = reconstructions
@@ -87,7 +87,7 @@ class Captures:
                     del self._live[capture.id]
                     self._catalogue.captures.remove(capture.id)
                     self._folder.remove(self._folder.capture(capture.id))
-                    self._room.release(self._folder.recording(capture.id))
+                    self._disk_space.release(self._folder.recording(capture.id))
                     raise BusyError(f"no worker can be started: {error.strerror}; end other programs") from error
         if armed_device is not None:
             armed_device.trigger(capture, plan)
@@ -98,12 +98,12 @@ class Captures:
         now = datetime.now(UTC)
         row = CaptureRow(new_id(), Origin.LIVE, plan, CaptureState.STARTING, now, name=plan.name, notes=plan.notes)
         if plan.record:
-            self._room.reserve_recording(self._folder.recording(row.id), size)
+            self._disk_space.reserve_recording(self._folder.recording(row.id), size)
         try:
             (self._folder.capture(row.id) / "logs").mkdir(parents=True)
             self._catalogue.captures.put(row)
         except (OSError, StoreError) as error:
-            self._room.release(self._folder.recording(row.id))
+            self._disk_space.release(self._folder.recording(row.id))
             self._folder.remove(self._folder.capture(row.id))
             if isinstance(error, StoreError):
                 raise
@@ -309,7 +309,7 @@ class Captures:
         self._notifier.capture(self.snapshot(capture.row))
         if not capture.row.state.over:
             return
-        self._room.release(self._folder.recording(capture.id))
+        self._disk_space.release(self._folder.recording(capture.id))
         with self._lock:
             self._recent.add(capture.row, capture.picture)
             saved = self._catalogue.captures.find(capture.id)

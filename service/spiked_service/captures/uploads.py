@@ -20,8 +20,8 @@ from spiked.sensor import Sensor
 from spiked_service.base.ids import new_id
 from spiked_service.captures.captures import Captures
 from spiked_service.store.catalogue import Catalogue, StoreError
+from spiked_service.store.disk_space import DiskSpace
 from spiked_service.store.folder import DataFolder
-from spiked_service.store.room import Room
 from spiked_service.store.rows import CaptureRow, CaptureState, Grade, Origin, Plan, Quality, Recorded, UploadRow
 from spiked_service.workers.messages import UploadChecked, UploadCommand, WorkerError, WorkerEvent
 from spiked_service.workers.process import WorkerProcess
@@ -55,9 +55,11 @@ class UploadBusyError(UploadError):
 class Uploads:
     """Stores uploads and makes captures of them. Thread-safe; `append` is called from an event loop."""
 
-    def __init__(self, folder: DataFolder, catalogue: Catalogue, room: Room, limit_bytes: Callable[[], int]) -> None:
+    def __init__(
+        self, folder: DataFolder, catalogue: Catalogue, disk_space: DiskSpace, limit_bytes: Callable[[], int]
+    ) -> None:
         """`limit_bytes` returns the current maximum size of a recording."""
-        self._room = room
+        self._disk_space = disk_space
         self._limit_bytes = limit_bytes
         self._folder = folder
         self._catalogue = catalogue
@@ -67,13 +69,13 @@ class Uploads:
     def create(
         self, name: str, notes: str, size: int, sidecar: str | None, geometry: str | None, sha256: str | None
     ) -> UploadRow:
-        """Create an upload of `size` bytes and reserve the space. Raises UploadTooLargeError, NoRoomError."""
+        """Create an upload of `size` bytes and reserve the space. Raises UploadTooLargeError, DiskFullError."""
         if size > self._limit_bytes():
             raise UploadTooLargeError(f"{size} bytes exceed the limit of {self._limit_bytes()} for an upload")
         now = datetime.now(UTC)
         stated = json.dumps({"notes": notes, "geometry": json.loads(geometry) if geometry else None})
         row = UploadRow(new_id(), name, size, now, now, sidecar=sidecar, geometry=stated, sha256=sha256)
-        with self._room.for_upload(size):
+        with self._disk_space.for_upload(size):
             with _store_errors(row.id):
                 self._folder.upload(row.id).touch(mode=0o600)
             self._catalogue.uploads.put(row)

@@ -83,13 +83,13 @@ class _ToBus(logging.Handler):
         fields = {name: value for name, value in line.items() if not name.startswith("_")}
         capture_id, reconstruction_id = fields.pop("capture_id", None), fields.pop("reconstruction_id", None)
         fields.pop("at", None)
-        told = LogPayload(
+        payload = LogPayload(
             level=str(fields.pop("level", record.levelname.lower())),
             event=str(fields.pop("event", "")),
             logger=str(fields.pop("logger", record.name)),
             **{name: _plain(value) for name, value in fields.items()},
         )
-        self._bus.publish(Topic.LOG, told, _text(capture_id), _text(reconstruction_id))
+        self._bus.publish(Topic.LOG, payload, _text(capture_id), _text(reconstruction_id))
 
     def _line(self, record: logging.LogRecord) -> MutableMapping[str, Any]:
         if isinstance(record.msg, dict):

@@ -166,10 +166,10 @@ def _usbfs(cameras: int) -> Diagnosis:
     if needed <= limit:
         return Diagnosis(name, DiagnosisStatus.OK, found)
     try:
-        hides_ms = 1e3 * plan_transfers(_WIRE_S, limit // cameras).buffered_s
+        buffered_ms = 1e3 * plan_transfers(_WIRE_S, limit // cameras).buffered_s
     except SourceError:
         return Diagnosis(name, DiagnosisStatus.PROBLEM, found, how_to_raise(needed))
-    hidden = f"{found}: a busy host loses frames after {hides_ms:.0f} ms, not {1e3 * wanted.buffered_s:.0f}"
+    hidden = f"{found}: a busy host loses frames after {buffered_ms:.0f} ms, not {1e3 * wanted.buffered_s:.0f}"
     return Diagnosis(name, DiagnosisStatus.WARNING, hidden, how_to_raise(needed))
 
 

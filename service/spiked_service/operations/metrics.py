@@ -182,11 +182,11 @@ class _Collector(Collector):
     def _events(self) -> Iterator[Metric]:
         published = CounterMetricFamily("spiked_events_published", "Messages on the bus.", labels=["topic"])
         dropped = CounterMetricFamily("spiked_events_dropped", "Messages dropped for slow clients.", labels=["topic"])
-        told, lost = self._bus.published(), self._bus.dropped()
+        published_counts, dropped_counts = self._bus.published(), self._bus.dropped()
         for topic in Topic:
             if topic is not Topic.LOST:
-                published.add_metric([topic], told.get(topic, 0))
-                dropped.add_metric([topic], lost.get(topic, 0))
+                published.add_metric([topic], published_counts.get(topic, 0))
+                dropped.add_metric([topic], dropped_counts.get(topic, 0))
         yield from (published, dropped)
 
     def _limits(self) -> Iterator[Metric]:

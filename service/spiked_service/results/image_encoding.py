@@ -29,15 +29,15 @@ class ImageFormat(StrEnum):
     @classmethod
     def accepted(cls, accept: str) -> "ImageFormat | None":
         """The preferred format of an HTTP Accept header; PNG for `*/*`, None if no format is accepted."""
-        wishes = []
+        accepted = []
         for part in accept.split(","):
             kind, *parameters = (word.strip() for word in part.split(";"))
             quality = next((p[2:] for p in parameters if p.startswith("q=")), "1")
             try:
-                wishes.append((float(quality), kind))
+                accepted.append((float(quality), kind))
             except ValueError:
                 continue
-        for weight, kind in sorted(wishes, key=lambda wish: -wish[0]):
+        for weight, kind in sorted(accepted, key=lambda entry: -entry[0]):
             for one in cls:
                 if weight > 0 and kind in (one.media_type, "image/*", "*/*"):
                     return one

@@ -321,13 +321,13 @@ def _nearest(name: str, prefix: str = "") -> str:
 
 
 def _wrong(error: ValidationError, origins: Mapping[str, SettingOrigin], path: Path | None) -> str:
-    told = []
+    messages = []
     for one in error.errors(include_url=False):
         name = str(one["loc"][0])
         what = "" if name == "token" else f" {one['input']!r}"
         message = one["msg"][0].lower() + one["msg"][1:]
-        told.append(f"{_place(name, origins[name], path)}: {message}, not{what or ' this'}{_near_value(name, one)}")
-    return "; ".join(told)
+        messages.append(f"{_place(name, origins[name], path)}: {message}, not{what or ' this'}{_near_value(name, one)}")
+    return "; ".join(messages)
 
 
 def _near_value(name: str, error: Mapping[str, Any]) -> str:

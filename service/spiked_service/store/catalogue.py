@@ -91,10 +91,10 @@ class Catalogue:
         self._path = path
         self._readers: list[sqlite3.Connection] = []
         self._writing = threading.RLock()
-        with _told(path):
+        with _as_store_error(path):
             self._writer = _connect(path)
         try:
-            with _told(path):
+            with _as_store_error(path):
                 self._writer.execute("PRAGMA journal_mode = WAL")
                 self._writer.execute("PRAGMA synchronous = NORMAL")
             self._migrate()
@@ -127,7 +127,7 @@ class Catalogue:
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
         """The exclusive write connection; committed at the end, rolled back on an exception. Reentrant."""
-        with self._writing, _told(self._path):
+        with self._writing, _as_store_error(self._path):
             if self._writer.in_transaction:
                 yield self._writer
                 return
@@ -143,7 +143,7 @@ class Catalogue:
 
     def read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         """Result of a query on a read-only connection."""
-        with _told(self._path), self._reader() as connection:
+        with _as_store_error(self._path), self._reader() as connection:
             return list(connection.execute(query, values).fetchall())
 
     def capture_page(
@@ -358,7 +358,7 @@ def _write_copy(path: Path, document: bytes) -> None:
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _as_store_error(path: Path) -> Iterator[None]:
     try:
         yield
     except (sqlite3.DatabaseError, OSError) as error:

@@ -111,8 +111,8 @@ class DataFolder:
                 {entry.stem for entry in self._uploads.iterdir() if is_id(entry.stem)},
             )
         except OSError as error:
-            told = f"{error.filename} cannot be read: {error.strerror}; let the user of the service read it"
-            raise ConfigurationError(told) from error
+            message = f"{error.filename} cannot be read: {error.strerror}; let the user of the service read it"
+            raise ConfigurationError(message) from error
 
     def set_aside(self, *paths: Path) -> Path:
         """Move files or folders to `lost+found`. Return the new place. Raises OSError."""
@@ -135,17 +135,17 @@ class DataFolder:
     def remove(self, folder: Path) -> None:
         """Delete the folder of a capture or reconstruction, if it exists."""
         # Renamed first, so that a kill in between never leaves half a capture under its name.
-        doomed = folder.with_name(f".{folder.name}.removed")
+        removed = folder.with_name(f".{folder.name}.removed")
         if folder.exists():
-            folder.rename(doomed)
-        shutil.rmtree(doomed, ignore_errors=True)
+            folder.rename(removed)
+        shutil.rmtree(removed, ignore_errors=True)
 
     def sweep(self) -> int:
         """Delete incomplete files of killed processes. Return their number."""
         removed = 0
         for base in (self._captures, self._reconstructions):
-            for doomed in base.glob(".*.removed"):
-                shutil.rmtree(doomed, ignore_errors=True)
+            for leftover in base.glob(".*.removed"):
+                shutil.rmtree(leftover, ignore_errors=True)
                 removed += 1
             for part in base.glob("*/*.part"):
                 part.unlink(missing_ok=True)

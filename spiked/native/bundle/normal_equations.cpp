@@ -125,7 +125,7 @@ struct System {
     int64_t size, unknown, each;  // D, D without the focal length, slots of a pose
     const int64_t* slots;
     const double* shares;
-    double *hessian, *gradient, *eliminated, *pull, *roots;
+    double *hessian, *gradient, *eliminated, *whitened_gradient, *roots;
     bool focal;
 };
 
@@ -162,7 +162,7 @@ inline void add_row(const Projection& projection, int row, double weight, double
     for (int j = 0; j < kPoseStride; ++j) own_gradient[j] += a[j] * error;
 }
 
-// Eliminates a point: writes its root, its pull and its rows of `eliminated`.
+// Eliminates a point: writes its root, its whitened gradient and its rows of `eliminated`.
 inline void eliminate(const System& system, int64_t p, PointSums& sums, const std::vector<int64_t>& used,
                       double* cross) {
     for (int i = 0; i < 3; ++i) sums.hessian[4 * i] = sums.hessian[4 * i] * (1 + system.damping) + kDiagonal;
@@ -171,7 +171,7 @@ inline void eliminate(const System& system, int64_t p, PointSums& sums, const st
     for (int a = 0; a < 3; ++a) {
         const double *r = root + 3 * a, *g = sums.gradient, *f = sums.focal;
         double* to = system.eliminated + (3 * p + a) * system.size;
-        system.pull[3 * p + a] = r[0] * g[0] + r[1] * g[1] + r[2] * g[2];
+        system.whitened_gradient[3 * p + a] = r[0] * g[0] + r[1] * g[1] + r[2] * g[2];
         if (system.focal) to[system.unknown] = r[0] * f[0] + r[1] * f[1] + r[2] * f[2];
         for (const int64_t slot : used) {
             const double* from = cross + 3 * kPoseStride * slot;
@@ -252,19 +252,20 @@ void scatter_to_slots(const System& system, int64_t cameras, const PoseSums& pos
 void linearise(const In3& rotations, const In2& centres, const In2& points, const Index& camera, const Index& point,
                const In2& pixels, double fx, double fy, double cx, double cy, double scale, double damping,
                const Index2& slots, const In2& shares, bool focal, const Array<double, 2>& hessian,
-               const Array<double, 1>& gradient, const Array<double, 2>& eliminated, const Array<double, 2>& pull,
-               const Array<double, 3>& roots, const Array<double, 3>& pose_hessian) {
+               const Array<double, 1>& gradient, const Array<double, 2>& eliminated,
+               const Array<double, 2>& whitened_gradient, const Array<double, 3>& roots,
+               const Array<double, 3>& pose_hessian) {
     const Observations observations(rotations, centres, points, camera, point, pixels);
     const int64_t size = static_cast<int64_t>(hessian.shape(0)), unknown = size - focal;
     const auto count = static_cast<size_t>(observations.point_count),
                cameras = static_cast<size_t>(observations.cameras);
     if (static_cast<int64_t>(hessian.shape(1)) != size || static_cast<int64_t>(gradient.shape(0)) != size ||
         static_cast<int64_t>(eliminated.shape(1)) != size || eliminated.shape(0) != 3 * count ||
-        pull.shape(0) != count || pull.shape(1) != 3 || roots.shape(0) != count || roots.shape(1) != 3 ||
-        roots.shape(2) != 3 || pose_hessian.shape(0) != cameras || pose_hessian.shape(1) != 6 ||
+        whitened_gradient.shape(0) != count || whitened_gradient.shape(1) != 3 || roots.shape(0) != count ||
+        roots.shape(1) != 3 || roots.shape(2) != 3 || pose_hessian.shape(0) != cameras || pose_hessian.shape(1) != 6 ||
         pose_hessian.shape(2) != 6 || unknown < 0 || unknown % 6) {
         throw std::invalid_argument(
-            "expected hessian [D, D], gradient [D], eliminated [3 P, D], pull [P, 3], roots [P, 3, 3], "
+            "expected hessian [D, D], gradient [D], eliminated [3 P, D], whitened_gradient [P, 3], roots [P, 3, 3], "
             "pose_hessian [C, 6, 6] with D six times the slots, and one more for a free focal length");
     }
     if (slots.shape(0) != cameras || shares.shape(0) != cameras || shares.shape(1) != slots.shape(1)) {
@@ -275,10 +276,19 @@ void linearise(const In3& rotations, const In2& centres, const In2& points, cons
             throw std::invalid_argument("a slot is -1 for a fixed pose, or below the number of slots");
         }
     }
-    const System system = {
-        scale,        damping,       size,           unknown,         static_cast<int64_t>(slots.shape(1)),
-        slots.data(), shares.data(), hessian.data(), gradient.data(), eliminated.data(),
-        pull.data(),  roots.data(),  focal};
+    const System system = {scale,
+                           damping,
+                           size,
+                           unknown,
+                           static_cast<int64_t>(slots.shape(1)),
+                           slots.data(),
+                           shares.data(),
+                           hessian.data(),
+                           gradient.data(),
+                           eliminated.data(),
+                           whitened_gradient.data(),
+                           roots.data(),
+                           focal};
     nb::gil_scoped_release release;
     std::fill_n(hessian.data(), size * size, 0.0);
     std::fill_n(gradient.data(), size, 0.0);
@@ -300,7 +310,8 @@ void bind_normal_equations(nb::module_& m) {
     m.def("linearise", &linearise,
           "Hessian [D, D] and gradient [D] of what the poses are made of: slots [C, K] of six numbers each, with\n"
           "shares [C, K], and the logarithm of the focal length where it is free. Each point's damped 3x3 Hessian V\n"
-          "is taken out: with roots R = chol(V)^-1, `eliminated` holds the rows R cross^T and `pull` R gradient.");
+          "is taken out: with roots R = chol(V)^-1, `eliminated` holds the rows R cross^T and `whitened_gradient` R "
+          "gradient.");
 }
 
 }  // namespace spiked

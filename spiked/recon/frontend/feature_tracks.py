@@ -21,15 +21,15 @@ WINDOW_PX = 13
 """Side of a track's template in px."""
 LEVELS = 4
 """Pyramid levels below full size for tracking from view to view."""
-NEAR_PX = 3.0
+SLOW_MOTION_PX = 3.0
 """Below this motion between views one halving of the image suffices."""
-NEAR_GUESS_PX = 1.5
+PREDICTION_RADIUS_PX = 1.5
 """Largest distance of a track from its prediction."""
-AS_EXPECTED = 0.85
+MIN_PREDICTED_SHARE = 0.85
 """With a smaller share of the tracks at their predictions, all are searched from the previous image."""
-LOOKED = 3
+WHITE_STRIDE_PX = 3
 """Stride in px of the samples that set the white level: odd, to sample all sites of a mosaic."""
-SURE = 0.6
+MIN_FOUND_SHARE = 0.6
 """Share of the points found that ends a search."""
 
 
@@ -42,7 +42,7 @@ def picture(rate: NDArray[np.float32], white: float) -> Picture:
 
 def white_of(rate: NDArray[np.float32]) -> float:
     """The rate shown as white: the 99.5th percentile of every ninth pixel."""
-    return max(float(_spikes.quantile(rate[::LOOKED, ::LOOKED], 0.995)), 1e-6)
+    return max(float(_spikes.quantile(rate[::WHITE_STRIDE_PX, ::WHITE_STRIDE_PX], 0.995)), 1e-6)
 
 
 @dataclass
@@ -113,8 +113,8 @@ class Tracks:
     def _follow(self, image: Picture, levels: Pyramid) -> float:
         """Refine tracks from their predictions; search them in the previous image if too few match."""
         moved, good = self._refined(levels, self._expected())
-        if good.sum() <= AS_EXPECTED * len(good):
-            moved, found = self._sought(image, levels)
+        if good.sum() <= MIN_PREDICTED_SHARE * len(good):
+            moved, found = self._searched(image, levels)
             moved, good = self._refined(levels, moved)
             good &= found
         height, width = image.shape
@@ -127,19 +127,19 @@ class Tracks:
     def _expected(self) -> Array | None:
         """Predicted positions [live, 2] at constant velocity, new tracks at the median; None if unreliable."""
         known = ~np.isnan(self.pace[:, 0])
-        if self.far or self.motion_px >= NEAR_PX or known.sum() <= SURE * len(known):
+        if self.far or self.motion_px >= SLOW_MOTION_PX or known.sum() <= MIN_FOUND_SHARE * len(known):
             return None
         return self.at + np.where(known[:, None], self.pace, [median(one) for one in self.pace[known].T])
 
-    def _sought(self, image: Picture, levels: Pyramid) -> tuple[Array, NDArray[np.bool_]]:
+    def _searched(self, image: Picture, levels: Pyramid) -> tuple[Array, NDArray[np.bool_]]:
         """Positions [live, 2] tracked from the previous image, and which were found."""
         assert self.newest_picture is not None
         if self.far:
             return search(self.newest_picture, image, self.at)
         before = self.pictures[self.newest]
-        few = 1 if self.motion_px < NEAR_PX else LEVELS
+        few = 1 if self.motion_px < SLOW_MOTION_PX else LEVELS
         moved, good = follow(before, levels, self.at, self.at, self.reach_px, few, back=False)
-        if few < LEVELS and good.sum() < SURE * len(good):
+        if few < LEVELS and good.sum() < MIN_FOUND_SHARE * len(good):
             moved, good = follow(before, levels, self.at, self.at, self.reach_px, back=False)
         return moved, good
 
@@ -151,7 +151,7 @@ class Tracks:
         births, at = [levels[0] for levels in self.pictures.values()], np.array(guess)
         number = {window: n for n, window in enumerate(self.pictures)}
         row = np.array([number[window] for window in self.born.tolist()], np.int64)
-        _tracking.refine_tracks(births, row, levels[0], self.birthplace, at, self.reach_px, NEAR_GUESS_PX, good)
+        _tracking.refine_tracks(births, row, levels[0], self.birthplace, at, self.reach_px, PREDICTION_RADIUS_PX, good)
         return at, good
 
     def _start(self, window: int, image: Picture) -> None:
@@ -214,6 +214,6 @@ def search(a: Picture, b: Picture, points: Array) -> tuple[Array, NDArray[np.boo
         good &= (at > 4).all(1) & (at < np.array(b.shape[::-1]) - 4).all(1)
         if good.sum() > best[1].sum():
             best = at, good
-        if good.sum() > SURE * len(points):
+        if good.sum() > MIN_FOUND_SHARE * len(points):
             break
     return best

@@ -7,9 +7,9 @@ import numpy as np
 
 from spiked.sensor import Image, Mosaic
 
-CLEAR = 1.25
+GREEN_RATIO = 1.25
 """Factor by which one diagonal must agree better than the other to be green."""
-SEEN = 0.03
+MIN_SITE_CONTRAST = 0.03
 """Relative difference of the sites' mean rates below which the sensor or the scene is grey."""
 
 _ON_MAIN_DIAGONAL = (Mosaic.GRBG, Mosaic.GBRG)
@@ -34,7 +34,7 @@ class Green:
     @property
     def clear(self) -> bool:
         """Whether the evidence suffices."""
-        return self.ratio > CLEAR
+        return self.ratio > GREEN_RATIO
 
 
 def find_green(rate: Image) -> Green | None:
@@ -49,7 +49,7 @@ def find_green(rate: Image) -> Green | None:
     means = np.array([float(plane.mean()) for plane in moved])
     main, other = _disagreement(moved[0], moved[3]), _disagreement(moved[1], moved[2])
     ratio = max(main, other) / max(min(main, other), 1e-9)
-    if ratio < CLEAR and np.ptp(means) < SEEN * max(float(means.mean()), 1e-9):
+    if ratio < GREEN_RATIO and np.ptp(means) < MIN_SITE_CONTRAST * max(float(means.mean()), 1e-9):
         return None
     return Green(main < other, ratio)
 

@@ -14,7 +14,7 @@ from spiked.recon.statistics import median
 
 VELOCITY_ERROR_SHARE = 0.25
 """Relative standard deviation of the shift: the pixels around a track have different times."""
-NEAR = 8
+NEIGHBOURS = 8
 """Neighbouring tracks whose median velocity a new track takes."""
 
 
@@ -53,16 +53,16 @@ def _velocity(last: _TimedView, time: float, ids: NDArray[np.int64], at: Array, 
     place = np.minimum(np.searchsorted(last.ids, ids, sorter=order), max(len(order) - 1, 0))
     kept = last.ids[order[place]] == ids if len(order) else np.zeros(len(ids), bool)
     new, old = np.flatnonzero(kept), order[place[kept]] if len(order) else order
-    if len(new) < NEAR:
+    if len(new) < NEIGHBOURS:
         return velocity
     apart = times[new] - last.times[old]
-    sure = np.clip(2 * apart / (time - last.time) - 1, 0, 1)[:, None]
+    weight = np.clip(2 * apart / (time - last.time) - 1, 0, 1)[:, None]
     moved = (at[new] - last.at[old]) / np.maximum(apart, 0.5)[:, None]
-    velocity[new] = sure * moved + (1 - sure) * last.velocity[old]
+    velocity[new] = weight * moved + (1 - weight) * last.velocity[old]
     rest = np.flatnonzero(~kept)
     if len(rest) == 0:
         return velocity
     distance = ((at[rest, None] - at[None, new]) ** 2).sum(2)
-    near = np.argpartition(distance, NEAR - 1, axis=1)[:, :NEAR]
+    near = np.argpartition(distance, NEIGHBOURS - 1, axis=1)[:, :NEIGHBOURS]
     velocity[rest] = np.median(velocity[new][near], axis=1)
     return velocity

@@ -14,16 +14,16 @@ from spiked.recon.frontend.motion_compensation import MotionCompensator, drift, 
 from spiked.recon.frontend.spike_intervals import SpikeIntervals
 from spiked.sensor import Image, Mosaic, Sensor
 
-LATE_PERCENT = 10.0
+EXPOSURE_PERCENTILE = 10.0
 """Percentile of exposure starts and ends that bound the rendered span: the darkest pixels gather charge for too long to
 render their whole exposure in straight sub-frames."""
-LEAST_INSIDE = 0.7
+MIN_EXPOSURE_SHARE = 0.7
 """Share of a pixel's exposure that has to lie in that span."""
-MARGIN = 24
+SEARCH_FRAMES = 24
 """Frames on both sides of a window that are searched for the spikes nearest to its edges."""
-STORE = 4
+BUFFER_RATIO = 4
 """Capacity of the frame buffer over the number of waiting frames."""
-PROBE = 16
+PROBE_FRAMES = 16
 """Frames of the first motion estimate."""
 WINDOWS = (4, 8, 16, 32, 64)
 """Lengths of a view in frames."""
@@ -33,7 +33,7 @@ FIRST_WINDOW = 16
 """Length of the first views in frames."""
 WINDOW_MOTION_PX = (0.12, 0.6)
 """The next view is twice as long below the first motion in a view, half as long above twice the second."""
-STARTS_PX = 1.0
+MOTION_ONSET_PX = 1.0
 """Motion in a view longer than `FIRST_WINDOW` that shortens this view at once."""
 FAST_PX = (0.35, 0.5)
 """Motion a frame: compensation starts above the second and ends below the first. Below it 8-frame windows give better
@@ -85,9 +85,9 @@ class View:
         """Standard deviation of `rate`."""
         return self.light[1]
 
-    def preview_rate(self, room: Image) -> Image:
-        """`rate` without caching; written to `room` if there is no calibration."""
-        return self.rate if self.calibration is not None else self.intervals.rate(room)
+    def preview_rate(self, out: Image) -> Image:
+        """`rate` without caching; written to `out` if there is no calibration."""
+        return self.rate if self.calibration is not None else self.intervals.rate(out)
 
     def exposure(self, parts: int) -> tuple[NDArray[np.float64], Image, NDArray[np.bool_]]:
         """When each pixel gathered its charge, for `Rasteriser.forward_moving` with `parts` sub-frames.
@@ -96,14 +96,14 @@ class View:
         pixels' exposures [2, H, W] in units of sub-frames, and a mask [H, W], False for much longer exposures.
         """
         start, stop = self.intervals.times()
-        first = float(np.percentile(start[::4, ::4], LATE_PERCENT))
-        last = float(np.percentile(stop[::4, ::4], 100 - LATE_PERCENT))
+        first = float(np.percentile(start[::4, ::4], EXPOSURE_PERCENTILE))
+        last = float(np.percentile(stop[::4, ::4], 100 - EXPOSURE_PERCENTILE))
         scale = np.float32(parts / max(last - first, 1e-3))
         windows = np.stack([(start - np.float32(first)) * scale, (stop - np.float32(first)) * scale])
         whole = windows[1] - windows[0]
         np.clip(windows[0], 0, parts - 0.02, out=windows[0])
         np.clip(windows[1], windows[0] + 0.02, parts, out=windows[1])
-        seen = windows[1] - windows[0] >= LEAST_INSIDE * whole
+        seen = windows[1] - windows[0] >= MIN_EXPOSURE_SHARE * whole
         return self.time + np.linspace(first, last, parts + 1), windows.astype(np.float32), seen
 
 
@@ -162,7 +162,7 @@ class Windows:
         begin = self._filled - waiting
         if begin + count > len(self._store):
             if self._shared or 2 * count > len(self._store):
-                self._store, self._shared = np.empty((STORE * count, self.sensor.frame_bytes), np.uint8), False
+                self._store, self._shared = np.empty((BUFFER_RATIO * count, self.sensor.frame_bytes), np.uint8), False
             self._store[:waiting] = self._frames
             begin = 0
         self._store[begin + waiting : begin + count] = frames
@@ -172,7 +172,7 @@ class Windows:
     @property
     def latest_frames(self) -> int:
         """Number of frames that `latest_view` needs."""
-        return self.length + 2 * MARGIN
+        return self.length + 2 * SEARCH_FRAMES
 
     def latest_view(self, first_frame: int, frames: NDArray[np.uint8]) -> View:
         """One view in the middle of frames uint8 [n, frame_bytes]; waiting frames are dropped."""
@@ -209,7 +209,7 @@ class Windows:
 
     def _probe(self) -> None:
         """Estimate the motion of the first frames; only fast motion changes the view length."""
-        speed_px = speed(self._frames[:PROBE], self.sensor)
+        speed_px = speed(self._frames[:PROBE_FRAMES], self.sensor)
         if speed_px > FAST_PX[1]:
             self.follow(speed_px, 1.0)
         self._probed = True
@@ -218,21 +218,21 @@ class Windows:
         """Shorten a long view in which the camera starts to move: it would be blurred."""
         while self._follows and not self.sharpen and self.length > FIRST_WINDOW:
             begin = self._next - self._first
-            if drift(self._frames[begin : begin + self.length], self.sensor) < STARTS_PX:
+            if drift(self._frames[begin : begin + self.length], self.sensor) < MOTION_ONSET_PX:
                 return
             self.length = WINDOWS[WINDOWS.index(self.length) - 1]
 
     def _cut(self, final: bool) -> Iterator[View]:
         stop = self._first + len(self._frames)
-        if not self._probed and (len(self._frames) >= PROBE or final):
+        if not self._probed and (len(self._frames) >= PROBE_FRAMES or final):
             self._probe()
         if not self._probed:
             return
-        while self._next + self.length + (0 if final else MARGIN) <= stop:
+        while self._next + self.length + (0 if final else SEARCH_FRAMES) <= stop:
             self._shorten()
             begin, end = self._next, self._next + self.length
-            low = max(self._first, begin - MARGIN)
-            high = min(stop, end + MARGIN)
+            low = max(self._first, begin - SEARCH_FRAMES)
+            high = min(stop, end + SEARCH_FRAMES)
             part = self._frames[low - self._first : high - self._first]
             self._window = window = aligned_window(part, self.sensor, low, begin, end, out=self._window)
             sharp = self._sharp(0.5 * (begin + end), high)
@@ -242,7 +242,7 @@ class Windows:
             first, frames = self._around((begin + end) // 2, stop) if sharp is not None else (0, None)
             yield make_view(window, self._gap, self._calibration, sharp, first, frames)
             self._gap = False
-        keep = max(self._first, min(self._next - MARGIN, stop))
+        keep = max(self._first, min(self._next - SEARCH_FRAMES, stop))
         self._frames, self._first = self._frames[keep - self._first :], keep
 
     def _around(self, middle: int, stop: int) -> tuple[int, NDArray[np.uint8]]:

@@ -47,14 +47,14 @@ class DensifyStrategy:
         return np.asarray(np.maximum(badness - np.median(badness), 0))
 
     def choose(
-        self, error: Image, replaced: int, cap: int, room: int, rng: np.random.Generator
+        self, error: Image, replaced: int, cap: int, headroom: int, rng: np.random.Generator
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
-        """Rows and columns of the pixels that become splats; None if there is no room or no error.
+        """Rows and columns of the pixels that become splats; None if there is no headroom or no error.
 
-        `replaced` splats were removed, `room` is left below the `cap`.
+        `replaced` splats were removed, `headroom` is left below the `cap`.
         """
         badness = self.badness(error)
-        count, total = min(int(self.share * cap) + replaced, room), float(badness.sum())
+        count, total = min(int(self.share * cap) + replaced, headroom), float(badness.sum())
         if count < 1 or total <= 0:
             return None
         count = min(count, badness.size // 4)

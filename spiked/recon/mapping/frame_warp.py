@@ -12,7 +12,7 @@ from spiked.render import Camera
 from spiked.render.charge import WARP_CELL_PX
 from spiked.sensor import Image
 
-NEAREST = 0.05
+MIN_RELATIVE_DEPTH = 0.05
 """Smallest depth, relative to the typical one; nearer depths are clipped."""
 
 
@@ -39,7 +39,7 @@ class FrameWarp:
         turn = (k @ rotation.T @ self.rotations @ np.linalg.inv(k)).astype(np.float32)
         shift = ((self.centres - centre) @ rotation @ k.T).astype(np.float32)
         moved = np.empty((len(turn), rows, columns, 2), np.float32)
-        warp_nodes(inverse, shrink, turn, np.ascontiguousarray(shift), WARP_CELL_PX, NEAREST, moved)
+        warp_nodes(inverse, shrink, turn, np.ascontiguousarray(shift), WARP_CELL_PX, MIN_RELATIVE_DEPTH, moved)
         return moved
 
 
@@ -47,7 +47,7 @@ def _smooth_inverse(depth: Image, width: int) -> tuple[Image, float]:
     """Inverse depths averaged over about a cell, and the image's width over the sensor's."""
     shrink = depth.shape[1] / width
     known = depth > 0
-    inverse = 1 / np.maximum(depth, np.float32(NEAREST))
+    inverse = 1 / np.maximum(depth, np.float32(MIN_RELATIVE_DEPTH))
     if not known.all():
         inverse = np.where(known, inverse, np.float32(np.median(inverse[known]) if known.any() else 1.0))
     side = max(1, round(WARP_CELL_PX * shrink))

@@ -4,11 +4,11 @@ import numpy as np
 
 from spiked.sensor import Image
 
-PIXEL_RIDGE = 0.02
+GAIN_SIGMA = 0.02
 """Prior deviation of a pixel's gain from 1."""
 MODEL_ERROR = 0.07
 """Relative error of the map's render, added to the noise of each residual."""
-FORGET = 0.7
+RESIDUAL_DECAY = 0.7
 """Decay of the accumulated residuals at each update: older ones are of an older map."""
 
 
@@ -71,12 +71,12 @@ class Nuisances:
         # A view observed again adds no information: the evidence is that of the distinct views.
         once = np.float32(min(1.0, len(self._levels) / self._observed))
         if not self._fixed:
-            relative = once * self._xy / (once * self._xx + np.float32(1 / PIXEL_RIDGE**2))
+            relative = once * self._xy / (once * self._xx + np.float32(1 / GAIN_SIGMA**2))
             gain = np.clip(1 + relative, 0.5, 2.0)
             self.gain = (gain / np.exp(np.log(gain).mean())).astype(np.float32)
-        self._xx *= FORGET
-        self._xy *= FORGET
-        self._observed *= FORGET
+        self._xx *= RESIDUAL_DECAY
+        self._xy *= RESIDUAL_DECAY
+        self._observed *= RESIDUAL_DECAY
 
     def forget_views(self) -> None:
         """Drop what is stored for each view, after some were dropped."""

@@ -19,7 +19,7 @@ from spiked.sensor import Image, Intrinsics
 
 SWEPT_PIXELS = 130_000
 """Images of more than about this many pixels are swept at a smaller size: the first splats are coarser still."""
-MOST_APART, UNSEEN = 4.0, 2.0
+MAX_COST, OUTSIDE_COST = 4.0, 2.0
 """Cap of a pixel's difference in standard deviations, and its cost outside the other image."""
 
 
@@ -94,7 +94,7 @@ def sweep(
         total = np.zeros((height, width), np.float32)
         for other in others:
             warped = _through_plane(other, reference, k, float(inverse[plane]))
-            _dense.add_cost(warped, image, weight, MOST_APART, UNSEEN, total)
+            _dense.add_cost(warped, image, weight, MAX_COST, OUTSIDE_COST, total)
         total /= len(others)
         cost[plane] = (
             cv2.boxFilter(total, -1, (3, 3)) + cv2.boxFilter(total, -1, (9, 9)) + cv2.boxFilter(total, -1, (21, 21))

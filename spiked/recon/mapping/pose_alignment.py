@@ -29,13 +29,13 @@ from spiked.spline import Spline
 
 LANDMARK_PX = 16
 """Approximate width of a landmark in the image: all pixels in its cube of space share its three coordinates."""
-HELD, BARELY_HELD = 1e-2, 1e-3
+LANDMARK_DAMPING, LANDMARK_DAMPING_FLOOR = 1e-2, 1e-3
 """Damping of a landmark, relative to its own information and to the median landmark's: few pixels may see it."""
-STRONG = 0.7
+GRADIENT_QUANTILE = 0.7
 """Quantile of the gradient magnitude below which pixels are left out."""
-DAMPING = 1e-3
+KNOT_DAMPING = 1e-3
 """Of each knot, relative to its information."""
-CHUNK = 4_000_000
+CHUNK_FLOATS = 4_000_000
 """Floats held at once while landmarks are marginalised."""
 
 
@@ -79,7 +79,7 @@ def align_spline(
     if known is not None:
         square, gradient = square + known.information, gradient + known.gradient(spline)
     diagonal = np.diag(square).copy()
-    square[np.diag_indices(len(square))] += DAMPING * diagonal + 1e-6 * diagonal.max()
+    square[np.diag_indices(len(square))] += KNOT_DAMPING * diagonal + 1e-6 * diagonal.max()
     step = np.asarray(-share * np.linalg.solve(square, gradient).reshape(-1, 6), np.float64)
     return spline.move(step[:, :3], step[:, 3:])
 
@@ -115,9 +115,9 @@ def marginalise_landmarks(
     for s, n in zip(sums, numbers, strict=True):
         own[n] += s.places[:, :, [0, 1, 2, 9]]
     trace = np.trace(own[:, :, :3], axis1=1, axis2=2) / 3
-    held = HELD * trace + BARELY_HELD * median(trace)
-    roots = np.linalg.inv(np.linalg.cholesky(own[:, :, :3] + held[:, None, None] * np.eye(3)))
-    chunk = max(1, CHUNK // (18 * knots))
+    damping = LANDMARK_DAMPING * trace + LANDMARK_DAMPING_FLOOR * median(trace)
+    roots = np.linalg.inv(np.linalg.cholesky(own[:, :, :3] + damping[:, None, None] * np.eye(3)))
+    chunk = max(1, CHUNK_FLOATS // (18 * knots))
     for begin in range(0, len(names), chunk):
         taken = slice(begin, min(begin + chunk, len(names)))
         cross = np.zeros((taken.stop - begin, 3, knots, 6))
@@ -125,8 +125,8 @@ def marginalise_landmarks(
             here = (n >= begin) & (n < taken.stop)
             cross[n[here] - begin, :, at : at + len(share)] += s.places[here, :, None, 3:9] * share[None, None, :, None]
         eliminated = (roots[taken] @ cross.reshape(len(cross), 3, -1)).reshape(-1, 6 * knots)
-        pull = (roots[taken] @ own[taken, :, 3:]).ravel()
-        square, right = marginalise(square, right, eliminated, pull)
+        whitened_gradient = (roots[taken] @ own[taken, :, 3:]).ravel()
+        square, right = marginalise(square, right, eliminated, whitened_gradient)
     return square, right
 
 
@@ -147,7 +147,7 @@ def _view_normals(
     edge = 2
     strong = np.zeros(error.shape, bool)
     size = np.hypot(du, dv)
-    strong[edge:-edge, edge:-edge] = (size > np.quantile(size[::4, ::4], STRONG))[edge:-edge, edge:-edge]
+    strong[edge:-edge, edge:-edge] = (size > np.quantile(size[::4, ::4], GRADIENT_QUANTILE))[edge:-edge, edge:-edge]
     strong &= image.alpha > 0.9
     e = error[strong]
     scale = 1.5 * (median(np.abs(e)) if len(e) else 0.0) + 1e-6

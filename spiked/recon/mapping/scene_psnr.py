@@ -10,7 +10,7 @@ from spiked.scene import Scene
 from spiked.sensor import Sensor
 from spiked.trajectory import Trajectory
 
-VIEWS = 8
+COMPARED_VIEWS = 8
 """Number of views compared, spread over the recording."""
 
 
@@ -21,7 +21,7 @@ def scene_psnr_db(
 
     A view without a pose counts as rendered black.
     """
-    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, VIEWS).round().astype(int))]
+    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, COMPARED_VIEWS).round().astype(int))]
     rate = sensor.frame_rate_hz
     rows = trajectory.nearest(np.array([view.time / rate for view in chosen]), 0.51 / rate)
     errors, whites = [], []

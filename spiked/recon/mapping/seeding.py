@@ -47,7 +47,7 @@ class Seeding:
     sure: float = 0.6
     """Depth confidence of the pixels seeded first; the others are seeded where no view is more confident."""
     share: float = 0.3
-    """Largest share of the cap that one view seeds: the first leaves room for others, and covers all of its image."""
+    """Largest share of the cap that one view seeds: the first leaves some for others, and covers all of its image."""
     opacity: float = 0.5
     """Pixels that the map covers with less are seeded."""
     size: float = 0.6
@@ -84,9 +84,9 @@ class Seeding:
         return max(least_px, float(np.sqrt(pixels / (self.share * cap))))
 
     def pixels(
-        self, empty: NDArray[np.bool_], stride: float, room: int
+        self, empty: NDArray[np.bool_], stride: float, limit: int
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
-        """Rows and columns of at most `room` pixels, `stride` apart, that are `empty` [H, W]; None for too few."""
+        """Rows and columns of at most `limit` pixels, `stride` apart, that are `empty` [H, W]; None for too few."""
         height, width = empty.shape
         v, u = (
             g.ravel().astype(int)
@@ -95,7 +95,7 @@ class Seeding:
             )
         )
         keep = empty[v, u]
-        u, v = u[keep][:room], v[keep][:room]
+        u, v = u[keep][:limit], v[keep][:limit]
         return None if len(u) < LEAST_PIXELS else (v, u)
 
 

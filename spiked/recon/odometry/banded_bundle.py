@@ -97,11 +97,11 @@ class _BandedSystem:
     parts: list[NormalEquations]
     band: Array
     """[bandwidth + 1, 6 F]"""
-    own: Array
-    """[6 F], the diagonal before marginalisation."""
+    diagonal: Array
+    """[6 F], before marginalisation."""
     right: Array
     """[6 F]"""
-    side: Array
+    cross: Array
     """[6 F], cross terms with the log focal length."""
     focal: Array
     """Hessian of the log focal length, its right side, and its Hessian before marginalisation."""
@@ -109,41 +109,41 @@ class _BandedSystem:
     @classmethod
     def of(cls, bundle: Bundle, structure: BandedStructure, scale_px: float, damping: float) -> "_BandedSystem":
         width, size = structure.bandwidth, 6 * len(structure.order)
-        band, own = np.zeros((width + 1, size)), np.zeros(size)
-        right, side, focal, parts = np.zeros(size), np.zeros(size), np.zeros(3), []
+        band, diagonal = np.zeros((width + 1, size)), np.zeros(size)
+        right, cross, focal, parts = np.zeros(size), np.zeros(size), np.zeros(3), []
         for group in structure.groups:
             part = _of_group(bundle, group).linearise(scale_px, group.blocks, damping)
-            square, gradient = part.reduced()
+            hessian, gradient = part.reduced()
             at, count = group.unknowns, len(group.unknowns)
             row, column = at[:, None], at[None, :]
             upper = (row <= column) & (column - row <= width)
             rows, columns = np.nonzero(upper)
-            band[width + at[rows] - at[columns], at[columns]] += square[rows, columns]
-            own[at] += np.diag(part.hessian)[:count]
+            band[width + at[rows] - at[columns], at[columns]] += hessian[rows, columns]
+            diagonal[at] += np.diag(part.hessian)[:count]
             right[at] -= gradient[:count]
             if bundle.focal_free:
-                side[at] += square[:count, -1]
-                focal += [square[-1, -1], -gradient[-1], part.hessian[-1, -1]]
+                cross[at] += hessian[:count, -1]
+                focal += [hessian[-1, -1], -gradient[-1], part.hessian[-1, -1]]
             parts.append(part)
-        return cls(structure, parts, band, own, right, side, focal)
+        return cls(structure, parts, band, diagonal, right, cross, focal)
 
     def solve(self, damping: float, focal_free: bool) -> Step:
         """Steps of the poses, the points and, if free, the focal length."""
         band = self.band.copy()
-        band[-1] += damping * self.own + RIDGE
-        both = solveh_banded(band, np.stack([self.right, self.side], 1), overwrite_ab=True, check_finite=False)
-        solved, log_focal = both[:, 0], 0.0
+        band[-1] += damping * self.diagonal + RIDGE
+        solutions = solveh_banded(band, np.stack([self.right, self.cross], 1), overwrite_ab=True, check_finite=False)
+        solution, log_focal = solutions[:, 0], 0.0
         if focal_free:
-            hessian, right, own = self.focal
-            solved, log_focal = focal_step(both, self.side, hessian + damping * own + RIDGE, right)
+            hessian, right, diagonal = self.focal
+            solution, log_focal = focal_step(solutions, self.cross, hessian + damping * diagonal + RIDGE, right)
         points = np.zeros((sum(len(group.points) for group in self.structure.groups), 3))
         for group, part in zip(self.structure.groups, self.parts, strict=True):
-            own = solved[group.unknowns]
+            part_solution = solution[group.unknowns]
             if focal_free:
-                own = np.append(own, log_focal)
-            back = -part.pull - (part.eliminated @ own).reshape(-1, 3)
-            points[group.points] = np.einsum("Pji,Pj->Pi", part.roots, back)
-        blocks = solved.reshape(-1, 6)[self.structure.order]
+                part_solution = np.append(part_solution, log_focal)
+            whitened = -part.whitened_gradient - (part.eliminated @ part_solution).reshape(-1, 3)
+            points[group.points] = np.einsum("Pji,Pj->Pi", part.roots, whitened)
+        blocks = solution.reshape(-1, 6)[self.structure.order]
         return Step(blocks, points, log_focal)
 
 

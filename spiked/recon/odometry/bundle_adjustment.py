@@ -101,12 +101,12 @@ class Bundle:
             free[0] = False
         else:
             free &= ~fixed
-        blocks, room = PoseBlocks.of_poses(free), None
+        blocks, workspace = PoseBlocks.of_poses(free), None
 
         def attempt(damping: float) -> tuple[float, Bundle]:
-            nonlocal room
-            room = self.linearise(scale_px, blocks, damping, room)
-            trial = self.stepped(room.solve(damping), free)
+            nonlocal workspace
+            workspace = self.linearise(scale_px, blocks, damping, workspace)
+            trial = self.stepped(workspace.solve(damping), free)
             return trial.cost(scale_px), trial
 
         search = LevenbergMarquardt(damping=1e-3, least_damping=1e-8, iterations=iterations, tolerance=tolerance)
@@ -117,27 +117,27 @@ class Bundle:
     ) -> tuple[Spline, float]:
         """As `optimise`, with the poses tied to a spline at `times` [C] (frames): returns spline and cost."""
         self.rotations, self.centres = spline.poses(times)
-        inertia = SmoothnessPrior.of(spline, spline.basis_matrix(times), self.noise_px())
-        blocks, room = PoseBlocks.of_knots(spline, times), None
+        smoothness = SmoothnessPrior.of(spline, spline.basis_matrix(times), self.noise_px())
+        blocks, workspace = PoseBlocks.of_knots(spline, times), None
         share = 2 / (scale_px**2 * len(self.camera))  # of the energy: the cost is a mean in units of the scale
-        prior = inertia.hessian(), inertia.gradient(spline)
+        prior = smoothness.hessian(), smoothness.gradient(spline)
 
         def attempt(damping: float) -> tuple[float, tuple[Spline, Bundle]]:
-            nonlocal room
-            room = self.linearise(scale_px, blocks, damping, room)
-            step = room.solve(damping, prior)
+            nonlocal workspace
+            workspace = self.linearise(scale_px, blocks, damping, workspace)
+            step = workspace.solve(damping, prior)
             moved = spline.move(step.blocks[:, :3], step.blocks[:, 3:])
             trial = self._moved(*moved.poses(times), step)
-            return trial.cost(scale_px) + share * inertia.energy(moved), (moved, trial)
+            return trial.cost(scale_px) + share * smoothness.energy(moved), (moved, trial)
 
         def accept(found: tuple[Spline, Bundle]) -> None:
             nonlocal spline, prior
             spline = found[0]
             self.take(found[1])
-            prior = inertia.hessian(), inertia.gradient(spline)
+            prior = smoothness.hessian(), smoothness.gradient(spline)
 
         search = LevenbergMarquardt(damping=1e-4, least_damping=1e-9, iterations=iterations, tolerance=tolerance)
-        cost = search.minimise(self.cost(scale_px) + share * inertia.energy(spline), attempt, accept)
+        cost = search.minimise(self.cost(scale_px) + share * smoothness.energy(spline), attempt, accept)
         return spline, cost
 
     def take(self, other: "Bundle") -> None:
@@ -161,9 +161,9 @@ class Bundle:
 
     def spline_information(self, spline: Spline, times: Array, scale_px: float) -> Array:
         """Information of the knots, points marginalised: [6 knots, 6 knots] of (rotation, centre), in 1/px^2."""
-        inertia = SmoothnessPrior.of(spline, spline.basis_matrix(times), self.noise_px())
-        square, _ = replace(self, focal_free=False).linearise(scale_px, PoseBlocks.of_knots(spline, times)).reduced()
-        return square + inertia.hessian().reshape(square.shape)
+        smoothness = SmoothnessPrior.of(spline, spline.basis_matrix(times), self.noise_px())
+        hessian, _ = replace(self, focal_free=False).linearise(scale_px, PoseBlocks.of_knots(spline, times)).reduced()
+        return hessian + smoothness.hessian().reshape(hessian.shape)
 
     def stepped(self, step: Step, free: NDArray[np.bool_]) -> "Bundle":
         rotations, centres = self.rotations.copy(), self.centres.copy()
@@ -177,10 +177,10 @@ class Bundle:
         return replace(self, rotations=rotations, centres=centres, points=points, intrinsics=intrinsics)
 
     def linearise(
-        self, scale_px: float, blocks: PoseBlocks, damping: float = 0.0, room: NormalEquations | None = None
+        self, scale_px: float, blocks: PoseBlocks, damping: float = 0.0, workspace: NormalEquations | None = None
     ) -> NormalEquations:
         """The normal equations, with damped points; written over earlier ones of the same size, if given."""
-        system = room or NormalEquations.empty(blocks.count, len(self.centres), len(self.points), self.focal_free)
+        system = workspace or NormalEquations.empty(blocks.count, len(self.centres), len(self.points), self.focal_free)
         _bundle.linearise(
             *self._seen(),
             scale_px,
@@ -191,7 +191,7 @@ class Bundle:
             system.hessian,
             system.gradient,
             system.eliminated,
-            system.pull,
+            system.whitened_gradient,
             system.roots,
             system.pose_hessian,
         )

@@ -9,7 +9,7 @@ from spiked.pose import Array, log_so3, mean_rotation
 from spiked.recon.odometry.bundle_adjustment import Bundle
 from spiked.recon.odometry.initialisation import BOOT_VIEWS, INLIER_PX, SCALE_PX
 from spiked.recon.odometry.pnp import LOST_CHI2, MIN_POINTS, chi2_of, noise_outside_px
-from spiked.recon.odometry.self_calibration import CORRELATED, SAME_FOCAL, Focal
+from spiked.recon.odometry.self_calibration import FOCAL_ERROR_FACTOR, FOCAL_TOLERANCE, Focal
 from spiked.recon.odometry.sparse_map import MapBundle, Pose, SparseMap, TrackedView
 from spiked.recon.odometry.spline_fitting import MotionBursts, fit_coarsest_spline, knot_time_warp, motion_bursts
 from spiked.recon.odometry.stationarity import STILL_PX
@@ -115,7 +115,7 @@ class GlobalAdjuster:
             if self.map.focal is None or self.spline is None:
                 return
             self.adjust()
-            if abs(self.map.intrinsics.fx / before - 1) < SAME_FOCAL:
+            if abs(self.map.intrinsics.fx / before - 1) < FOCAL_TOLERANCE:
                 return
 
     def path_error(self) -> float | None:
@@ -172,7 +172,7 @@ class GlobalAdjuster:
         if sparse_map.focal is not None:
             sparse_map.points[found.left_out] = np.nan  # triangulated again below with the new path
             sparse_map.intrinsics = bundle.intrinsics
-            sparse_map.focal = Focal(sparse_map.intrinsics, CORRELATED * bundle.focal_sigma(SCALE_PX))
+            sparse_map.focal = Focal(sparse_map.intrinsics, FOCAL_ERROR_FACTOR * bundle.focal_sigma(SCALE_PX))
         self.spline = _align_to_previous(found.spline, adjusted)
         self._newest = bundle, adjusted.times
         sparse_map.apply(adjusted)

@@ -28,12 +28,14 @@ MIN_PARALLAX_PX = 0.5
 """Parallax (image motion beyond rotation) that a bootstrap needs; tracks are good to 0.05 px."""
 PARALLAX_NOISES = 5.0
 """Parallax over the tracks' noise that an initialisation needs: with less, depths are noise."""
-SAME = 0.8
+SAME_SCENE_CORRELATION = 0.8
 """Correlation of inverse depths above which two results are the same scene."""
 WORSE_RATIO = 1.1
-CLEAR_T = 5.0
-CLEAR_RATIO = 1.02
-"""A rival is worse if its cost is by the first ratio, or by the last ratio with this t value over the tracks."""
+"""Cost of a rival over the best one above which it is worse..."""
+WORSE_T_RATIO, WORSE_T = 1.02, 5.0
+"""... or above this smaller ratio, if a paired t-test over the tracks gives at least this t value."""
+MIRROR_BETTER_RATIO = 0.98
+"""Cost of the depth-reversed result over the best one below which it takes its place."""
 
 
 class Guess(StrEnum):
@@ -126,7 +128,7 @@ def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = MIN_PARALLAX
     best = min(tried, key=lambda h: h.cost)
     rival = _converge(Guess.MIRROR, _mirrored(views, best.bundle), rotation_only)
     tried.append(rival)
-    if rival.cost < best.cost * 0.98:
+    if rival.cost < best.cost * MIRROR_BETTER_RATIO:
         best = rival
     return _select_hypothesis(best, tried, views.ids)
 
@@ -137,8 +139,12 @@ def _select_hypothesis(best: Hypothesis, tried: list[Hypothesis], ids: NDArray[n
             None, f"only {best.inliers:.0%} of the tracks agree with one rigid scene", tried, ids
         )
     for rival in tried:
-        if rival is not best and _inverse_depth_correlation(rival, best) < SAME and not _clearly_worse(rival, best):
-            name = "its depth-reversed twin" if _inverse_depth_correlation(rival, best) < 0 else "another one"
+        if (
+            rival is not best
+            and _inverse_depth_correlation(rival, best) < SAME_SCENE_CORRELATION
+            and not _clearly_worse(rival, best)
+        ):
+            name = "its depth reversal" if _inverse_depth_correlation(rival, best) < 0 else "another one"
             reason = f"the scene and {name} explain the tracks equally well"
             return InitialisationResult(None, reason, tried, ids, needs_motion=True)
     return InitialisationResult(best, "accepted", tried, ids)
@@ -157,7 +163,7 @@ def _clearly_worse(rival: Hypothesis, best: Hypothesis) -> bool:
         return True
     more = rival.track_costs() - best.track_costs()
     t = more.mean() / max(more.std() / np.sqrt(len(more)), 1e-9)
-    return bool(t > CLEAR_T and rival.cost > CLEAR_RATIO * best.cost)
+    return bool(t > WORSE_T and rival.cost > WORSE_T_RATIO * best.cost)
 
 
 def _converge(guess: Guess, bundle: Bundle, parallax: float) -> Hypothesis:

@@ -31,13 +31,13 @@ LOOP_REACH_PX = 0.6
 """Largest forward-backward error of a point found again."""
 LEAST_COS = 0.85
 """Cosine of the largest angle between the optical axes of two views of a loop."""
-AGREES_PX = 1.5 * INLIER_PX
+CLOSURE_INLIER_PX = 1.5 * INLIER_PX
 """Largest residual of a point that agrees with the pose."""
 MOST_SCALE = 1.25
 """Largest drift of the scale, and its inverse the least, that is taken from the closures' positions."""
 LEAST_SPREAD = 0.01
 """RMS distance of the closures' positions, in units of the first views' depth, that a scale is taken from."""
-PARTS = 200
+DRIFT_STEPS = 200
 """Steps in which the drift is spread over the points."""
 
 
@@ -116,10 +116,10 @@ def spread_drift(sparse_map: SparseMap, found: list[LoopClosure]) -> list[LoopCl
             seen[view.ids] += 1
             part = drift.part(float(shares[view.id]))
             view.pose = Pose(part.rotation @ view.pose.rotation, part.points(view.pose.centre))
-    steps = np.round(PARTS * places / np.maximum(seen, 1)).astype(np.int64)
+    steps = np.round(DRIFT_STEPS * places / np.maximum(seen, 1)).astype(np.int64)
     for step in np.unique(steps).tolist():
         chosen = steps == step
-        sparse_map.points[chosen] = drift.part(step / PARTS).points(sparse_map.points[chosen])
+        sparse_map.points[chosen] = drift.part(step / DRIFT_STEPS).points(sparse_map.points[chosen])
     return closures
 
 
@@ -195,7 +195,7 @@ def _match(
         return None
     seen = replace(later, ids=ids[good], pixels=at[good])
     fit = fit_pose(sparse_map, seen, before)
-    agree = sparse_map.errors_px(seen, fit.pose) < AGREES_PX
+    agree = sparse_map.errors_px(seen, fit.pose) < CLOSURE_INLIER_PX
     if agree.sum() < LEAST_MATCHES or agree.mean() < LEAST_AGREEING:
         return None
     return LoopClosure(earlier, later, seen.ids[agree], seen.pixels[agree], before, fit.pose)

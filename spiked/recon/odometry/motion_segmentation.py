@@ -19,15 +19,16 @@ from spiked.recon.odometry.initialisation import (
     converge_without,
 )
 
-SHARE = (0.04, 0.45)
+MOVING_SHARE = (0.04, 0.45)
 """Share of the tracks that may be left out: fewer have no effect, more may be the scene."""
-NEAR = 3.0
-"""Inverse depth over the median one above which a point is suspiciously near."""
-SUSPICIOUS = (0.9, 1.1)
+NEAR_RATIO = 3.0
+"""Inverse depth over the median one above which a point is probably an object explained as a near point."""
+UNCHANGED_RATIO = (0.9, 1.1)
 """Ratio of the others' residuals without and with the tracks that counts as unchanged: no second initialisation."""
-CLEARLY = 0.85
+IMPROVED_RATIO = 0.85
 """Ratio below which the tracks are left out."""
-ROUNDS = 20
+CLUSTERING_ROUNDS = 20
+"""Most iterations of the 2-means clustering."""
 
 
 def initialise(views: Views, seed: int = 0, min_parallax_px: float = MIN_PARALLAX_PX) -> InitialisationResult:
@@ -36,18 +37,18 @@ def initialise(views: Views, seed: int = 0, min_parallax_px: float = MIN_PARALLA
     if not result.tried:
         return result
     apart = moving_apart(views)
-    if not SHARE[0] < apart.mean() < SHARE[1]:
+    if not MOVING_SHARE[0] < apart.mean() < MOVING_SHARE[1]:
         return result
     best = result.winner or min(result.tried, key=lambda one: one.cost)
     before = _agreement(best)[~apart]
-    near = best.bundle.points[:, 2] < np.median(best.bundle.points[:, 2]) / NEAR
-    if not SHARE[0] < near.mean() < SHARE[1]:
-        quick = converge_without(best, apart)
-        if SUSPICIOUS[0] < np.median(_agreement(quick)) / np.median(before) < SUSPICIOUS[1]:
+    near = best.bundle.points[:, 2] < np.median(best.bundle.points[:, 2]) / NEAR_RATIO
+    if not MOVING_SHARE[0] < near.mean() < MOVING_SHARE[1]:
+        refitted = converge_without(best, apart)
+        if UNCHANGED_RATIO[0] < np.median(_agreement(refitted)) / np.median(before) < UNCHANGED_RATIO[1]:
             return result
     rest = replace(views, pixels=views.pixels[:, ~apart], ids=views.ids[~apart])
     other = bootstrap(rest, seed, min_parallax_px)
-    if other.winner is None or np.median(_agreement(other.winner)) > CLEARLY * np.median(before):
+    if other.winner is None or np.median(_agreement(other.winner)) > IMPROVED_RATIO * np.median(before):
         return result
     return other
 
@@ -58,7 +59,7 @@ def moving_apart(views: Views) -> NDArray[np.bool_]:
     middle = motion - motion.mean(0)
     along = middle @ np.linalg.svd(middle, full_matrices=False)[2][0]
     group = along > 0.5 * (along.min() + along.max())
-    for _ in range(ROUNDS):
+    for _ in range(CLUSTERING_ROUNDS):
         if group.all() or not group.any():
             break
         distance = [((motion - motion[side].mean(0)) ** 2).sum(1) for side in (group, ~group)]

@@ -18,13 +18,13 @@ RIDGE = 1e-9
 """Added to the diagonal of the reduced Hessian: unknowns that nothing observes stay where they are."""
 
 
-def marginalise(hessian: Array, gradient: Array, eliminated: Array, pull: Array) -> tuple[Array, Array]:
+def marginalise(hessian: Array, gradient: Array, eliminated: Array, whitened_gradient: Array) -> tuple[Array, Array]:
     """Hessian [D, D] and gradient [D] with landmarks marginalised (Schur complement).
 
-    With the landmarks' Hessians V and R = chol(V)^-1: eliminated [3 P, D] is R times their cross terms, pull [3 P] is R
-    times their gradients.
+    With the landmarks' Hessians V and R = chol(V)^-1: eliminated [3 P, D] is R times their cross terms,
+    whitened_gradient [3 P] is R times their gradients.
     """
-    return np.asarray(hessian - eliminated.T @ eliminated), np.asarray(gradient - eliminated.T @ pull)
+    return np.asarray(hessian - eliminated.T @ eliminated), np.asarray(gradient - eliminated.T @ whitened_gradient)
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class NormalEquations:
     """[D]"""
     eliminated: Array
     """[3 P, D]: R of each point times its cross terms."""
-    pull: Array
+    whitened_gradient: Array
     """[P, 3]: R times the points' gradients."""
     roots: Array
     """[P, 3, 3]: R."""
@@ -100,54 +100,55 @@ class NormalEquations:
 
     def reduced(self) -> tuple[Array, Array]:
         """Hessian [D, D] and gradient [D] with the points marginalised."""
-        return marginalise(self.hessian, self.gradient, self.eliminated, self.pull.ravel())
+        return marginalise(self.hessian, self.gradient, self.eliminated, self.whitened_gradient.ravel())
 
     def focal_information(self) -> float:
         """Information of the log focal length with all else free, in 1/px^2."""
         assert self.focal_free
-        square, _ = self.reduced()
-        poses, side = square[:-1, :-1], square[:-1, -1]
+        hessian, _ = self.reduced()
+        poses, cross = hessian[:-1, :-1], hessian[:-1, -1]
         poses[np.diag_indices(len(poses))] += RIDGE * np.abs(np.diag(poses)).max()
-        return float(square[-1, -1] - side @ np.linalg.solve(poses, side))
+        return float(hessian[-1, -1] - cross @ np.linalg.solve(poses, cross))
 
     def solve(self, damping: float, prior: tuple[Array, Array] | None = None) -> Step:
         """Steps of the blocks, the points and, if free, the focal length.
 
         `prior` is added to the Hessian [blocks, 6, blocks, 6] and gradient [blocks, 6] of the blocks.
         """
-        square, gradient = self.reduced()
+        hessian, gradient = self.reduced()
         right = -gradient
-        size = len(square) - self.focal_free
-        own = np.diag(self.hessian).copy()
+        size = len(hessian) - self.focal_free
+        diagonal = np.diag(self.hessian).copy()
         if prior is not None:
-            held = prior[0].reshape(size, size)
-            square[:size, :size] += held
+            prior_hessian = prior[0].reshape(size, size)
+            hessian[:size, :size] += prior_hessian
             right[:size] -= prior[1].ravel()
-            own[:size] += np.diag(held)
-        square[np.diag_indices(len(square))] += damping * own + RIDGE
-        solved, log_focal = right, 0.0
+            diagonal[:size] += np.diag(prior_hessian)
+        hessian[np.diag_indices(len(hessian))] += damping * diagonal + RIDGE
+        solution, log_focal = right, 0.0
         if self.focal_free:
-            solved, log_focal = _solve_with_focal(square, right)
+            solution, log_focal = _solve_with_focal(hessian, right)
         elif size:
-            solved = np.asarray(np.linalg.solve(square, right))
-        back = -self.pull - (self.eliminated @ solved).reshape(-1, 3)
-        return Step(solved[:size].reshape(-1, 6), np.einsum("Pji,Pj->Pi", self.roots, back), log_focal)
+            solution = np.asarray(np.linalg.solve(hessian, right))
+        whitened = -self.whitened_gradient - (self.eliminated @ solution).reshape(-1, 3)
+        return Step(solution[:size].reshape(-1, 6), np.einsum("Pji,Pj->Pi", self.roots, whitened), log_focal)
 
 
-def _solve_with_focal(square: Array, right: Array) -> tuple[Array, float]:
+def _solve_with_focal(hessian: Array, right: Array) -> tuple[Array, float]:
     """Solution [D] whose last unknown, the log focal length, is limited; and that unknown."""
-    side = square[:-1, -1]
-    both = np.asarray(np.linalg.solve(square[:-1, :-1], np.stack([right[:-1], side], 1)), np.float64)
-    blocks, log_focal = focal_step(both, side, square[-1, -1], right[-1])
+    cross = hessian[:-1, -1]
+    solutions = np.asarray(np.linalg.solve(hessian[:-1, :-1], np.stack([right[:-1], cross], 1)), np.float64)
+    blocks, log_focal = focal_step(solutions, cross, hessian[-1, -1], right[-1])
     return np.append(blocks, log_focal), log_focal
 
 
-def focal_step(both: Array, side: Array, hessian: float, right: float) -> tuple[Array, float]:
-    """Solution [D] of the blocks and the limited step of the log focal length, with its cross terms `side` [D].
+def focal_step(solutions: Array, cross: Array, hessian: float, right: float) -> tuple[Array, float]:
+    """Solution [D] of the blocks and the limited step of the log focal length, with its cross terms `cross` [D].
 
-    both [D, 2] solve the blocks' system for their right side and for `side`; hessian and right are of the focal length.
+    solutions [D, 2] solve the blocks' system for their right side and for `cross`; hessian and right are of the focal
+    length.
     """
-    left = float(hessian - side @ both[:, 1])
-    log_focal = (right - float(side @ both[:, 0])) / max(left, RIDGE)
+    complement = float(hessian - cross @ solutions[:, 1])
+    log_focal = (right - float(cross @ solutions[:, 0])) / max(complement, RIDGE)
     log_focal = float(np.clip(log_focal, -MOST_LOG_FOCAL, MOST_LOG_FOCAL))
-    return np.asarray(both[:, 0] - log_focal * both[:, 1]), log_focal
+    return np.asarray(solutions[:, 0] - log_focal * solutions[:, 1]), log_focal

@@ -18,7 +18,7 @@ from spiked.recon.odometry.path_adjuster import PathAdjuster
 from spiked.recon.odometry.pnp import fit_pose
 from spiked.recon.odometry.pose_tracker import LOCAL_BA_EVERY, PoseTracker
 from spiked.recon.odometry.relocaliser import Relocaliser
-from spiked.recon.odometry.self_calibration import UNSURE, Focal
+from spiked.recon.odometry.self_calibration import MAX_FOCAL_SIGMA, Focal
 from spiked.recon.odometry.sparse_map import Pose, SparseMap, TrackedView
 from spiked.recon.odometry.tracking_state import State, TrackingState
 from spiked.sensor import Intrinsics
@@ -208,16 +208,16 @@ class Odometry:
             if view.pose is None:
                 continue
             fit = fit_pose(self._map, view, view.pose, move=False)
-            doubt = fit.degraded_reason(len(view.ids))
+            reason = fit.degraded_reason(len(view.ids))
             fit.store_quality(view)
             if view.state in (State.TRACK, State.DEGRADED):
-                view.state = State.TRACK if doubt is None else State.DEGRADED
-            assessed.append(doubt)
+                view.state = State.TRACK if reason is None else State.DEGRADED
+            assessed.append(reason)
         if assessed and self.state in (State.TRACK, State.DEGRADED):
             last = assessed[-FINAL_STATE_VIEWS:]
-            doubts = [doubt for doubt in last if doubt is not None]
-            most = doubts[-1] if len(doubts) > len(last) - len(doubts) else None
-            self._status.assess(self.views[-1].time, most)
+            reasons = [reason for reason in last if reason is not None]
+            common = reasons[-1] if len(reasons) > len(last) - len(reasons) else None
+            self._status.assess(self.views[-1].time, common)
             if why := self._path_degraded_reasons():
                 self._status.set(self.views[-1].time, State.DEGRADED, "; ".join(why))
 
@@ -227,7 +227,7 @@ class Odometry:
         if self.path_error is not None and self.path_error > WORST_PATH_ERROR:
             about = f"about {self.path_error:.0%}"
             why.append(f"the whole path's shape is only known to {about}: few tracks tie it together")
-        if self.focal is not None and self.focal.relative_sigma > UNSURE:
+        if self.focal is not None and self.focal.relative_sigma > MAX_FOCAL_SIGMA:
             sigma = self.focal.relative_sigma
             known = "that the recording does not determine" if sigma > 1 else f"only known to about {sigma:.0%}"
             why.append(f"path and depths depend on a focal length {known}")

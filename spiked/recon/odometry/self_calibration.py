@@ -9,11 +9,11 @@ from spiked.sensor import Intrinsics
 FIELDS_OF_VIEW_DEG = (60.0, 42.0, 80.0, 30.0, 100.0)
 """Horizontal fields of view tried, the likeliest first."""
 FIRST_DEG = FIELDS_OF_VIEW_DEG[0]
-CORRELATED = 10.0
+FOCAL_ERROR_FACTOR = 10.0
 """True over predicted error of the focal length, as track errors are correlated over views (simulated recordings)."""
-SAME_FOCAL = 2e-3
+FOCAL_TOLERANCE = 2e-3
 """Relative change of the focal length that counts as stable."""
-UNSURE = 0.05
+MAX_FOCAL_SIGMA = 0.05
 """Relative standard deviation of the focal length above which the path is degraded."""
 
 

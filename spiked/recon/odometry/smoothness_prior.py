@@ -12,13 +12,13 @@ import numpy as np
 from spiked.pose import Array, log_so3
 from spiked.spline import Spline
 
-HELD = 0.5
+MIN_CONSTRAINED_WEIGHT = 0.5
 """Sum of a knot's basis weights over the views from which on the views constrain it."""
-LOOSE = 3.0
+CONSTRAINED_SIGMA = 3.0
 """Standard deviation of constrained second differences, relative to their RMS."""
-TIGHT = 0.3
+UNCONSTRAINED_SIGMA = 0.3
 """The same for unconstrained ones: smaller, as correlated track errors weaken the observations around them."""
-LEAST = 1e-6
+MIN_SIGMA = 1e-6
 """Floor of the standard deviation (rad, and units of depth)."""
 
 
@@ -32,14 +32,14 @@ class SmoothnessPrior:
     @classmethod
     def of(cls, spline: Spline, blend: Array, noise_px: float) -> "SmoothnessPrior":
         """For a spline seen by views with basis weights `blend` [views, k] and tracks with this noise."""
-        held = blend.sum(0) >= HELD
-        constrained = held[:-2] & held[1:-1] & held[2:]
+        supported = blend.sum(0) >= MIN_CONSTRAINED_WEIGHT
+        constrained = supported[:-2] & supported[1:-1] & supported[2:]
         second = _second_differences(spline)
         seen = second[constrained] if constrained.sum() >= 3 else second
         size = np.repeat([np.sqrt((part**2).mean()) if len(part) else 0.0 for part in (seen[:, :3], seen[:, 3:])], 3)
         differences = np.diff(np.eye(blend.shape[1]), 2, axis=0)
-        allowed = np.where(constrained, LOOSE, TIGHT)[:, None] * size
-        return cls(differences, np.asarray(max(noise_px, 1e-3) ** 2 / (allowed**2 + LEAST**2)))
+        allowed = np.where(constrained, CONSTRAINED_SIGMA, UNCONSTRAINED_SIGMA)[:, None] * size
+        return cls(differences, np.asarray(max(noise_px, 1e-3) ** 2 / (allowed**2 + MIN_SIGMA**2)))
 
     def energy(self, spline: Spline) -> float:
         """Half the weighted squares of the second differences."""

@@ -28,7 +28,7 @@ MIN_OBSERVATIONS = 3
 """Observations a point needs among the adjusted views."""
 MIN_BUNDLE_OBSERVATIONS = 60
 """Observations a bundle adjustment needs in all."""
-STRAY_NOISES, STRAY_PX, STRAY_SHARE = 6.0, (0.5, 2.0), 0.3
+OUTLIER_NOISES, OUTLIER_PX, OUTLIER_VIEW_SHARE = 6.0, (0.5, 2.0), 0.3
 """A point is dropped if its error exceeds 6 noises, clipped to 0.5 to 2 px, in over 30 % of its views: it moves."""
 
 
@@ -200,14 +200,16 @@ class SparseMap:
         return MapBundle(bundle, views, np.flatnonzero(used))
 
     def apply(self, adjusted: MapBundle) -> None:
-        """Take poses and points from an adjusted bundle; drop outlier points, see `STRAY_NOISES`."""
+        """Take poses and points from an adjusted bundle; drop outlier points, see `OUTLIER_NOISES`."""
         bundle, count = adjusted.bundle, len(adjusted.ids)
         for view, rotation, centre in zip(adjusted.views, bundle.rotations, bundle.centres, strict=True):
             view.pose = Pose(rotation, centre)
         error = np.linalg.norm(bundle.residuals(), axis=1)
-        stray = error > np.clip(STRAY_NOISES * bundle.noise_px(), *STRAY_PX)
-        bad = np.bincount(bundle.point, stray, count) > STRAY_SHARE * np.bincount(bundle.point, minlength=count)
-        self.points[adjusted.ids] = np.where(bad[:, None], np.nan, bundle.points)
+        outlier = error > np.clip(OUTLIER_NOISES * bundle.noise_px(), *OUTLIER_PX)
+        dropped = np.bincount(bundle.point, outlier, count) > OUTLIER_VIEW_SHARE * np.bincount(
+            bundle.point, minlength=count
+        )
+        self.points[adjusted.ids] = np.where(dropped[:, None], np.nan, bundle.points)
 
     def rescale(self, unit: float) -> None:
         """Make `unit` the unit of length of points and poses."""

@@ -21,16 +21,16 @@ PHASES = 4
 """Offsets of the first kink tried for each of these."""
 MOST_KNOTS = 128
 """Most knots of a spline (dense solver): longer paths get wider spacings."""
-STILL_TICKS = 8.0
-GAP_TICKS = 128.0
-"""Longest step between views on the time scale of the knots, while the camera stands still and otherwise."""
-BURST = 4.0
-"""Speed over that of the surrounding views above which an interval is a burst, with knots closer in time..."""
+STILL_TICKS, GAP_TICKS = 8.0, 128.0
+"""Longest step between views on the time scale of the knots, in frames, while the camera stands still and otherwise:
+the finest and the coarsest of `SPACINGS` (decision 7)."""
+BURST_SPEED_RATIO = 4.0
+"""Speed over that of the surrounding views above which an interval is a burst, with closer knots (decision 10)."""
 BURST_PX = 10.0
-"""... if the image moves by this much between two views."""
-AROUND = 6
+"""Image motion between two views that a burst needs."""
+SPEED_NEIGHBOURS = 6
 """Views on either side that give the usual speed."""
-RARELY = 0.5
+MIN_WARPED_SHARE = 0.5
 """Warped over original duration above which knots stay evenly spaced in frames."""
 NOISE_PX = 0.1
 """Approximate noise of the tracks behind the poses."""
@@ -38,8 +38,10 @@ FINE_PX = 0.03
 """RMS image residual that needs no finer spline."""
 WORST_PX = 0.12
 """The same for the worst view."""
-NO_WORSE = 1.5
+MAX_SCORE_RATIO = 1.5
 """Largest squared residual a degree of freedom of a coarser spline, over the smallest of all candidates."""
+MIN_FREEDOM_SHARE = 0.25
+"""Degrees of freedom that the residuals need, as a share of the views: finer splines follow the noise."""
 
 
 @dataclass(frozen=True)
@@ -78,23 +80,23 @@ def fit_coarsest_spline(
     for spacing, degree, phase in [(widest, 3, 0.0), *((s, 3, 0.0) for s in SPACINGS[1:]), *kinked]:
         begin = (span[0] - phase, span[1])
         knots = np.ceil((high - low + phase) / spacing) + degree + 1
-        left = len(times) - knots
-        if found and left < len(times) / 4:
+        degrees_of_freedom = len(times) - knots
+        if found and degrees_of_freedom < MIN_FREEDOM_SHARE * len(times):
             continue
         spline = Spline.fit(times, rotations, centres, spacing, degree, begin, time_warp)
         spline, squares = fit_weighted(spline, times, rotations, centres, hessians)
-        square, a_view = float(squares.sum()), max(observations / len(times), 1)
+        square, per_view = float(squares.sum()), max(observations / len(times), 1)
         one = _Candidate(
             spline,
             float(np.sqrt(square / max(observations, 1))),
             square / max(len(times) - len(spline.centres), 1),
-            float(np.sqrt(squares.max() / a_view)),
+            float(np.sqrt(squares.max() / per_view)),
         )
         found.append(one)
         if one.fine:
             break
     least = min(one.score for one in found)
-    good = [one for one in found if one.score <= NO_WORSE * least or one.fine]
+    good = [one for one in found if one.score <= MAX_SCORE_RATIO * least or one.fine]
     return min(good, key=lambda one: len(one.spline.centres)).spline
 
 
@@ -118,11 +120,11 @@ def motion_bursts(times: Array, motion_px: Array) -> MotionBursts:
     speed = motion_px / np.maximum(steps, 1e-9)
     factor = np.ones(len(steps))
     for k in np.flatnonzero(motion_px > BURST_PX):
-        around = np.concatenate([speed[max(0, k - AROUND) : k], speed[k + 1 : k + 1 + AROUND]])
+        around = np.concatenate([speed[max(0, k - SPEED_NEIGHBOURS) : k], speed[k + 1 : k + 1 + SPEED_NEIGHBOURS]])
         if len(around):
             factor[k] = speed[k] / max(float(np.median(around)), 1e-3)
-    quick = factor > BURST
-    return MotionBursts(times[:-1][quick], times[1:][quick], factor[quick])
+    burst = factor > BURST_SPEED_RATIO
+    return MotionBursts(times[:-1][burst], times[1:][burst], factor[burst])
 
 
 def knot_time_warp(times: Array, still: Array, fast: MotionBursts | None = None) -> KnotTimeWarp | None:
@@ -131,11 +133,11 @@ def knot_time_warp(times: Array, still: Array, fast: MotionBursts | None = None)
     Standstills and long gaps get no more knots than one ordinary view, bursts of speed get more. None: frames suffice.
     """
     steps = np.diff(times)
-    quick = np.ones(len(steps)) if fast is None else fast.at(0.5 * (times[1:] + times[:-1]))
-    short = np.minimum(steps * quick, np.where(still[1:] & (quick == 1), STILL_TICKS, GAP_TICKS))
-    if len(steps) == 0 or (short.sum() > RARELY * steps.sum() and quick.max() == 1):
+    factors = np.ones(len(steps)) if fast is None else fast.at(0.5 * (times[1:] + times[:-1]))
+    ticks = np.minimum(steps * factors, np.where(still[1:] & (factors == 1), STILL_TICKS, GAP_TICKS))
+    if len(steps) == 0 or (ticks.sum() > MIN_WARPED_SHARE * steps.sum() and factors.max() == 1):
         return None
-    return KnotTimeWarp(times, times[0] + np.concatenate([[0.0], np.cumsum(short)]))
+    return KnotTimeWarp(times, times[0] + np.concatenate([[0.0], np.cumsum(ticks)]))
 
 
 def fit_weighted(
@@ -146,19 +148,19 @@ def fit_weighted(
     knots = blend.shape[1]
     by_knot = np.einsum("va,vij,vb->aibj", blend, hessians, blend, optimize=True).reshape(knots * 6, knots * 6)
     diagonal = np.diag(by_knot).copy()
-    inertia = SmoothnessPrior.of(spline, blend, NOISE_PX)
-    by_knot += inertia.hessian().reshape(by_knot.shape)
+    smoothness = SmoothnessPrior.of(spline, blend, NOISE_PX)
+    by_knot += smoothness.hessian().reshape(by_knot.shape)
     by_knot[np.diag_indices(knots * 6)] += 1e-6 * diagonal + 1e-9 * diagonal.max()
     for _ in range(2):
-        left = _departure(spline, times, rotations, centres)
-        right = np.einsum("va,vij,vj->ai", blend, hessians, left, optimize=True)
-        right -= inertia.gradient(spline)
+        residuals = _residuals(spline, times, rotations, centres)
+        right = np.einsum("va,vij,vj->ai", blend, hessians, residuals, optimize=True)
+        right -= smoothness.gradient(spline)
         step = np.asarray(np.linalg.solve(by_knot, right.ravel())).reshape(knots, 6)
         spline = spline.move(step[:, :3], step[:, 3:])
-    left = _departure(spline, times, rotations, centres)
-    return spline, np.asarray(np.einsum("vi,vij,vj->v", left, hessians, left))
+    residuals = _residuals(spline, times, rotations, centres)
+    return spline, np.asarray(np.einsum("vi,vij,vj->v", residuals, hessians, residuals))
 
 
-def _departure(spline: Spline, times: Array, rotations: Array, centres: Array) -> Array:
-    turned, moved = spline.poses(times)
-    return np.concatenate([log_so3(rotations @ turned.swapaxes(1, 2)), centres - moved], 1)
+def _residuals(spline: Spline, times: Array, rotations: Array, centres: Array) -> Array:
+    on_spline, at = spline.poses(times)
+    return np.concatenate([log_so3(rotations @ on_spline.swapaxes(1, 2)), centres - at], 1)

@@ -34,10 +34,10 @@ class TrackingState:
         """Replace the reason without recording a change."""
         self.reason = reason
 
-    def assess(self, time: float, doubt: str | None) -> None:
-        """Set the state after a view with a pose: degraded for the reason `doubt`, or tracking."""
-        if doubt is not None:
-            self.set(time, State.DEGRADED, doubt)
+    def assess(self, time: float, degraded_reason: str | None) -> None:
+        """Set the state after a view with a pose: degraded for this reason, or tracking."""
+        if degraded_reason is not None:
+            self.set(time, State.DEGRADED, degraded_reason)
         elif self.state is not State.TRACK:
             self.set(time, State.TRACK, "enough points agree again")
 

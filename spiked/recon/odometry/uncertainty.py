@@ -10,7 +10,7 @@ from spiked.pose import Array, hat
 from spiked.recon.odometry.bundle_adjustment import Bundle
 from spiked.spline import Spline
 
-NULL = 1e-10
+GAUGE_EIGENVALUE_RATIO = 1e-10
 """Eigenvalues below this share of the largest belong to the gauge: position, orientation and scale of the world."""
 
 
@@ -23,7 +23,7 @@ def path_error(bundle: Bundle, spline: Spline, times: Array, scale_px: float) ->
     if radius == 0:
         return float("inf")
     value, vector = np.linalg.eigh(bundle.spline_information(spline, times, scale_px))
-    kept = value > NULL * value[-1]
+    kept = value > GAUGE_EIGENVALUE_RATIO * value[-1]
     root = vector[:, kept] / np.sqrt(value[kept])  # covariance = root root^T
     knots = len(spline.centres)
     by_view = spline.basis_matrix(times) @ root.reshape(knots, 6, -1)[:, 3:].transpose(1, 0, 2)  # [3, views, modes]

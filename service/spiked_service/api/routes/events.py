@@ -29,7 +29,7 @@ _STUCK = 1013
 
 
 @dataclass(frozen=True)
-class _Wish:
+class _EventQuery:
     topics: frozenset[Topic]
     since: int | None
 
@@ -41,7 +41,7 @@ def event_routes(bus: Bus, concurrency: ConcurrencyLimit) -> APIRouter:
     @router.websocket("/events")
     async def follow(websocket: WebSocket) -> None:
         try:
-            wish = _wish(websocket.query_params)
+            wanted = _parse_query(websocket.query_params)
             concurrency.acquire()
         except ConfigurationError as error:
             await websocket.send_denial_response(problem(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)))
@@ -50,15 +50,15 @@ def event_routes(bus: Bus, concurrency: ConcurrencyLimit) -> APIRouter:
             await websocket.send_denial_response(problem(HTTPStatus.SERVICE_UNAVAILABLE, str(error)))
             return
         try:
-            await _serve(websocket, _subscribe(bus, wish))
+            await _serve(websocket, _subscribe(bus, wanted))
         finally:
             concurrency.release()
 
     @router.get("/events", include_in_schema=False)
     async def stream(request: Request) -> Response:
-        wish = _wish({"since": request.headers.get("last-event-id", ""), **request.query_params})
+        wanted = _parse_query({"since": request.headers.get("last-event-id", ""), **request.query_params})
         concurrency.acquire()
-        subscription = _subscribe(bus, wish)
+        subscription = _subscribe(bus, wanted)
 
         def over() -> None:
             subscription.close()
@@ -70,7 +70,7 @@ def event_routes(bus: Bus, concurrency: ConcurrencyLimit) -> APIRouter:
     return router
 
 
-def _wish(query: Mapping[str, str]) -> _Wish:
+def _parse_query(query: Mapping[str, str]) -> _EventQuery:
     """Parse `topics=pose,scene` (default: all) and `since=SEQ` (default: from now on). Raises ConfigurationError."""
     known = ", ".join(sorted(PUBLISHED))
     topics = set()
@@ -82,11 +82,11 @@ def _wish(query: Mapping[str, str]) -> _Wish:
     since = query.get("since", "")
     if since and not (since.isascii() and since.isdigit() and len(since) < 19):
         raise ConfigurationError(f"since is the number of the last message received, not {since[:40]!r}")
-    return _Wish(frozenset(topics) or PUBLISHED, int(since) if since else None)
+    return _EventQuery(frozenset(topics) or PUBLISHED, int(since) if since else None)
 
 
-def _subscribe(bus: Bus, wish: _Wish) -> Subscription:
-    return bus.subscribe(wish.topics, CAPACITY, _PREVIEWS, wish.since)
+def _subscribe(bus: Bus, wanted: _EventQuery) -> Subscription:
+    return bus.subscribe(wanted.topics, CAPACITY, _PREVIEWS, wanted.since)
 
 
 async def _serve(websocket: WebSocket, subscription: Subscription) -> None:

@@ -30,14 +30,14 @@ class HealthOut(BaseModel):
 def health_routes(health: Health) -> APIRouter:
     """`/healthz` and `/readyz`, which need no token."""
     router = APIRouter(tags=["operations"])
-    unwell: dict[int | str, dict[str, Any]] = {503: {"model": HealthOut, "description": "A check has failed."}}
+    failing: dict[int | str, dict[str, Any]] = {503: {"model": HealthOut, "description": "A check has failed."}}
 
-    @router.get("/healthz", responses=unwell)
+    @router.get("/healthz", responses=failing)
     def get_health(response: Response) -> HealthOut:
         """Liveness: if a check fails, the service must be restarted."""
         return _health(health.life(), response)
 
-    @router.get("/readyz", responses=unwell)
+    @router.get("/readyz", responses=failing)
     def get_readiness(response: Response) -> HealthOut:
         """Readiness: whether captures can be started."""
         return _health(health.readiness(), response)

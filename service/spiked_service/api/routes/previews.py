@@ -65,13 +65,13 @@ def preview_routes(
         accept: Annotated[str, Header(include_in_schema=False)] = "",
     ) -> Response:
         """An image of the newest frames, of the frames around a recorded one, or of the scene from its pose."""
-        wished = image_format(format, accept)
+        requested = image_format(format, accept)
         if kind is PictureKind.RENDER:
             result = results.of(results.newest(capture_id))
-            return views_response(result, _view_at(result, frame, white, gain), wished, views)
+            return views_response(result, _view_at(result, frame, white, gain), requested, views)
         if frame is None and captures.get(capture_id).row.state.acquiring:
             return _live_preview(captures, capture_id, PreviewKind(kind))
-        return _recorded_preview(_frame_window(captures, folder, capture_id, frame), kind, white, gain, wished)
+        return _recorded_preview(_frame_window(captures, folder, capture_id, frame), kind, white, gain, requested)
 
     @router.get("/thumbnail", responses=_THUMBNAIL, response_class=Response)
     def get_thumbnail(capture_id: str, request: Request) -> Response:
@@ -111,13 +111,13 @@ def _live_preview(captures: Captures, capture_id: str, kind: PreviewKind) -> Res
 
 
 def _recorded_preview(
-    window: FrameWindow, kind: PictureKind, white: float | None, gain: float, wished: ImageFormat
+    window: FrameWindow, kind: PictureKind, white: float | None, gain: float, requested: ImageFormat
 ) -> Response:
     """An image of recorded frames."""
     shown = picture(window, kind, white)
     limit = shown.white / gain
     return Response(
-        encode(shown.image, wished, limit), media_type=wished.media_type, headers=_headers(limit, shown.frame)
+        encode(shown.image, requested, limit), media_type=requested.media_type, headers=_headers(limit, shown.frame)
     )
 
 

@@ -118,7 +118,7 @@ class ViewRequest(In):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if sum(wish is not None for wish in (self.camera, self.cameras, self.path)) != 1:
+        if sum(one is not None for one in (self.camera, self.cameras, self.path)) != 1:
             raise ValueError("give one of camera, cameras and path")
         if (self.width is None) != (self.height is None):
             raise ValueError("give width and height together")

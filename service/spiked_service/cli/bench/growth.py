@@ -28,11 +28,11 @@ print(next(line.split()[1] for line in open("/proc/self/status") if line.startsw
 def rows() -> list[Measurement]:
     """A row for each size, and one for each exponent; bytes a splat."""
     found = []
-    for law in [*renderer.scaling(), _frames()]:
-        for size, seconds in zip(law.sizes, law.seconds, strict=True):
-            threads = int(size) if law.name == "threads" else 1
-            found.append(Measurement(f"{law.name}: {size:,.0f}", seconds * 1e3, "ms", threads=threads))
-        found.append(Measurement(f"{law.name}: exponent", law.exponent, ""))
+    for scaling in [*renderer.scaling(), _frames()]:
+        for size, seconds in zip(scaling.sizes, scaling.seconds, strict=True):
+            threads = int(size) if scaling.name == "threads" else 1
+            found.append(Measurement(f"{scaling.name}: {size:,.0f}", seconds * 1e3, "ms", threads=threads))
+        found.append(Measurement(f"{scaling.name}: exponent", scaling.exponent, ""))
     small, large = 20_000, 200_000
     found.append(
         Measurement("memory of a step, a splat", (peak_bytes(large) - peak_bytes(small)) / (large - small), "bytes")

@@ -115,7 +115,7 @@ def convert(
 
 def read_content(path: Path, form: Form | None, given: RecordingGeometry) -> Content:
     """Open any form. Raises RecordingError or ConfigurationError."""
-    form = form or _sniff(path)
+    form = form or _detect_form(path)
     match form:
         case Form.USB:
             return _wire_content(path, UsbFraming, _wire_sensor(given, USB_WIDTH, USB_HEIGHT))
@@ -148,7 +148,7 @@ def write_content(content: Content, out: Path, to: Form) -> tuple[int, int]:
     return count, lost
 
 
-def _sniff(path: Path) -> Form | None:
+def _detect_form(path: Path) -> Form | None:
     """The wire format of a file of raw camera bytes; None for a recording."""
     if sidecar_path(path).exists() or not path.is_file():
         return None
@@ -215,14 +215,14 @@ def _parsed(
 def _recorded(recording: Recording) -> Iterator[Item]:
     stored = lost = 0
     for gap in sorted(recording.gaps, key=lambda gap: gap.first):
-        yield from _stretch(recording, stored, gap.first - lost)
+        yield from _frames_between(recording, stored, gap.first - lost)
         stored = min(gap.first - lost, recording.frames)
         lost += gap.count
         yield gap
-    yield from _stretch(recording, stored, recording.frames)
+    yield from _frames_between(recording, stored, recording.frames)
 
 
-def _stretch(recording: Recording, first: int, stop: int) -> Iterator[Item]:
+def _frames_between(recording: Recording, first: int, stop: int) -> Iterator[Item]:
     stop = min(stop, recording.frames)
     for start in range(first, stop, _CHUNK_FRAMES):
         yield recording.compact(start, min(_CHUNK_FRAMES, stop - start))

@@ -151,8 +151,8 @@ def _report(reconstructor: Reconstructor, out: Path) -> None:
     for warning in reconstructor.warnings:
         report_warning(warning)
     status, failure = reconstructor.status(), reconstructor.failure
-    doubt = "" if status.state is State.TRACK else f": {status.reason}"
-    outcome = f"{status.splats} splats, {status.state}{doubt}" if failure is None else "failed"
+    reason = "" if status.state is State.TRACK else f": {status.reason}"
+    outcome = f"{status.splats} splats, {status.state}{reason}" if failure is None else "failed"
     poses = len(reconstructor.trajectory())
     output.print(f"{out}: {poses} poses for {status.frames} frames, {outcome}", markup=False)
     if failure is not None:

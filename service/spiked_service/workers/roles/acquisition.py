@@ -86,6 +86,6 @@ def _slots(sensor: Sensor, history_s: float, backlog_s: float, can_block: bool) 
     wanted = math.ceil(history_s * slots_a_second / _HISTORY_SHARE)
     if not can_block:
         # The backlog is optional, so it leaves memory for other captures.
-        room = min(MOST_BACKLOG_BYTES, shutil.disk_usage(FOLDER).free // 2)
-        wanted = max(wanted, min(math.ceil(backlog_s * slots_a_second), room // slot_bytes))
+        largest = min(MOST_BACKLOG_BYTES, shutil.disk_usage(FOLDER).free // 2)
+        wanted = max(wanted, min(math.ceil(backlog_s * slots_a_second), largest // slot_bytes))
     return wanted if wanted > DEFAULT_BYTES // slot_bytes else None

@@ -13,7 +13,7 @@ from spiked.errors import SceneError
 from spiked.pose import quaternion
 from spiked.poses import PoseFile
 from spiked.recon import Reconstructor, State, Status, Tracked
-from spiked.recon.frontend.windowing import MARGIN
+from spiked.recon.frontend.windowing import SEARCH_FRAMES
 from spiked.recording import open_recording
 from spiked.ring import End, Frames, Gap, Policy, RingReader
 from spiked.scene import Scene
@@ -181,7 +181,7 @@ def _track_latest(latest: LatestFrames, work: _Work, command: ReconstructionComm
                 frames = frames[max(0, zero - begin) :]
                 begin = max(begin, zero)
                 end = _within(begin, begin + len(frames), zero, stop)[1]
-                if end - begin > MARGIN:
+                if end - begin > SEARCH_FRAMES:
                     work.track_latest(begin - zero, frames[: end - begin], newest)
                 unmapped += 1
                 if newest() + zero - end < _PUNCTUAL_S * rate_hz or unmapped >= _MOST_UNMAPPED:

@@ -117,7 +117,7 @@ class RecordingBuffer:
         return max(0.0, self._due_s - time.monotonic()) if self._waiting else _WAIT_S
 
     @property
-    def has_room(self) -> bool:
+    def has_space(self) -> bool:
         return self._waiting + len(self._buffer) // _BATCH_BLOCKS <= len(self._buffer)
 
     def take(self, item: Frames, stop: int | None) -> None:
@@ -222,7 +222,7 @@ def _record(reader: RingReader, buffer: RecordingBuffer, stop: int | None, stopp
         match item:
             case Frames():
                 buffer.take(item, stop)
-                if not buffer.has_room:
+                if not buffer.has_space:
                     buffer.write()
             case Gap():
                 # An overrun of this reader means that the disk was too slow.

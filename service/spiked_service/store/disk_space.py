@@ -13,21 +13,19 @@ from spiked_service.store.rows import Plan
 
 _LEAST_BYTES = 64 << 20
 """Space reserved for an unlimited capture; less on a small disk."""
-_FOR_CAPTURES_BYTES = 256 << 20
+_CAPTURES_RESERVE_BYTES = 256 << 20
 """Space that uploads leave for captures; less on a small disk."""
-
-
 _INDEX_BYTES = 4
 """Index size per frame: an entry of 32 bytes covers at least 8 frames."""
-_BESIDE_BYTES = 1 << 20
+_SIDECAR_BYTES = 1 << 20
 """Sidecar with its reserve, logs and thumbnail."""
 
 
-class NoRoomError(StoreError):
+class DiskFullError(StoreError):
     """A capture or upload exceeds the free space that is not reserved."""
 
 
-class Room:
+class DiskSpace:
     """Reserves no more than the free space. A reservation shrinks as its file grows. Thread-safe.
 
     Recorders stop at `Durability.reserve_bytes` of free space, which is never reserved.
@@ -51,13 +49,13 @@ class Room:
         return min(_LEAST_BYTES, self._folder.space().total_bytes // 32)
 
     def reserve_recording(self, path: Path, size: int | None) -> None:
-        """Reserve `size` bytes for a recording; None: unlimited. Raises NoRoomError."""
+        """Reserve `size` bytes for a recording; None: unlimited. Raises DiskFullError."""
         needed = self.least_bytes if size is None else size
         with self._lock:
             free = self.storable_bytes - self._reserved()
             if needed > free:
                 whose = "an unlimited capture needs" if size is None else "this capture needs"
-                raise NoRoomError(
+                raise DiskFullError(
                     f"{whose} {readable_bytes(needed)}, and {readable_bytes(max(0, free))} are free for captures at "
                     f"{self._folder.path}{self._others()}: free disk space, or capture less"
                 )
@@ -70,12 +68,15 @@ class Room:
 
     @contextmanager
     def for_upload(self, size: int) -> Iterator[None]:
-        """Check the space for an upload; no other reservation is made until the context exits. Raises NoRoomError."""
+        """Check the space for an upload; no other reservation is made until the context exits.
+
+        Raises DiskFullError.
+        """
         with self._lock:
-            left = min(_FOR_CAPTURES_BYTES, self._folder.space().total_bytes // 10)
+            left = min(_CAPTURES_RESERVE_BYTES, self._folder.space().total_bytes // 10)
             free = self.storable_bytes - left - self._reserved()
             if size > free:
-                raise NoRoomError(
+                raise DiskFullError(
                     f"{size} bytes do not fit: the disk of {self._folder.path} has {max(0, free)} bytes free for "
                     f"uploads{self._others()}: free disk space, or send it later"
                 )
@@ -102,7 +103,7 @@ def recording_bytes(plan: Plan, sensor: Sensor, frames: int | None) -> int | Non
     if not ends:
         return None
     count = min(ends) + round(plan.pretrigger_s * sensor.frame_rate_hz)
-    return count * (sensor.compact().frame_bytes + _INDEX_BYTES) + _BESIDE_BYTES
+    return count * (sensor.compact().frame_bytes + _INDEX_BYTES) + _SIDECAR_BYTES
 
 
 def readable_bytes(size: int) -> str:

@@ -43,6 +43,7 @@ MATCH_FRAMES = 0.6
 """A pose belongs to a frame if their times lie less than this many frames apart."""
 
 _UNIT_POSES = 24
+"""Poses, evenly spaced, of the ATE for paths of norm 1."""
 MIN_SCORED_FRAMES = 48
 """Least number of frames with a pose: 1.5 times `RPE_FRAMES`, so that relative errors have at least 16 pairs."""
 

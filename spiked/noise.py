@@ -17,6 +17,7 @@ LENGTHS = (4, 8, 16, 32, 64)
 MARGIN = 32
 """Frames on both sides of a window that are searched for the spikes nearest to its edges."""
 LEAST_WINDOWS = 4
+"""Fewest windows of one length for its variance."""
 LEAST_SPIKES = 8
 """Fewest intervals of a pixel for an estimate of its spread."""
 

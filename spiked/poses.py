@@ -31,6 +31,7 @@ _HEADER = (_MAGIC + struct.pack("<4I", _VERSION, _HEADER_BYTES, _RECORD.itemsize
     _HEADER_BYTES, b"\0"
 )
 _CHUNK = 65_536
+"""Records read or written at a time."""
 _TIME_DECIMALS = 9
 """Times are kept to the nanosecond, as in the text formats: a time that was read selects the same pose again."""
 

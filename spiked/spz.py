@@ -29,10 +29,13 @@ Bytes = NDArray[np.uint8]
 _MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")  # magic, version, number of points, degree of SH, fractional bits, flags, reserved
 _COLOUR_SCALE = 0.15
+"""Scale of the constant colour coefficient in a byte, of the SPZ format."""
 _LARGEST = (1 << 23) - 1
 """Positions are signed 24-bit fixed-point numbers."""
 _FINEST_BITS = 22
+"""Most bits after the point."""
 _MAGNITUDES = (1 << 9) - 1
+"""Largest number of 9 bits: a component of a quaternion in version 3."""
 _SQRT_HALF = np.float32(np.sqrt(0.5))
 _TO_RUB = np.array([1, -1, -1], np.float32)
 _SH_COEFFICIENTS = (0, 3, 8, 15, 24)

@@ -13,7 +13,9 @@ from spiked_driver.faults import Faults, Loss, Stall
 MOST_FRAMES = 10**12
 """Upper bound of frame indices and counts: a year and a half at 20 kHz."""
 _MOST_FAULTS = 1000
+"""Most faults of a kind in one source."""
 _MOST_STALL_S = 3600.0
+"""Longest stall, seconds."""
 _SPAN = re.compile(r"(\d{1,12}(?:\.\d{1,9})?)(s|ms)?")
 _Frame = Annotated[int, Field(ge=0, le=MOST_FRAMES)]
 

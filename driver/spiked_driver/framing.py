@@ -14,11 +14,13 @@ from spiked.ring import Gap, LossCause
 from spiked_driver.source import Chunk
 
 USB_WIDTH, USB_HEIGHT = 400, 250
+"""Pixels in a row, and rows."""
 USB_FRAME_BYTES = 13_016
 """A frame on the wire: 16 bytes of header and 250 rows of 52 bytes."""
 USB_COMPACT_BYTES = 12_500
 """A frame's pixels: 250 rows of 50 bytes."""
 _MAGIC, _WORD1 = 0x63606300, 0x00100021
+"""First two words of a header."""
 
 
 @dataclass(frozen=True)

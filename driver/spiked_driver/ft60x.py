@@ -11,6 +11,7 @@ from enum import IntEnum
 from spiked.errors import SourceError
 
 VENDOR_ID = 0x0403
+"""USB vendor id of FTDI."""
 PRODUCTS = {0x601E: "FT600", 0x601F: "FT601"}
 """Chip by USB product id; the SPS10-002 camera has an FT601."""
 
@@ -27,10 +28,12 @@ DATA_IN = 0x82
 REQUEST_TYPE, REQUEST_CONFIGURATION, REQUEST_VALUE, REQUEST_INDEX = 0xC0, 0xCF, 1, 0
 """Vendor request (device to host) that reads the chip's configuration."""
 CONFIGURATION_BYTES = 152
+"""Length of the configuration."""
 
 _READ_REQUEST = struct.Struct("<IBBHIII")
 READ_REQUEST_BYTES = _READ_REQUEST.size
 _COMMAND_READ = 1
+"""Command byte of a read request."""
 _CONFIGURATION = struct.Struct("<HH128sBBHBBBBHBBII")
 
 

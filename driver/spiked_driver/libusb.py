@@ -24,6 +24,7 @@ _NO_MEMORY = -11
 _BULK = 2
 """LIBUSB_TRANSFER_TYPE_BULK."""
 _ATTEMPTS = 5
+"""Attempts to make a libusb context."""
 _RETRY_S = 0.02
 """Pause after the first failed attempt, seconds; it grows by as much with each."""
 

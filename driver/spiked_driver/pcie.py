@@ -18,6 +18,7 @@ from spiked_driver.source import READ_WAIT_S, Chunk, former_source_names
 from spiked_driver.source_kind import CameraOptions, Device, SourceKind, SourceSpec, Warn, path_of
 
 PCIE_SIZE = 1000
+"""Pixels in a row, and rows."""
 PCIE_FRAME_BYTES = 128_000
 """A frame in the stream: 2000 half-lines of 64 bytes."""
 PCIE_COMPACT_BYTES = 125_000

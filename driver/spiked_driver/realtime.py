@@ -8,7 +8,9 @@ from pathlib import Path
 PRIORITY = 20
 """SCHED_FIFO priority, 1 to 99: above all ordinary processes, below the kernel's interrupt threads (50)."""
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
+"""Numbers of linux/capability.h."""
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
+"""Flags of mlockall, sys/mman.h."""
 
 
 def take_priority() -> list[str]:

@@ -46,6 +46,7 @@ _BY_NUMBER = {
     errno.ENODEV: TransferError.GONE,
 }
 _REQUEST_TIMEOUT_MS = 100
+"""Time for a request of 20 bytes to be sent, ms."""
 
 
 @dataclass(frozen=True)

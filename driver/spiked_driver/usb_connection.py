@@ -42,6 +42,7 @@ _FRAMELESS_S = 1.0
 _NEVER_A_FRAME_S = 5.0
 """Seconds of bytes without a frame after which a capture fails that never had one."""
 _MAX_DOUBLINGS = 8
+"""Bounds the shift; `_MAX_SILENCE_FACTOR` is reached before."""
 _REARM_AFTER = (None, TransferError.STALLED, TransferError.BABBLE)
 """Errors (None: silence) after which the open session is tried once more before it is closed."""
 _OTHER_DEVICES = f"Not every {VENDOR_ID:04x}:601f is one: see `spiked devices`"

@@ -26,6 +26,7 @@ from spiked_driver.usb_cameras import NotUsableError, UsbCamera
 
 _log = logging.getLogger(__name__)
 _CONTROL_TIMEOUT_MS = 500
+"""Time for the answer to a control request, ms."""
 
 
 class NotThereError(SourceError):

@@ -39,8 +39,11 @@ from spiked.client.models import (
 from spiked.errors import SpikedError
 
 _CHUNK_BYTES = 8 << 20
+"""Bytes of an upload in one request."""
 _HASH_BYTES = 1 << 20
+"""Bytes read at a time."""
 _POLL_S = 0.2
+"""Interval at which the state of a job is polled, seconds."""
 _T = TypeVar("_T")
 _OVER = (JobState.complete, JobState.cancelled, JobState.failed)
 

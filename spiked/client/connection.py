@@ -14,7 +14,9 @@ from spiked.errors import SpikedError
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _TRIES = 4
+"""Attempts of a request in all, ..."""
 _PAUSE_S = 0.25
+"""... and the pause after the first, seconds; it doubles with each."""
 _AGAIN = frozenset({429, 503})
 
 

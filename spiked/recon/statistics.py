@@ -6,6 +6,8 @@ from spiked.pose import Array
 
 RAYLEIGH_MEDIAN = 1.1774
 """sqrt(2 ln 2): median length of a two-dimensional error over its standard deviation in one direction."""
+WHITE_PERCENTILE = 99.5
+"""Percentile of an image's rates that is shown as white: a few pixels are lamps, reflections or hot."""
 
 
 def median(values: Array) -> float:

@@ -37,6 +37,7 @@ _MAGIC = b"spkring2"
 _WORDS = slice(8, 32)
 _CONTROL_OFFSET = mmap.PAGESIZE
 _ENTRIES_A_SLOT = 4
+"""Entries of the log (gaps, clock pairs, end) for each slot."""
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from spiked.trajectory import Trajectory, tum_lines
 Array = NDArray[np.float64]
 
 _CHUNK = 64
+"""Frames written at a time."""
 _POSES = 16_384
 """Poses of the ground truth in memory at a time."""
 

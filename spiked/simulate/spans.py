@@ -15,6 +15,7 @@ from spiked.simulate.view import LUMINANCE, View, ViewableScene
 Array = NDArray[np.float64]
 
 _GROUP = 8
+"""Frames of the longest span in `grouped_spans`."""
 _GROUP_STEP_PX = 0.6
 """Largest image motion between the pictures of a span in `grouped_spans`; halfway, a detail of four pixels from crest
 to crest loses 11 % of its contrast."""

@@ -14,6 +14,7 @@ from fastapi.responses import StreamingResponse
 from spiked_service.api.problems import NotReadyError, problem
 
 _CHUNK_BYTES = 1 << 20
+"""Bytes read and sent at a time."""
 _RANGE = re.compile(r"bytes=([0-9]*)-([0-9]*)")
 _FAR = 10**18
 """Larger than any file; longer numbers are not parsed."""

@@ -38,6 +38,7 @@ _PIECE = 4096
 _KEPT = 16
 """Pieces cached for all columns of JSON: with a large step every pose is on another page of the file."""
 _DECIMALS = 9
+"""Decimals of positions and quaternions in JSON."""
 _CONVERTING = threading.Lock()
 
 

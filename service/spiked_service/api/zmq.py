@@ -22,10 +22,13 @@ _LOOPBACK = "127.0.0.1"
 QUEUE_MESSAGES = 10_000
 """High-water mark, messages."""
 QUEUE_PICTURES = 2
+"""High-water mark of the sockets of pictures and of state, messages."""
 REQUEST_BYTES = 65_536
 """Largest request; the sender of a larger one is disconnected."""
 _ANSWER_MESSAGES = 4096
+"""Most past messages in an answer."""
 _LOOK_MS = 200
+"""Interval at which the threads check that the service ends, ms."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,9 @@ from spiked_service.store.folder import DataFolder
 from spiked_service.store.retention import Policy, Retention
 
 _CLEAN_S = 60.0
+"""Interval at which retention is applied, seconds."""
 _SCARCE_BYTES = 1 << 30
+"""Free space below which a warning is given; a tenth of a small disk."""
 
 
 class DataStore:

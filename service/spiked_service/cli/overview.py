@@ -15,8 +15,11 @@ from spiked.recon import Reconstructor, Sample
 from spiked.trajectory import Trajectory
 
 _SAMPLES = 4
+"""Views shown."""
 _WIDTH_IN = 14.0
+"""Width of the figure, inches."""
 _PATHS_IN = 4.3
+"""Height of the plots of the path, inches."""
 _INK = "#1d2330"
 _PATH = "viridis"
 _LINE = 120

@@ -17,8 +17,11 @@ from spiked_service.results.image_encoding import ImageFormat, encode
 
 _FILES = Path(__file__).with_name("watching")
 _PICTURE_S = 1.0
+"""Least time between two pictures, seconds."""
 _PATH_POINTS = 400
+"""Most points of the path that is drawn."""
 _CURVE_POINTS = 300
+"""Points of the loss that are kept at least."""
 
 
 class Watch:

@@ -34,6 +34,7 @@ _WIRE_S = USB_FRAME_BYTES * RATE_HZ
 _BUS_S = 400e6
 """What is left of 5 Gbit/s after encoding and protocol, about."""
 _MINUTES = 5
+"""Length of the recording that the disk should hold, minutes."""
 PROBE_BYTES = 128 << 20
 """Written to measure the speed of the disk."""
 _PIECE = bytes(range(256)) * (4 << 10)

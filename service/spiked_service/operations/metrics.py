@@ -22,7 +22,9 @@ from spiked_service.events.payloads import PosePayload
 from spiked_service.store.rows import Counters
 
 _POSE_S = (0.002, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+"""Bucket bounds of the latency of poses, seconds."""
 _REQUEST_S = (0.002, 0.005, 0.01, 0.015, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0)
+"""Bucket bounds of the time of requests, seconds."""
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,17 @@ from spiked_service.results.image_encoding import display_white
 _MOMENT_FRAMES = 32
 """Frames of an `interval` image: 1.5 % noise of the spike-aligned rate; motion is blurred over them."""
 _COUNTED_FRAMES = 64
+"""Frames of a `rate` image and of the statistics."""
 _ACCUMULATED_FRAMES = 1024
+"""Frames of an `accumulation` image."""
 _EDGE_FRAMES = 64
 """Frames on either side of a window that are searched for the spikes that bound it."""
 _BINS = 64
+"""Bins of the histogram of rates, 0 to 1 spike a frame."""
 _HOT_RATE = 0.3
 """Excess rate of a hot pixel over the median of its 5x5 neighbours, spikes per frame."""
 _HOT_MOST = 64
+"""Hot pixels listed, the worst first."""
 
 
 class FrameNotRecordedError(RecordingError):

@@ -9,6 +9,7 @@ from spiked.recon import Reconstructor, Status
 from spiked.recording import Recording
 
 CHUNK_FRAMES = 64
+"""Frames fed at a time."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import CaptureRow, CaptureState, JobState, ReconstructionRow, UploadRow, VersionRow
 
 _WAIT_S = 5.0
+"""Longest wait for another process that writes the catalogue, seconds."""
 _CopyOf = Callable[[str], Path]
 _DAMAGED = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 

@@ -11,6 +11,7 @@ from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import CaptureRow
 
 _UPLOAD_DAYS = 1.0
+"""Uploads without progress for this time are removed."""
 
 
 @dataclass(frozen=True)

@@ -135,6 +135,8 @@ static void gather(const ChargeJob& job, const ChargeRow& row, int64_t x0, int c
 // Residuals of the intervals, and the slope of the loss by the light of each frame.
 static void residual(const ChargeJob& job, const ChargeRow& row, int64_t x0, ChargeWork& work, ChargeSums& sums) {
     constexpr float kEdgeWeight = 6.0f;  // 1 / variance of the charge before the first and after the last spike
+    // Counts are accurate to half a spike, the map to some percent; limits chosen by hand.
+    constexpr float kAgreeSpikes = 1.2f, kAgreeShare = 0.2f;
     const float floor2 = job.floor * job.floor, jitter2 = job.jitter * job.jitter;
     float charge[kPixels] = {}, spikes[kPixels] = {}, residual[kPixels] = {}, squares[kPixels] = {};
     float first[kPixels] = {}, last[kPixels] = {}, charge_first[kPixels] = {}, charge_last[kPixels] = {};
@@ -181,9 +183,8 @@ static void residual(const ChargeJob& job, const ChargeRow& row, int64_t x0, Cha
         sums.pixels += enough;
         sums.chi2 += enough & more ? squares[i] / variance : 0;
         sums.intervals += enough & more ? spikes[i] - 1 : 0;
-        // Counts are accurate to half a spike, the map to some percent.
         const float off = charge[i] - spikes[i] > 0 ? charge[i] - spikes[i] : spikes[i] - charge[i];
-        const bool agrees = enough & (off < 1.2f + 0.2f * (charge[i] + spikes[i]));
+        const bool agrees = enough & (off < kAgreeSpikes + kAgreeShare * (charge[i] + spikes[i]));
         sums.expected += agrees ? charge[i] : 0;
         sums.counted += agrees ? spikes[i] : 0;
     }

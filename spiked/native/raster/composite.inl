@@ -7,7 +7,8 @@ namespace {
 constexpr int kParts = 16 / kLanes;
 static_assert(kParts <= kMaxParts, "TileState::ends has room for every part");
 
-constexpr float kLog2Cap = -0.014499570f;  // log2(0.99)
+constexpr float kAlphaCap = 0.99f;         // largest opacity of a splat at a pixel, as in 3D Gaussian splatting
+constexpr float kLog2Cap = -0.014499570f;  // log2(kAlphaCap)
 
 // The same numbers for every tile: offsets of the pixel centres, in tile order.
 struct Centres {
@@ -146,7 +147,7 @@ static void forward_tile(const Tile& tile, const float background[3], const Plan
         for (int j = 0; j < pixels; ++j) transmittance[i + j] = 1.0f;
     });
     const uint32_t weighted = Moving ? weighted_blocks(weight) : 0xffff;
-    const Vec cut = broadcast(-kLog2Cut), cap = broadcast(0.99f), stop = broadcast(kStopTransmittance);
+    const Vec cut = broadcast(-kLog2Cut), cap = broadcast(kAlphaCap), stop = broadcast(kStopTransmittance);
     for (int block = 0; block < kBlocks; ++block) {
         const int listed = weighted >> block & 1 ? list_block(tile, block) : 0;
         for (int part = 0; part < kParts; ++part) {
@@ -260,7 +261,7 @@ struct Pixels {
 template <int C, bool Moving, bool Capped>
 static inline void backward_entry(const float* s, uint32_t blocks, int index, const int32_t* ends,
                                   Pixels<C, Moving>& pixels, float* slot) {
-    const Vec cut = broadcast(-kLog2Cut), cap = broadcast(0.99f);
+    const Vec cut = broadcast(-kLog2Cut), cap = broadcast(kAlphaCap);
     alignas(64) float us[kTilePixels], ws[kTilePixels], alphas[kTilePixels];
     int32_t places[kBlocks * kParts];
     int count = 0;

@@ -42,6 +42,8 @@ Intervals<T> intervals_of(const Offsets<T>& spikes, const Offsets<T>& start, con
 
 constexpr uint8_t kByte = 0xFF;  // the largest number of a byte; all of them are "never"
 constexpr uint16_t kWord = 0xFFFF;
+// Relative error of the scale of a charge, which does not fall with the number of spikes.
+constexpr float kChargeError = 0.01f;
 inline float bound(bool seen, float per_frame) { return (seen ? 2.0f : 1.0f) * per_frame; }
 
 template <class T>
@@ -56,7 +58,9 @@ template <class T>
 inline void deviation_pixels(Intervals<T> e, T never, float per_frame, float jitter, float* __restrict out) {
     for (int64_t i = 0; i < e.count; ++i) {
         const float m = e.spikes[i], per_time = 1 / std::max(static_cast<float>(e.stop[i] - e.start[i]), 1.0f);
-        const float p = m * per_time, charge = p * p / 6 + jitter * m + (0.01f * m) * (0.01f * m);
+        const float p = m * per_time;
+        // Both spikes are known to the frame: twice the variance 1/12 of a uniform distribution.
+        const float charge = p * p / 6 + jitter * m + (kChargeError * m) * (kChargeError * m);
         out[i] = m > 0 ? std::sqrt(charge) * per_time : bound(e.start[i] != never, per_frame);
     }
 }

@@ -5,10 +5,14 @@
 namespace spiked {
 namespace {
 
-constexpr size_t stride = UsbParser::row_bytes + 2;
+constexpr size_t stride = UsbParser::row_bytes + UsbParser::tag_bytes;
+// Bytes from the begin of a header to its words: a constant of the session, bytes and lines so far.
+constexpr size_t word1_at = 4, bytes_at = 8, lines_at = 12;
 
 bool has_magic(const uint8_t* p) { return load32(p) == UsbParser::magic; }
-uint32_t session_offset(const uint8_t* header) { return load32(header + 8) - 50 * load32(header + 12); }
+uint32_t session_offset(const uint8_t* header) {
+    return load32(header + bytes_at) - static_cast<uint32_t>(UsbParser::row_bytes) * load32(header + lines_at);
+}
 
 // Whether the complete rows among `bytes` bytes from the header on have the numbers 0, 1, 2, ...
 bool rows_run(const uint8_t* header, size_t bytes) {
@@ -139,8 +143,8 @@ UsbParser::Step UsbParser::synchronise(const uint8_t* p, size_t available) {
         return Step::frame;
     }
     const uint8_t* following = p + frame_bytes;
-    const auto step = frames_between(load32(p + 12), load32(following + 12));
-    const bool confirmed = has_magic(following) && load32(p + 4) == load32(following + 4) &&
+    const auto step = frames_between(load32(p + lines_at), load32(following + lines_at));
+    const bool confirmed = has_magic(following) && load32(p + word1_at) == load32(following + word1_at) &&
                            session_offset(p) == session_offset(following) && step && *step > 0;
     if (!confirmed) return skip_damage(p, available);
     const bool again = lock_.has_value();
@@ -191,12 +195,12 @@ UsbParser::Step UsbParser::skip_damage(const uint8_t* p, size_t available) {
 }
 
 std::optional<int64_t> UsbParser::frames_ahead(const uint8_t* header) const {
-    if (load32(header + 4) != lock_->word1 || session_offset(header) != lock_->offset) return std::nullopt;
-    return frames_between(lock_->expected, load32(header + 12));
+    if (load32(header + word1_at) != lock_->word1 || session_offset(header) != lock_->offset) return std::nullopt;
+    return frames_between(lock_->expected, load32(header + lines_at));
 }
 
 void UsbParser::lock_on(const uint8_t* header) {
-    lock_ = Lock{load32(header + 4), session_offset(header), load32(header + 12)};
+    lock_ = Lock{load32(header + word1_at), session_offset(header), load32(header + lines_at)};
 }
 
 Event UsbParser::report_gap(int64_t count, Kind kind) {

@@ -9,8 +9,8 @@ namespace spiked {
 
 class UsbParser {
   public:
-    static constexpr size_t rows = 250, row_bytes = 50, header_bytes = 16;
-    static constexpr size_t frame_bytes = header_bytes + rows * (row_bytes + 2);
+    static constexpr size_t rows = 250, row_bytes = 50, tag_bytes = 2, header_bytes = 16;
+    static constexpr size_t frame_bytes = header_bytes + rows * (row_bytes + tag_bytes);
     static constexpr size_t compact_bytes = rows * row_bytes;
     static constexpr uint32_t magic = 0x63606300;
 
@@ -33,7 +33,7 @@ class UsbParser {
     // Constants of the headers of one session, and its position.
     struct Lock {
         uint32_t word1;
-        uint32_t offset;    // w2 - 50 w3: both count the same lines, and modulo 2^32 this never changes
+        uint32_t offset;    // w2 - row_bytes w3: w2 counts the bytes of the lines that w3 counts, both modulo 2^32
         uint32_t expected;  // w3 of the frame next_index_
     };
     // A break in the stream. The next two headers show its length.

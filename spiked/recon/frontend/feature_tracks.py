@@ -12,25 +12,37 @@ from numpy.typing import NDArray
 import spiked.native._spikes as _spikes
 import spiked.native._tracking as _tracking
 from spiked.pose import Array
-from spiked.recon.statistics import median
+from spiked.recon.statistics import WHITE_PERCENTILE, median
 
 Picture = NDArray[np.uint8]
 Pyramid = list[NDArray[np.float32]]
 """See `pyramid`."""
 WINDOW_PX = 13
-"""Side of a track's template in px."""
+"""Side of a track's template in px: `kWindow` of native/tracking/lucas_kanade.cpp. Images of less than twice this are
+not halved."""
 LEVELS = 4
 """Pyramid levels below full size for tracking from view to view."""
 SLOW_MOTION_PX = 3.0
-"""Below this motion between views one halving of the image suffices."""
+"""Below this motion between views one halving of the image suffices (decision 9)."""
 PREDICTION_RADIUS_PX = 1.5
 """Largest distance of a track from its prediction."""
 MIN_PREDICTED_SHARE = 0.85
-"""With a smaller share of the tracks at their predictions, all are searched from the previous image."""
+"""With a smaller share of the tracks at their predictions, all are searched from the previous image (decision 9)."""
 WHITE_STRIDE_PX = 3
 """Stride in px of the samples that set the white level: odd, to sample all sites of a mosaic."""
 MIN_FOUND_SHARE = 0.6
 """Share of the points found that ends a search."""
+REFILL_SHARE = 0.7
+"""Share of `Tracks.target` below which new tracks are started."""
+CORNER_QUALITY, CORNER_DISTANCE_PX, CORNER_BLOCK_PX = 0.003, 7, 5
+"""Corners of new tracks: smallest eigenvalue over that of the best corner, distance from
+other tracks, and side of the averaging window."""
+BORDER_PX, CORNER_BORDER_PX = 4, 6
+"""Tracks nearer to the border of the image end, and corners nearer to it are not used."""
+THUMBNAIL_SCALE = 0.25
+"""Size of the images of `search` over the full size."""
+REACH_PX = 0.6
+"""Largest forward-backward distance of a good track."""
 
 
 def picture(rate: NDArray[np.float32], white: float) -> Picture:
@@ -41,8 +53,8 @@ def picture(rate: NDArray[np.float32], white: float) -> Picture:
 
 
 def white_of(rate: NDArray[np.float32]) -> float:
-    """The rate shown as white: the 99.5th percentile of every ninth pixel."""
-    return max(float(_spikes.quantile(rate[::WHITE_STRIDE_PX, ::WHITE_STRIDE_PX], 0.995)), 1e-6)
+    """The rate shown as white: `WHITE_PERCENTILE` of every ninth pixel."""
+    return max(float(_spikes.quantile(rate[::WHITE_STRIDE_PX, ::WHITE_STRIDE_PX], WHITE_PERCENTILE / 100)), 1e-6)
 
 
 @dataclass
@@ -53,7 +65,7 @@ class Tracks:
     """Number of live tracks."""
     far: bool = False
     """Frames are skipped between windows: the image shift is searched first."""
-    reach_px: float = 0.6
+    reach_px: float = REACH_PX
     """Largest forward-backward distance of a good track."""
     next_id: int = 0
     ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -84,7 +96,7 @@ class Tracks:
             motion = self._follow(image, levels)
         self.newest, self.newest_picture, self.motion_px = window, image, motion
         self.pictures[window] = levels
-        if len(self.ids) < 0.7 * self.target:
+        if len(self.ids) < REFILL_SHARE * self.target:
             self._start(window, image)
         for old in set(self.pictures) - set(self.born.tolist()) - {window}:
             self._spare = [self.pictures.pop(old)]
@@ -119,7 +131,7 @@ class Tracks:
             good &= found
         height, width = image.shape
         motion = median(np.linalg.norm(moved - self.at, axis=1)[good]) if good.any() else 0.0
-        good &= (moved > 4).all(1) & (moved[:, 0] < width - 4) & (moved[:, 1] < height - 4)
+        good &= (moved > BORDER_PX).all(1) & (moved[:, 0] < width - BORDER_PX) & (moved[:, 1] < height - BORDER_PX)
         self.at, self.pace = moved, moved - self.at
         self._keep(good)
         return motion
@@ -155,12 +167,14 @@ class Tracks:
         return at, good
 
     def _start(self, window: int, image: Picture) -> None:
-        mask = np.full(image.shape, 255, np.uint8)
-        mask[:6], mask[-6:], mask[:, :6], mask[:, -6:] = 0, 0, 0, 0
+        mask, inside = np.zeros(image.shape, np.uint8), slice(CORNER_BORDER_PX, -CORNER_BORDER_PX)
+        mask[inside, inside] = 255
         for x, y in self.at:
-            cv2.circle(mask, (int(x), int(y)), 7, 0, -1)
+            cv2.circle(mask, (int(x), int(y)), CORNER_DISTANCE_PX, 0, -1)
         wanted = self.target - len(self.ids)
-        corners = cv2.goodFeaturesToTrack(image, wanted, 0.003, 7, mask=mask, blockSize=5)
+        corners = cv2.goodFeaturesToTrack(
+            image, wanted, CORNER_QUALITY, CORNER_DISTANCE_PX, mask=mask, blockSize=CORNER_BLOCK_PX
+        )
         if corners is None:
             return
         fresh = corners[:, 0].astype(float) + 0.5
@@ -206,12 +220,13 @@ def pyramid(image: Picture, levels: int, into: Pyramid | None = None) -> Pyramid
 def search(a: Picture, b: Picture, points: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Positions in `b` of `points` [n, 2] of `a` after a large motion: phase correlation of thumbnails (Hann window),
     then `flow`; and which points pass the forward-backward check."""
-    small = [cv2.resize(p, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(np.float32) for p in (a, b)]
+    s = THUMBNAIL_SCALE
+    small = [cv2.resize(p, None, fx=s, fy=s, interpolation=cv2.INTER_AREA).astype(np.float32) for p in (a, b)]
     shift, _ = cv2.phaseCorrelate(small[0], small[1], cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F))
     best = points, np.zeros(len(points), bool)
-    for guess in (4.0 * np.array(shift), np.zeros(2)):
-        at, good = flow(a, b, points, points + guess, 0.6, levels=4)
-        good &= (at > 4).all(1) & (at < np.array(b.shape[::-1]) - 4).all(1)
+    for guess in (np.array(shift) / s, np.zeros(2)):
+        at, good = flow(a, b, points, points + guess, REACH_PX, LEVELS)
+        good &= (at > BORDER_PX).all(1) & (at < np.array(b.shape[::-1]) - BORDER_PX).all(1)
         if good.sum() > best[1].sum():
             best = at, good
         if good.sum() > MIN_FOUND_SHARE * len(points):

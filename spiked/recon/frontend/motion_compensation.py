@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 import spiked.native._tracking as _tracking
 from spiked.blocks import aligned_window
 from spiked.pose import Array
-from spiked.recon.frontend.feature_tracks import Picture, flow, picture, white_of
+from spiked.recon.frontend.feature_tracks import CORNER_QUALITY, Picture, flow, picture, white_of
 from spiked.sensor import BitOrder, Image, Sensor
 
 FIELD_CELL_PX = 16
@@ -26,7 +26,22 @@ SMOOTH_PX = 32.0
 COARSE_FRAMES = 8
 """Frames of the blurred windows that the motion is estimated from."""
 REACH_FRAMES = 12
-"""Frames on either side of a time that are warped to it."""
+"""Frames on either side of a time that are warped to it; as many as the map is fitted to (`WARP_FRAMES`, decision
+8)."""
+MIN_FIELD_TRACKS = 12
+"""Tracks that a motion field needs: three times those of a homography."""
+HOMOGRAPHY_INLIER_PX, MIN_HOMOGRAPHY_INLIERS = 3.0, 0.3
+"""Largest residual of a track that agrees with the homography, and the share of the tracks that has to."""
+RESIDUAL_CLIP, MIN_RESIDUAL_PX = 4.0, 0.5
+"""Tracks whose residual exceeds this many medians are left out; the median counts as at least so large."""
+MIN_COVERAGE = 0.25
+"""Share of the frames that have to cover a pixel of a warped image."""
+COARSE_BLUR_PX, COARSE_CORNERS, COARSE_DISTANCE_PX, COARSE_BLOCK_PX = 1.5, 300, 6, 7
+"""Corners of the blurred windows, at half size: standard deviation of the blur, number, distance, averaging window."""
+COARSE_REACH_PX, COARSE_LEVELS = 0.75, 3
+"""Largest forward-backward distance of their tracks, and pyramid levels below half size."""
+BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
+"""Kernel whose 3x3 product weighs the colours of a mosaic alike at every pixel."""
 
 Field = NDArray[np.float64]
 """Displacements [rows, columns, 2] in px at nodes `FIELD_CELL_PX` apart, beginning at the corner of the image."""
@@ -41,15 +56,15 @@ def nodes(width: int, height: int) -> Array:
 
 def fit_field(start: Array, end: Array, width: int, height: int) -> Field | None:
     """The motion field through tracks from `start` [n, 2] to `end` [n, 2]; None without a consistent homography."""
-    if len(start) < 12:
+    if len(start) < MIN_FIELD_TRACKS:
         return None
-    homography, inlier = cv2.findHomography(start, end, cv2.RANSAC, 3.0)
-    if homography is None or inlier.mean() < 0.3:
+    homography, inlier = cv2.findHomography(start, end, cv2.RANSAC, HOMOGRAPHY_INLIER_PX)
+    if homography is None or inlier.mean() < MIN_HOMOGRAPHY_INLIERS:
         return None
     places = nodes(width, height)
     rest = end - _through(homography, start)
     size = np.linalg.norm(rest, axis=1)
-    keep = size < 4.0 * max(float(np.median(size)), 0.5)
+    keep = size < RESIDUAL_CLIP * max(float(np.median(size)), MIN_RESIDUAL_PX)
     distance = ((places[:, :, None] - start[keep]) ** 2).sum(3)
     weight = np.exp(-0.5 * distance / SMOOTH_PX**2)
     moved = np.einsum("rcn,nd->rcd", weight, rest[keep]) / (weight.sum(2, keepdims=True) + 0.5)
@@ -101,9 +116,8 @@ def warp_frames(
         weight,
     )
     full = cv2.resize(weight, None, fx=4, fy=4, interpolation=cv2.INTER_LINEAR)[: sensor.height, : sensor.width]
-    row = np.array([0.25, 0.5, 0.25], np.float32)
-    spikes = cv2.sepFilter2D(spikes, cv2.CV_32F, row, row, borderType=cv2.BORDER_REFLECT_101)
-    seen = full > 0.25 * len(grids)
+    spikes = cv2.sepFilter2D(spikes, cv2.CV_32F, BINOMIAL, BINOMIAL, borderType=cv2.BORDER_REFLECT_101)
+    seen = full > MIN_COVERAGE * len(grids)
     mean = float(spikes[seen].sum() / max(full[seen].sum(), 1e-9))
     return np.asarray(np.where(seen, spikes / np.maximum(full, 1e-6), mean), np.float32)
 
@@ -234,11 +248,14 @@ def _small(count: NDArray[np.uint16]) -> Picture:
 
 
 def _coarse_motion(a: Picture, b: Picture, sensor: Sensor) -> Field | None:
-    corners = cv2.goodFeaturesToTrack(cv2.GaussianBlur(a, (0, 0), 1.5), 300, 0.003, 6, blockSize=7)
+    blurred = cv2.GaussianBlur(a, (0, 0), COARSE_BLUR_PX)
+    corners = cv2.goodFeaturesToTrack(
+        blurred, COARSE_CORNERS, CORNER_QUALITY, COARSE_DISTANCE_PX, blockSize=COARSE_BLOCK_PX
+    )
     if corners is None:
         return None
     start = corners[:, 0].astype(float) + 0.5
-    end, good = flow(a, b, start, start, reach_px=0.75, levels=3)
+    end, good = flow(a, b, start, start, reach_px=COARSE_REACH_PX, levels=COARSE_LEVELS)
     return fit_field(2 * start[good], 2 * end[good], sensor.width, sensor.height)
 
 

@@ -10,15 +10,17 @@ from numpy.typing import NDArray
 
 from spiked.blocks import Window, aligned_window
 from spiked.calibration import Calibration
-from spiked.recon.frontend.motion_compensation import MotionCompensator, drift, speed
+from spiked.recon.frontend.motion_compensation import BINOMIAL, MotionCompensator, drift, speed
 from spiked.recon.frontend.spike_intervals import SpikeIntervals
 from spiked.sensor import Image, Mosaic, Sensor
 
 EXPOSURE_PERCENTILE = 10.0
 """Percentile of exposure starts and ends that bound the rendered span: the darkest pixels gather charge for too long to
-render their whole exposure in straight sub-frames."""
+render their whole exposure in straight sub-frames (decision 6)."""
 MIN_EXPOSURE_SHARE = 0.7
-"""Share of a pixel's exposure that has to lie in that span."""
+"""Share of a pixel's exposure that has to lie in that span (decision 6)."""
+MIN_EXPOSURE = 0.02
+"""Shortest exposure of a pixel, in units of a sub-frame."""
 SEARCH_FRAMES = 24
 """Frames on both sides of a window that are searched for the spikes nearest to its edges."""
 BUFFER_RATIO = 4
@@ -26,20 +28,20 @@ BUFFER_RATIO = 4
 PROBE_FRAMES = 16
 """Frames of the first motion estimate."""
 WINDOWS = (4, 8, 16, 32, 64)
-"""Lengths of a view in frames."""
+"""Lengths of a view in frames (decision 2)."""
 WARP_FRAMES = 12
-"""Frames on either side of a view's middle that the map is fitted to where the motion is fast."""
+"""Frames on either side of a view's middle that the map is fitted to where the motion is fast (decision 8)."""
 FIRST_WINDOW = 16
 """Length of the first views in frames."""
 WINDOW_MOTION_PX = (0.12, 0.6)
-"""The next view is twice as long below the first motion in a view, half as long above twice the second."""
+"""The next view is twice as long below the first motion in a view, half as long above twice the second (decision 2)."""
 MOTION_ONSET_PX = 1.0
-"""Motion in a view longer than `FIRST_WINDOW` that shortens this view at once."""
+"""Motion in a view longer than `FIRST_WINDOW` that shortens this view at once (decision 7)."""
 FAST_PX = (0.35, 0.5)
-"""Motion a frame: compensation starts above the second and ends below the first. Below it 8-frame windows give better
-tracks in spite of their blur: charge between spikes is far less noisy than warped spikes."""
+"""Motion in px a frame: compensation starts above the second and ends below the first (decision 2). Below it 8-frame
+windows give better tracks in spite of their blur: charge between spikes is far less noisy than warped spikes."""
 FASTEST_PX = (0.45, 0.6)
-"""Motion a frame: views of 4 instead of 8 frames start above the second and end below the first."""
+"""Motion in px a frame: views of 4 instead of 8 frames start above the second and end below the first (decision 2)."""
 
 
 @dataclass(frozen=True)
@@ -101,8 +103,8 @@ class View:
         scale = np.float32(parts / max(last - first, 1e-3))
         windows = np.stack([(start - np.float32(first)) * scale, (stop - np.float32(first)) * scale])
         whole = windows[1] - windows[0]
-        np.clip(windows[0], 0, parts - 0.02, out=windows[0])
-        np.clip(windows[1], windows[0] + 0.02, parts, out=windows[1])
+        np.clip(windows[0], 0, parts - MIN_EXPOSURE, out=windows[0])
+        np.clip(windows[1], windows[0] + MIN_EXPOSURE, parts, out=windows[1])
         seen = windows[1] - windows[0] >= MIN_EXPOSURE_SHARE * whole
         return self.time + np.linspace(first, last, parts + 1), windows.astype(np.float32), seen
 
@@ -265,5 +267,6 @@ def luminance(rate: Image, mosaic: Mosaic | None) -> Image:
     """A grey image of raw sites: a 3x3 binomial mean sees every colour in the same proportion at every pixel."""
     if mosaic is None:
         return rate
-    row = np.array([0.25, 0.5, 0.25], np.float32)
-    return np.asarray(cv2.sepFilter2D(rate, cv2.CV_32F, row, row, borderType=cv2.BORDER_REFLECT_101), np.float32)
+    return np.asarray(
+        cv2.sepFilter2D(rate, cv2.CV_32F, BINOMIAL, BINOMIAL, borderType=cv2.BORDER_REFLECT_101), np.float32
+    )

@@ -16,6 +16,7 @@ from spiked.recon.mapping.photometric import Nuisances
 from spiked.recon.mapping.pyramid import Level, levels
 from spiked.recon.mapping.render_requests import RenderRequest
 from spiked.recon.mapping.seeding import SweptView, isotropic_splats
+from spiked.recon.statistics import WHITE_PERCENTILE
 from spiked.render import Camera
 from spiked.render.charge import ChargeLoss
 from spiked.render.optimiser import Adam
@@ -25,11 +26,12 @@ from spiked.sensor import Image, Sensor
 LARGE_PIXELS = 130_000
 """Images of more pixels are aligned at half their size."""
 BETAS = 0.9, 0.99
-"""Adam's decay rates, counted in the steps in which a splat is visible: many splats see few."""
+"""Adam's decay rates (10 and 100 steps, decision 3), counted in the steps in which a splat is visible: many splats see
+few."""
 NUISANCES_FROM = 50
-"""Steps before view brightness is estimated: the map has to converge roughly first."""
+"""Steps before view brightness is estimated: the map has to converge roughly first (decision 5)."""
 GAINS_FROM = 800
-"""Steps before pixel gains are estimated: earlier they absorb errors of the geometry."""
+"""Steps before pixel gains are estimated: earlier they absorb errors of the geometry (decision 13)."""
 NUISANCE_STEPS = 200
 """Steps between estimates of the pixel gains."""
 
@@ -54,7 +56,7 @@ class Mapper:
         self.channels = self.levels[0].channels
         self.scene = Scene.empty(self.colours)
         self.white = 1.0
-        """The radiance (spikes a frame) that is shown as white: the 99.5th percentile of the first seeded view."""
+        """The radiance (spikes a frame) that is shown as white: `WHITE_PERCENTILE` of the first seeded view."""
         self.depth = 1.0
         """Typical depth of the scene; the learning rate of the means is relative to it."""
         self.rasteriser = self.levels[0].rasteriser
@@ -84,7 +86,7 @@ class Mapper:
             alpha = self.rasteriser.forward(self.scene, swept.rotation[None], swept.centre[None]).alpha
             empty = alpha < seeding.opacity
         else:
-            self.white = float(np.percentile(rate, 99.5))
+            self.white = float(np.percentile(rate, WHITE_PERCENTILE))
             empty = np.ones(rate.shape, bool)
         empty &= swept.sweep.confidence >= surer
         stride = seeding.stride(rate.size, int(self.cap / self.extent), self.options.stride_px)

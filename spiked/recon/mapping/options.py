@@ -15,18 +15,22 @@ class MapOptions:
     stride_px: float = 2.0
     """Spacing of the pixels that become the first splats."""
     splats_a_pixel: float = 0.8
-    """Maximum number of splats for each sensor pixel."""
+    """Maximum number of splats for each sensor pixel (decision 5)."""
     most_splats: int = 250_000
-    """Maximum number of splats in all."""
+    """Maximum number of splats in all (decision 8)."""
     extent_px: float = 1000.0
     """Image motion of a path up to which a map has the size above; beyond it splats, seeded views and steps grow in
     proportion. The recordings of docs/accuracy.md move by up to 700 px."""
     rate_means: float = 2e-3
-    """Learning rates at the start, per step; those of the means and of colour are in units of depth and of white."""
+    """Learning rate of the means at the start, per step, in units of depth (decision 3)."""
     rate_quats: float = 2.5e-2
+    """Of the quaternions, per step (decision 3)."""
     rate_scales: float = 1e-1
+    """Of the logarithms of the scales, per step (decision 3)."""
     rate_opacities: float = 8e-2
+    """Of the opacity logits, per step (decision 6)."""
     rate_colours: float = 1.5e-2
+    """Of the colours, per step, in units of white (decision 6)."""
     ssim: float = RateLoss.ssim
     """Share of structural similarity in the loss of rates, see `RateLoss`."""
     sub_frames: int | None = None
@@ -34,7 +38,7 @@ class MapOptions:
     nuisances: bool = True
     """Estimate each pixel's gain and the brightness of each view (flicker, lamps)."""
     background: float = 0.5
-    """Largest brightness of the random background while fitting, in units of white; 0 is always black."""
+    """Largest brightness of the random background while fitting, in units of white; 0 is always black (decision 5)."""
     floor: float = RateLoss.floor
     """Noise added to each pixel, in units of white, see `RateLoss`."""
     detail: float = WarpedChargeLoss.detail

@@ -10,6 +10,10 @@ MODEL_ERROR = 0.07
 """Relative error of the map's render, added to the noise of each residual."""
 RESIDUAL_DECAY = 0.7
 """Decay of the accumulated residuals at each update: older ones are of an older map."""
+AGREEING_SIGMAS = 3
+"""Deviations within which a pixel agrees with the map, and counts for the brightness of its view."""
+GAIN_LIMITS = (0.5, 2.0)
+"""Limits of a pixel's gain."""
 
 
 class Nuisances:
@@ -48,7 +52,7 @@ class Nuisances:
         precision = 1 / (deviation * deviation + error * error + 1e-12)
         # A ratio of means: least squares underestimates the brightness while the map is rough, and the map follows.
         # Weights by precision would give most weight to the darkest pixels.
-        agree = (np.abs(observed - expected) < 3 * (deviation + error)) & np.isfinite(deviation)
+        agree = (np.abs(observed - expected) < AGREEING_SIGMAS * (deviation + error)) & np.isfinite(deviation)
         total = float(expected[agree].sum())
         if total > 0:
             self.note(key, float(observed[agree].sum()) / total)
@@ -72,7 +76,7 @@ class Nuisances:
         once = np.float32(min(1.0, len(self._levels) / self._observed))
         if not self._fixed:
             relative = once * self._xy / (once * self._xx + np.float32(1 / GAIN_SIGMA**2))
-            gain = np.clip(1 + relative, 0.5, 2.0)
+            gain = np.clip(1 + relative, *GAIN_LIMITS)
             self.gain = (gain / np.exp(np.log(gain).mean())).astype(np.float32)
         self._xx *= RESIDUAL_DECAY
         self._xy *= RESIDUAL_DECAY

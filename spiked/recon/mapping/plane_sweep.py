@@ -18,9 +18,26 @@ from spiked.render.cpu import usable_cores
 from spiked.sensor import Image, Intrinsics
 
 SWEPT_PIXELS = 130_000
-"""Images of more than about this many pixels are swept at a smaller size: the first splats are coarser still."""
+"""Images of more than about this many pixels are swept at a smaller size: the first splats are coarser still (decision
+5)."""
 MAX_COST, OUTSIDE_COST = 4.0, 2.0
 """Cap of a pixel's difference in standard deviations, and its cost outside the other image."""
+MAX_TURN_DEG = 25.0
+"""Largest angle between the viewing directions of two views that are compared."""
+MIN_BASELINE_SHARE = 0.3
+"""Shortest baseline of the views compared, over the longest."""
+PLANE_STEP_PX, MIN_PLANES, MAX_PLANES = 0.6, 16, 96
+"""Disparity between neighbouring planes at the longest baseline, and limits of the number of planes."""
+COST_WINDOWS_PX = (3, 9, 21)
+"""Windows over which the costs of a plane are averaged; the sum is a peaked kernel."""
+RIVAL_DISTANCE = 12
+"""A rival of the best plane is at least this part of the planes away."""
+SURE_MARGIN = 0.3
+"""Margin of the cost of the rival, in units of the cost, that has confidence 1."""
+FILL_WINDOWS_PX = (7, 15, 31)
+"""Windows from which pixels of low confidence are filled, one after the other."""
+MIN_TRUST = 1e-4
+"""Weight of a pixel without confidence in its neighbours' means."""
 
 
 @dataclass(frozen=True)
@@ -41,16 +58,16 @@ class Sweep:
 
 
 def neighbours(centres: Array, forward: Array, reference: int, count: int) -> NDArray[np.int64]:
-    """Views of suitable baselines to `reference`: spread from 0.3 of the widest up.
+    """Views of suitable baselines to `reference`: spread from `MIN_BASELINE_SHARE` of the widest up.
 
-    centres [V, 3]; forward [V, 3] viewing directions, which exclude views that turned by more than 25 degrees.
+    centres [V, 3]; forward [V, 3] viewing directions, which exclude views that turned by more than `MAX_TURN_DEG`.
     """
     baseline = np.linalg.norm(centres - centres[reference], axis=1)
-    usable = np.flatnonzero((forward @ forward[reference] > np.cos(np.radians(25))) & (baseline > 1e-9))
+    usable = np.flatnonzero((forward @ forward[reference] > np.cos(np.radians(MAX_TURN_DEG))) & (baseline > 1e-9))
     if len(usable) <= count:
         return usable
     ordered = usable[np.argsort(baseline[usable])]
-    first = np.searchsorted(baseline[ordered], 0.3 * baseline[ordered[-1]])
+    first = np.searchsorted(baseline[ordered], MIN_BASELINE_SHARE * baseline[ordered[-1]])
     first = min(first, len(ordered) - count)
     return np.asarray(ordered[np.linspace(first, len(ordered) - 1, count).round().astype(int)], np.int64)
 
@@ -84,7 +101,7 @@ def sweep(
     k = intrinsics.matrix()
     baseline = max(np.linalg.norm(o.centre - reference.centre) for o in others)
     largest, smallest = near_far
-    planes = int(np.clip((largest - smallest) * intrinsics.fx * baseline / 0.6, 16, 96))
+    planes = int(np.clip((largest - smallest) * intrinsics.fx * baseline / PLANE_STEP_PX, MIN_PLANES, MAX_PLANES))
     inverse = np.linspace(smallest, largest, planes, dtype=np.float32)
     weight = np.ascontiguousarray(1 / np.maximum(noise, 1e-6), np.float32)
     cost = np.empty((planes, height, width), np.float32)
@@ -96,9 +113,8 @@ def sweep(
             warped = _through_plane(other, reference, k, float(inverse[plane]))
             _dense.add_cost(warped, image, weight, MAX_COST, OUTSIDE_COST, total)
         total /= len(others)
-        cost[plane] = (
-            cv2.boxFilter(total, -1, (3, 3)) + cv2.boxFilter(total, -1, (9, 9)) + cv2.boxFilter(total, -1, (21, 21))
-        )
+        near, middle, far = (cv2.boxFilter(total, -1, (size, size)) for size in COST_WINDOWS_PX)
+        cost[plane] = near + middle + far
 
     with ThreadPoolExecutor(threads or usable_cores()) as pool:
         deque(pool.map(fill, range(planes)), maxlen=0)
@@ -135,17 +151,17 @@ def _winner(cost: Image, inverse: Image) -> Sweep:
     """Best plane with parabolic refinement; confidence from the margin to the second best."""
     planes, height, width = cost.shape
     place, margin = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
-    _dense.best_plane(cost, max(2, planes // 12), place, margin)
-    confidence = np.clip(margin / 0.3, 0, 1).astype(np.float32)
+    _dense.best_plane(cost, max(2, planes // RIVAL_DISTANCE), place, margin)
+    confidence = np.clip(margin / SURE_MARGIN, 0, 1).astype(np.float32)
     value = inverse[0] + place * (inverse[1] - inverse[0])
     return Sweep(_settled(value, confidence), confidence)
 
 
 def _settled(value: Image, confidence: Image) -> Image:
     """Pixels of low confidence take the weighted mean of growing neighbourhoods."""
-    trust = confidence**2 + 1e-4
+    trust = confidence**2 + MIN_TRUST
     out = np.asarray(cv2.medianBlur(value, 5), np.float32)
-    for size in (7, 15, 31):
+    for size in FILL_WINDOWS_PX:
         mean = cv2.boxFilter(out * trust, -1, (size, size)) / cv2.boxFilter(trust, -1, (size, size))
         out = confidence * out + (1 - confidence) * mean
     return np.asarray(out, np.float32)

@@ -28,15 +28,23 @@ from spiked.sensor import Image
 from spiked.spline import Spline
 
 LANDMARK_PX = 16
-"""Approximate width of a landmark in the image: all pixels in its cube of space share its three coordinates."""
+"""Approximate width of a landmark in the image: all pixels in its cube of space share its three coordinates. Half and
+twice the width are as good (decision 13)."""
 LANDMARK_DAMPING, LANDMARK_DAMPING_FLOOR = 1e-2, 1e-3
 """Damping of a landmark, relative to its own information and to the median landmark's: few pixels may see it."""
 GRADIENT_QUANTILE = 0.7
 """Quantile of the gradient magnitude below which pixels are left out."""
 KNOT_DAMPING = 1e-3
-"""Of each knot, relative to its information."""
+"""Damping of each knot, relative to its information; 0.02 is worse (decision 13)."""
 CHUNK_FLOATS = 4_000_000
 """Floats held at once while landmarks are marginalised."""
+MIN_ALPHA = 0.9
+"""Coverage of the pixels that are compared."""
+EDGE_PX = 2
+"""Pixels along the border that are left out: their gradients are one-sided."""
+MAD_SCALE, ROBUST_SCALES = 1.5, 3.0
+"""Standard deviation of normal errors over their median size (1.48, rounded), and the scale of the Cauchy weight in
+units of this standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -144,14 +152,14 @@ def _view_normals(
     k = level.camera.intrinsics
     du = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 32)
     dv = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 32)
-    edge = 2
     strong = np.zeros(error.shape, bool)
     size = np.hypot(du, dv)
-    strong[edge:-edge, edge:-edge] = (size > np.quantile(size[::4, ::4], GRADIENT_QUANTILE))[edge:-edge, edge:-edge]
-    strong &= image.alpha > 0.9
+    inside = slice(EDGE_PX, -EDGE_PX)
+    strong[inside, inside] = (size > np.quantile(size[::4, ::4], GRADIENT_QUANTILE))[inside, inside]
+    strong &= image.alpha > MIN_ALPHA
     e = error[strong]
-    scale = 1.5 * (median(np.abs(e)) if len(e) else 0.0) + 1e-6
-    weight = np.where(strong, certainty / (1 + (error / (3 * scale)) ** 2), 0).astype(np.float32)
+    scale = MAD_SCALE * (median(np.abs(e)) if len(e) else 0.0) + 1e-6
+    weight = np.where(strong, certainty / (1 + (error / (ROBUST_SCALES * scale)) ** 2), 0).astype(np.float32)
     pose, keys, places = np.empty((6, 7)), np.empty(len(e), np.int64), np.empty((len(e), 3, 10))
     count = _dense.photometric_normals(
         error,

@@ -12,7 +12,9 @@ from spiked.scene import Scene
 from spiked.sensor import Image, Mosaic, Sensor
 
 SMALLEST_PIXELS = 50_000
-"""No level has fewer pixels."""
+"""No level has fewer pixels (decision 5)."""
+SITE_SHARES = np.array([0.25, 0.5, 0.25], np.float32)
+"""Share of the red, green and blue sites in a mosaic."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ class Level:
 
     def mixed(self, image: Image) -> Image:
         """Grey [h, w] of colours [h, w, 3] in the proportion of a mosaic's sites; grey images pass through."""
-        return image if image.ndim == 2 else np.ascontiguousarray(image @ np.array([0.25, 0.5, 0.25], np.float32))
+        return image if image.ndim == 2 else np.ascontiguousarray(image @ SITE_SHARES)
 
     def shrunk(self, image: Image) -> Image:
         """A grey image [H, W] at this size."""

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from spiked.recon.frontend.windowing import View, luminance
+from spiked.recon.mapping.pyramid import SITE_SHARES
+from spiked.recon.statistics import WHITE_PERCENTILE
 from spiked.render import AnyRasteriser
 from spiked.scene import Scene
 from spiked.sensor import Sensor
@@ -12,6 +14,8 @@ from spiked.trajectory import Trajectory
 
 COMPARED_VIEWS = 8
 """Number of views compared, spread over the recording."""
+NEAREST_FRAMES = 0.51
+"""Largest distance of a pose from the time of a view, in frames: half a frame and the rounding of the time."""
 
 
 def scene_psnr_db(
@@ -23,15 +27,15 @@ def scene_psnr_db(
     """
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, COMPARED_VIEWS).round().astype(int))]
     rate = sensor.frame_rate_hz
-    rows = trajectory.nearest(np.array([view.time / rate for view in chosen]), 0.51 / rate)
+    rows = trajectory.nearest(np.array([view.time / rate for view in chosen]), NEAREST_FRAMES / rate)
     errors, whites = [], []
     for view, row in zip(chosen, rows, strict=True):
         seen = luminance(view.rate, sensor.mosaic) if view.sharp is None else view.sharp
         shown = np.zeros_like(seen)
         if row >= 0:
             values = rasteriser.forward(scene, trajectory.rotations[row, None], trajectory.centres[row, None]).values
-            shown = values if values.ndim == 2 else values @ np.array([0.25, 0.5, 0.25], np.float32)
+            shown = values if values.ndim == 2 else values @ SITE_SHARES
         brightness = float((seen * shown).sum()) / max(float((shown * shown).sum()), 1e-12)
         errors.append(float(np.mean((seen - brightness * shown) ** 2)))
-        whites.append(float(np.percentile(seen, 99.5)))
+        whites.append(float(np.percentile(seen, WHITE_PERCENTILE)))
     return float(-10 * np.log10(max(float(np.mean(errors)), 1e-12) / max(float(np.mean(whites)), 1e-6) ** 2))

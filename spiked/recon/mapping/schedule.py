@@ -8,21 +8,22 @@ class Schedule:
     """When what happens in a refinement, by the share of it that is done: 0 to 1, of its steps or of its time limit."""
 
     coarse_share: float = 0.6
-    """Share in which large images are fitted at smaller pyramid levels, a quarter of the work each."""
+    """Share in which large images are fitted at smaller pyramid levels, a quarter of the work each (decision 5)."""
     rate_decades: float = 1.0
-    """Decimal powers by which all learning rates fall (docs/decisions/0003-learning-rates.md)."""
+    """Decimal powers by which all learning rates fall (decision 3)."""
     settling_share: float = 0.15
-    """Last share, in which the rates fall to zero: otherwise the map follows the last views' noise."""
+    """Last share, in which the rates fall to zero: otherwise the map follows the last views' noise (decision 3)."""
     alignments: int = 5
-    """Alignments of the whole path with the map."""
+    """Alignments of the whole path with the map (decision 13)."""
     aligned_share: float = 0.7
-    """Share with alignments; the path is fixed after it."""
+    """Share with alignments; the path is fixed after it (decision 13)."""
     small_pixels: int = 130_000
     """Images up to this size get the full number of steps."""
     large_power: float = 0.4
-    """The steps of larger images fall with this power of their pixels: a compromise of cost and convergence."""
+    """The steps of larger images fall with this power of their pixels: a compromise of cost and convergence (decision
+    13)."""
     fast_steps: float = 2.5
-    """Factor on the steps for views of fast motion: a step costs less and carries less fine detail."""
+    """Factor on the steps for views of fast motion: a step costs less and carries less fine detail (decision 13)."""
     live_steps: int = 800
     """Steps of a live map from the coarsest pyramid level to full size."""
     stale_px: float = 0.05

@@ -16,6 +16,10 @@ LEAST_POINTS = 10
 """Points in front of a view that its range of depths needs."""
 LEAST_PIXELS = 20
 """Fewer uncovered pixels of a view are not seeded."""
+DEPTH_PERCENTILES = (1, 99.5)
+"""Percentiles of the points' inverse depths that bound the sweep; the nearest points matter more than the farthest."""
+SEED_LOGIT = 0.5
+"""Opacity logit of a new splat, an opacity of 0.62."""
 
 
 @dataclass(frozen=True)
@@ -35,19 +39,21 @@ class Seeding:
     """Where depth is swept and which pixels become splats."""
 
     views: int = 11
-    """Views swept at the start of a refinement."""
+    """Views swept at the start of a refinement (decision 8)."""
     neighbours: int = 5
     """Views compared with each swept view."""
     nearest: float = 1.3
-    """Inverse depth of the nearest plane over the 99.5th percentile of the points' inverse depths."""
+    """Inverse depth of the nearest plane over the upper one of `DEPTH_PERCENTILES`."""
     farthest: float = 0.5
-    """Inverse depth of the farthest plane over the first percentile."""
+    """Inverse depth of the farthest plane over the lower one."""
     noise: float = 1.5
     """Standard deviation of the difference of two views over that of one: about sqrt(2) for independent noise."""
     sure: float = 0.6
-    """Depth confidence of the pixels seeded first; the others are seeded where no view is more confident."""
+    """Depth confidence of the pixels seeded first; the others are seeded where no view is more confident (decision
+    8)."""
     share: float = 0.3
-    """Largest share of the cap that one view seeds: the first leaves some for others, and covers all of its image."""
+    """Largest share of the cap that one view seeds: the first leaves some for others, and covers all of its image
+    (decision 8)."""
     opacity: float = 0.5
     """Pixels that the map covers with less are seeded."""
     size: float = 0.6
@@ -76,7 +82,7 @@ class Seeding:
         ahead = depths[depths > 0]
         if len(ahead) < LEAST_POINTS:
             return None
-        low, high = np.percentile(1 / ahead, [1, 99.5])
+        low, high = np.percentile(1 / ahead, DEPTH_PERCENTILES)
         return self.nearest * high, self.farthest * low
 
     def stride(self, pixels: int, cap: int, least_px: float) -> float:
@@ -108,7 +114,7 @@ def isotropic_splats(
     rotation: Array,
     centre: Array,
 ) -> Scene:
-    """Round splats of opacity 0.62 at `pixels` [N, 2] of a camera and `depth` [N], `deviation_px` wide in the image.
+    """Round splats at `pixels` [N, 2] of a camera and `depth` [N], `deviation_px` wide in the image.
 
     The pose is camera to world; colours are [N, C].
     """
@@ -120,6 +126,6 @@ def isotropic_splats(
         np.ascontiguousarray((intrinsics.unproject(pixels) * depth[:, None]) @ rotation.T + centre, np.float32),
         quats,
         np.repeat(log_scale[:, None], 3, 1).astype(np.float32),
-        np.full(count, 0.5, np.float32),
+        np.full(count, SEED_LOGIT, np.float32),
         np.ascontiguousarray(colours, np.float32),
     )

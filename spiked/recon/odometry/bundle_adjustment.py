@@ -19,13 +19,15 @@ Index = NDArray[np.int64]
 
 MOST_DAMPING = 1e6
 """The search ends if a step of this damping does not lower the cost."""
+DAMPING_UP, DAMPING_DOWN = 8, 5
+"""Factor of the damping after a rejected step, and divisor after an accepted one."""
 
 Trial = TypeVar("Trial")
 
 
 @dataclass(frozen=True)
 class LevenbergMarquardt:
-    """Levenberg-Marquardt loop: a rejected step multiplies the damping by 8, an accepted one divides it by 5."""
+    """Levenberg-Marquardt loop: a rejected step raises the damping, an accepted one lowers it."""
 
     damping: float
     """Of the first step."""
@@ -48,11 +50,11 @@ class LevenbergMarquardt:
                 tried, trial = attempt(damping)
                 if tried < cost:
                     break
-                damping *= 8
+                damping *= DAMPING_UP
             else:
                 return cost
             accept(trial)
-            damping = max(damping / 5, self.least_damping)
+            damping = max(damping / DAMPING_DOWN, self.least_damping)
             gain, cost = (cost - tried) / cost, tried
             if gain < self.tolerance:
                 break

@@ -25,7 +25,7 @@ INLIER_PX = 1.0
 LEAST_INLIERS = 0.6
 """Share of inliers that an initialisation needs."""
 MIN_PARALLAX_PX = 0.5
-"""Parallax (image motion beyond rotation) that a bootstrap needs; tracks are good to 0.05 px."""
+"""Parallax (image motion beyond rotation) that a bootstrap needs; tracks are good to 0.05 px (decision 12)."""
 PARALLAX_NOISES = 5.0
 """Parallax over the tracks' noise that an initialisation needs: with less, depths are noise."""
 SAME_SCENE_CORRELATION = 0.8
@@ -34,6 +34,19 @@ WORSE_RATIO = 1.1
 """Cost of a rival over the best one above which it is worse..."""
 WORSE_T_RATIO, WORSE_T = 1.02, 5.0
 """... or above this smaller ratio, if a paired t-test over the tracks gives at least this t value."""
+MIN_TRACKS = 30
+"""Tracks through all views that an initialisation needs."""
+RANDOM_INVERSE_DEPTHS = (0.5, 1.5)
+"""Range of the random start."""
+COARSE_SEARCH, FINE_ITERATIONS, FINE_TOLERANCE = (15, 2.0), 40, 1e-3
+"""Iterations and scale in px of the first adjustment of a start; iterations and tolerance of the second."""
+RANSAC_CONFIDENCE, ESSENTIAL_INLIER_PX, PNP_INLIER_PX = 0.999, 0.5, 3.0
+"""Of the five-point start: probability of a sample without outliers, and largest errors of inliers of the essential
+matrix and of the poses between, whose points are still rough."""
+MIN_FIVE_POINT_TRACKS, DEPTH_LIMITS = 12, (0.05, 1e3)
+"""Points that this start needs, and the depths that they may have, in baselines."""
+INVERSE_DEPTH_RATIOS = (0.1, 10)
+"""Limits of an inverse depth over the median one where they are compared and mirrored."""
 MIRROR_BETTER_RATIO = 0.98
 """Cost of the depth-reversed result over the best one below which it takes its place."""
 
@@ -100,7 +113,7 @@ class InitialisationResult:
 def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = MIN_PARALLAX_PX) -> InitialisationResult:
     """Try all guesses on `views`. Accepts when there is enough parallax for the noise of the tracks, inliers > 60 % and
     every different outcome, the depth-reversed one above all, is clearly worse."""
-    if len(views.ids) < 30:
+    if len(views.ids) < MIN_TRACKS:
         return InitialisationResult(
             None, f"only {len(views.ids)} tracks span the views; more texture or light is needed", [], views.ids
         )
@@ -112,7 +125,7 @@ def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = MIN_PARALLAX
     count = len(views.ids)
     starts: dict[Guess, Callable[[], Bundle | None]] = {
         Guess.FLAT: lambda: _from_depth(views, np.ones(count)),
-        Guess.RANDOM: lambda: _from_depth(views, 1 / rng.uniform(0.5, 1.5, count)),
+        Guess.RANDOM: lambda: _from_depth(views, 1 / rng.uniform(*RANDOM_INVERSE_DEPTHS, count)),
         Guess.FIVE_POINT: lambda: _from_five_point(views),
     }
     tried: list[Hypothesis] = []
@@ -153,7 +166,9 @@ def _select_hypothesis(best: Hypothesis, tried: list[Hypothesis], ids: NDArray[n
 def _inverse_depth_correlation(a: Hypothesis, b: Hypothesis) -> float:
     """Correlation of the inverse depths: 1 for the same scene, about -1 where near and far are exchanged."""
     inverse = [1 / np.maximum(h.bundle.points[:, 2], 1e-3) for h in (a, b)]
-    near, far = (np.clip(q, 0.1 * np.median(q), 10 * np.median(q)) for q in inverse)
+    near, far = (
+        np.clip(q, INVERSE_DEPTH_RATIOS[0] * np.median(q), INVERSE_DEPTH_RATIOS[1] * np.median(q)) for q in inverse
+    )
     return float(np.corrcoef(near, far)[0, 1])
 
 
@@ -167,8 +182,8 @@ def _clearly_worse(rival: Hypothesis, best: Hypothesis) -> bool:
 
 
 def _converge(guess: Guess, bundle: Bundle, parallax: float) -> Hypothesis:
-    bundle.optimise(15, 2.0)
-    cost = bundle.optimise(40, SCALE_PX, tolerance=1e-3)
+    bundle.optimise(*COARSE_SEARCH)
+    cost = bundle.optimise(FINE_ITERATIONS, SCALE_PX, tolerance=FINE_TOLERANCE)
     depth = float(np.median(bundle.points[:, 2]))
     if depth > 0:
         bundle.points /= depth
@@ -234,20 +249,22 @@ def _from_five_point(views: Views) -> Bundle | None:
     """Relative pose of the first and last view from the essential matrix, the others by PnP."""
     k = views.intrinsics.matrix()
     first, last = views.pixels[0], views.pixels[-1]
-    essential, mask = cv2.findEssentialMat(first, last, k, cv2.RANSAC, 0.999, 0.5)
+    essential, mask = cv2.findEssentialMat(first, last, k, cv2.RANSAC, RANSAC_CONFIDENCE, ESSENTIAL_INLIER_PX)
     if essential is None or essential.shape != (3, 3):
         return None
     _, r, t, _ = cv2.recoverPose(essential, first, last, k, mask=mask)
     projections = k @ np.eye(3, 4), k @ np.hstack([r, t])
     homogeneous = cv2.triangulatePoints(*projections, first.T, last.T)
     points = (homogeneous[:3] / homogeneous[3]).T
-    ok = np.isfinite(points).all(1) & (points[:, 2] > 0.05) & (points[:, 2] < 1e3)
-    if ok.sum() < 12:
+    ok = np.isfinite(points).all(1) & (points[:, 2] > DEPTH_LIMITS[0]) & (points[:, 2] < DEPTH_LIMITS[1])
+    if ok.sum() < MIN_FIVE_POINT_TRACKS:
         return None
     points[~ok] = views.rays()[0][~ok] * np.median(points[ok, 2])
     rotations, centres = np.tile(np.eye(3), (len(views.pixels), 1, 1)), np.zeros((len(views.pixels), 3))
     for i in range(1, len(views.pixels)):
-        found, rvec, tvec, _ = cv2.solvePnPRansac(points[ok], views.pixels[i][ok], k, None, reprojectionError=3.0)
+        found, rvec, tvec, _ = cv2.solvePnPRansac(
+            points[ok], views.pixels[i][ok], k, None, reprojectionError=PNP_INLIER_PX
+        )
         if not found:
             return None
         rotation = cv2.Rodrigues(rvec)[0].T
@@ -258,5 +275,5 @@ def _from_five_point(views: Views) -> Bundle | None:
 def _mirrored(views: Views, bundle: Bundle) -> Bundle:
     """The depth-reversed start: translations negated, inverse depths mirrored about their median."""
     inverse = 1 / np.maximum(bundle.points[:, 2], 1e-3)
-    mirrored = np.clip(2 * np.median(inverse) - inverse, 0.1 * np.median(inverse), None)
+    mirrored = np.clip(2 * np.median(inverse) - inverse, INVERSE_DEPTH_RATIOS[0] * np.median(inverse), None)
     return _bundle(views, bundle.rotations.copy(), -bundle.centres, views.rays()[0] / mirrored[:, None])

@@ -18,19 +18,20 @@ from spiked.recon.odometry.sparse_map import MapBundle, Pose, SparseMap, Tracked
 from spiked.spline import Spline
 
 LONG_FRAMES, LONG_VIEWS = 12_000, 1000
-"""Frames or views with a pose from which on a path is long: shorter ones are adjusted as a whole, on a spline."""
+"""Frames or views with a pose from which on a path is long: shorter ones are adjusted as a whole, on a spline (decision
+15)."""
 KEYFRAME_PX = 4.0
-"""Image motion from one keyframe to the next."""
+"""Image motion from one keyframe to the next: 10 px triple the error, 2 px do not lower it (decision 15)."""
 WINDOW_KEYFRAMES, FIXED_KEYFRAMES = 24, 6
-"""Newest keyframes that are adjusted while tracking, and those before them that fix the gauge."""
+"""Newest keyframes that are adjusted while tracking, and those before them that fix the gauge (decision 15)."""
 ADJUST_EVERY = 3
-"""New keyframes from one adjustment to the next."""
+"""New keyframes from one adjustment to the next (decision 15)."""
 REFERENCE_KEYFRAMES = 30
-"""Newest keyframes from which tracks are triangulated, and to which the newest views are adjusted."""
+"""Newest keyframes from which tracks are triangulated, and to which the newest views are adjusted (decision 15)."""
 REFITTED_VIEWS = 48
 """Newest views that are fitted again after an adjustment while tracking; those before move with their keyframe."""
 LOOP_ROUNDS = 4
-"""Searches for loops, at most: each closes the first loop of the path that is open."""
+"""Searches for loops, at most: each closes the first loop of the path that is open (decision 15)."""
 WINDOW_ITERATIONS, LOOP_ITERATIONS, FINAL_ITERATIONS = 4, 4, 12
 TOLERANCE = 1e-3
 """Most iterations of an adjustment in the window, after a loop and at the end; relative gain of one that ends it."""

@@ -12,19 +12,20 @@ from spiked.recon.odometry.pnp import fit_pose
 from spiked.recon.odometry.sparse_map import Pose, SparseMap, TrackedView
 
 LEAST_APART_PX = 300.0
-"""Image motion between two views of a loop, at least: nearer ones share tracks."""
+"""Image motion between two views of a loop, at least: nearer ones share tracks (decision 15)."""
 EVERY_PX = 10.0
-"""Image motion from one view in which loops are searched to the next: a camera that stands still adds none."""
+"""Image motion from one view in which loops are searched to the next: a camera that stands still adds none (decision
+15)."""
 LOOP_SPAN_PX = 500.0
 """Image motion over which the closures of one loop may lie: their drift is taken as one."""
 MOST_SHARED = 15
-"""Tracks that two views of a loop share, at most."""
+"""Tracks that two views of a loop share, at most (decision 15)."""
 LEAST_INSIDE = 0.4
 """Share of the points of the earlier view that project into the later one by the path so far."""
 LEAST_MATCHES = 30
-"""Points that are found again, and agree with one pose."""
+"""Points that are found again, and agree with one pose (decision 15)."""
 LEAST_AGREEING = 0.7
-"""Share of the points found that agree with one pose."""
+"""Share of the points found that agree with one pose (decision 15)."""
 COARSE_LEVELS, FINE_LEVELS = 4, 2
 """Pyramid levels of the search around the projections, and around their common shift."""
 LOOP_REACH_PX = 0.6

@@ -25,9 +25,10 @@ from spiked.sensor import Intrinsics
 from spiked.spline import Spline, Waypoints
 
 WORST_PATH_ERROR = 0.03
-"""Predicted path error, relative to the path's RMS radius, above which the path is degraded and a warning is given."""
+"""Predicted path error, relative to the path's RMS radius, above which the path is degraded and a warning is given
+(decision 7)."""
 FINAL_STATE_VIEWS = 8
-"""The final state is that of most of the last 8 views: one noisy view does not decide it."""
+"""The final state is that of most of the last 8 views: one noisy view does not decide it (decision 10)."""
 MIN_GIVEN_POINTS = 10
 """Points in front of the camera that given poses have to explain."""
 

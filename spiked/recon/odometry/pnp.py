@@ -28,7 +28,8 @@ WORST_INLIERS = 0.5
 WORST_OVERLAP = 0.25
 """Tracking counts as degraded beyond any of these; overlap is the share of the tracks whose points are known."""
 LOST_CHI2, LOST_INLIERS = 25.0, 0.35
-"""A pose is rejected if points lie 5 times as far off as noise explains, or if a smaller share of them agrees."""
+"""A pose is rejected if points lie 5 times as far off as noise explains, or if a smaller share of them agrees (decision
+10)."""
 
 
 @dataclass(frozen=True)

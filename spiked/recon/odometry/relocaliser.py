@@ -14,7 +14,7 @@ KEYFRAME_EVERY = 8
 NEWEST_KEYFRAMES, OLDER_KEYFRAMES = 3, 12
 """Keyframes tried: the newest, and about so many of the older ones, evenly spaced."""
 RELOCALISED_CHI2, RELOCALISED_INLIERS = 4.0, 0.6
-"""Relocalisation needs points within twice their noise: blurred views match much by chance."""
+"""Relocalisation needs points within twice their noise: blurred views match much by chance (decision 10)."""
 REPROJECTION_SEARCH_PX = (0.5, 4.0)
 """Largest forward-backward error of a keyframe point matched again, and its largest distance from the projection."""
 REPROJECTED_INLIER_PX = 2 * INLIER_PX

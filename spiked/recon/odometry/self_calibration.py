@@ -9,6 +9,9 @@ from spiked.sensor import Intrinsics
 FIELDS_OF_VIEW_DEG = (60.0, 42.0, 80.0, 30.0, 100.0)
 """Horizontal fields of view tried, the likeliest first."""
 FIRST_DEG = FIELDS_OF_VIEW_DEG[0]
+"""Field of view assumed until one was estimated."""
+REFINEMENT_ITERATIONS, REFINEMENT_TOLERANCE = 30, 1e-4
+"""Of the adjustment with a free focal length that follows each trial."""
 FOCAL_ERROR_FACTOR = 10.0
 """True over predicted error of the focal length, as track errors are correlated over views (simulated recordings)."""
 FOCAL_TOLERANCE = 2e-3
@@ -50,7 +53,7 @@ def try_fields(views: Views, seed: int, min_parallax_px: float) -> tuple[Initial
             continue
         bundle = result.winner.bundle
         bundle.focal_free = True
-        cost = bundle.optimise(30, SCALE_PX, tolerance=1e-4)
+        cost = bundle.optimise(REFINEMENT_ITERATIONS, SCALE_PX, tolerance=REFINEMENT_TOLERANCE)
         if best is None or cost < best[0]:
             best = cost, result, bundle.intrinsics
     return (results[0], views.intrinsics) if best is None else best[1:]

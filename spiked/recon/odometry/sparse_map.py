@@ -21,7 +21,8 @@ TRIANGULATION_MIN_VIEWS, TRIANGULATION_MIN_SPREAD_PX, TRIANGULATION_MAX_ERROR_PX
 TRIANGULATION_MIN_SPREAD_NOISES = 3.0
 """Ray spread that a triangulation needs, over the noise of the tracks."""
 STILL_SHARE = 0.1
-"""Share of image motion below `STILL_PX` that counts along the path: most of it is noise of the tracks."""
+"""Share of image motion below `STILL_PX` that counts along the path: most of it is noise of the tracks (decision
+15)."""
 BORDER_PX = 8
 """Points projected nearer to the image border are not searched."""
 MIN_OBSERVATIONS = 3
@@ -29,7 +30,8 @@ MIN_OBSERVATIONS = 3
 MIN_BUNDLE_OBSERVATIONS = 60
 """Observations a bundle adjustment needs in all."""
 OUTLIER_NOISES, OUTLIER_PX, OUTLIER_VIEW_SHARE = 6.0, (0.5, 2.0), 0.3
-"""A point is dropped if its error exceeds 6 noises, clipped to 0.5 to 2 px, in over 30 % of its views: it moves."""
+"""A point is dropped if its error exceeds 6 noises, clipped to 0.5 to 2 px, in over 30 % of its views: it moves
+(decision 10)."""
 
 
 class Pose(NamedTuple):

@@ -17,6 +17,7 @@ MOVED_PX = 2.0
 LEAST_TRACKS = 30
 """Earlier tracks that a view needs for the decision."""
 LEAST_VIEWS = 3
+"""Views that the decision needs."""
 OBJECT_SHARE, OBJECT_TRACKS = 0.02, 8
 """Share of the observations and number of points that distinguish an object from wrong tracks."""
 

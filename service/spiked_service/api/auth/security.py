@@ -30,6 +30,7 @@ _OPEN = frozenset({"/healthz", "/readyz"})
 """Health checks, which need no token and reveal nothing about captures."""
 _EVENTS = "/api/v1/events"
 _POLICY_VIOLATION = 1008
+"""Close code for a client without the scope that it needs (RFC 6455, 7.4.1)."""
 _log = logger("spiked.security")
 _CHANGING = frozenset({"POST", "PUT", "PATCH", "DELETE"})
 _POLICY = {

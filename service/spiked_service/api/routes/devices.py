@@ -24,6 +24,7 @@ from spiked_service.store.catalogue import UnknownIdError
 DeviceId = Annotated[str, Path(description="As `GET devices` names it, percent-encoded.", max_length=4096)]
 
 _LOOK_S = 2.0
+"""Interval at which devices are checked, seconds."""
 _log = logger("spiked.devices")
 
 

@@ -19,6 +19,7 @@ from spiked_service.events.bus import PUBLISHED, Bus, Subscription, Topic
 CAPACITY = 1024
 """Capacity of a client's queue, messages: some seconds of poses."""
 _PREVIEWS = 2
+"""Pictures queued for a client; older ones are dropped."""
 _HEARTBEAT_S = 15.0
 """Interval of comments, which keep proxies from closing a silent stream and detect lost connections."""
 _TURN = 4
@@ -26,6 +27,7 @@ _TURN = 4
 CLOSE_SEND_ONLY = 1003
 """Close code for a client that writes to the stream (RFC 6455, 7.4.1)."""
 _STUCK = 1013
+"""Close code "try again later" for a client that takes nothing."""
 
 
 @dataclass(frozen=True)

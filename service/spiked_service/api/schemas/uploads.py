@@ -9,6 +9,7 @@ from spiked.sensor import BitOrder, Layout, Mosaic
 from spiked_service.api.schemas.base import Id, In, IntrinsicsModel, Name, Notes, Out, examples
 
 MAX_UPLOAD_BYTES = 1 << 42
+"""Upper bound of the schema, 4 TiB; `limit_upload_bytes` is the limit in effect."""
 
 
 class GeometryModel(In):

@@ -11,8 +11,11 @@ from spiked_service.api.schemas.base import Finite, In, IntrinsicsModel, Quatern
 from spiked_service.results.view_renderer import Output, Pose
 
 MAX_VIEWS = 100
+"""Views of one request."""
 MAX_SIDE = 4096
+"""Sides of a view, pixels: the renderer's own limit."""
 MAX_PIXELS = 32_000_000
+"""Pixels of all views of one request: 32 views of 1000x1000."""
 
 _Length = Annotated[StrictFloat, Field(ge=-1e9, le=1e9)]
 _Light = Annotated[StrictFloat, Field(ge=0, le=1e6)]

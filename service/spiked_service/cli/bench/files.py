@@ -13,6 +13,7 @@ from spiked.sensor import Sensor
 
 _BATCH = 128  # frames a write
 _PLAIN_BYTES = 1 << 20
+"""Bytes of a plain write, for comparison."""
 
 
 def rows(folder: Path | None = None, *, megabytes: int = 256) -> list[Measurement]:

@@ -11,6 +11,7 @@ from spiked.render import benchmark as renderer
 from spiked.sensor import Sensor
 
 WINDOW_FRAMES = 40
+"""Frames of a spike-aligned window."""
 _MEMORY = """
 import sys
 import numpy as np

@@ -20,8 +20,11 @@ from spiked.sensor import Sensor
 from spiked_service.workers.roles.recorder import record
 
 _START_S = 30.0
+"""Time for the consumers to attach, seconds."""
 _PREVIEW_S = 1 / 30
+"""Pause of the preview between images, seconds."""
 _WINDOW_FRAMES = 40
+"""Frames of a spike-aligned window."""
 
 
 @dataclass(frozen=True)

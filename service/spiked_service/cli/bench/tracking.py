@@ -18,6 +18,7 @@ from spiked.simulate import MotionKind, SimulatedCamera
 from spiked.trajectory import Trajectory
 
 CHUNK_FRAMES = 64
+"""Frames fed at a time."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,9 @@ from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import output, report_warning
 
 _BLOCK_BYTES = 1 << 20
+"""Bytes read at a time."""
 _CHUNK_FRAMES = 64
+"""Frames written at a time."""
 
 
 class Form(StrEnum):

@@ -11,6 +11,7 @@ from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import output, report_warning
 
 _SAMPLED_FRAMES = 4096
+"""Frames from which the mean rate is computed."""
 
 
 def info(

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from spiked_service.cli.watch import Watch
 
 INTERRUPTED = 130
+"""Exit status after Ctrl-C: 128 + SIGINT, as in shells."""
 _STDERR = 2
 _FEED_SHARE = 0.3
 """Part of the progress bar for feeding; the refinement has the rest."""

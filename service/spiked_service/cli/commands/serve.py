@@ -22,6 +22,7 @@ from spiked_service.store.rows import CaptureState, Plan
 from spiked_service.store.snapshot import Snapshot
 
 _FOLLOW_S = 2.0
+"""Interval at which `--follow` checks the newest capture, seconds."""
 
 
 # Longer than 60 lines, because each option is a parameter.

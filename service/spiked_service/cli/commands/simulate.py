@@ -21,6 +21,7 @@ from spiked_service.cli.console import messages, output
 from spiked_service.cli.recording_flags import with_optics
 
 _FOV_DEG = 60.0
+"""Horizontal field of view if none is given, degrees."""
 _LINE_S = 10.0
 """Time between two lines of progress where standard error is not a terminal."""
 

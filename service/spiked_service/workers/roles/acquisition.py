@@ -17,6 +17,7 @@ from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.messages import AcquisitionCommand, RingOpened, Warned
 
 _BLOCK_FRAMES = 8
+"""Frames of a slot."""
 _UNPACED_SLOTS = 64
 """Ring slots of a source that can block: its largest lead over the slowest reader.
 

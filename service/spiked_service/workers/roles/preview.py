@@ -20,14 +20,19 @@ from spiked_service.workers.messages import PreviewCommand, PreviewKind, Preview
 _BLOCKS = 4
 """Blocks per image; the window excludes one at either end, whose spikes complete the intervals."""
 _PERIOD_S = 0.15
+"""Pause between two sets of images, seconds."""
 _WAIT_S = 0.1
+"""Longest wait for frames, seconds, so that the worker can leave."""
 _BINS = 64
+"""Bins of the histogram of rates, 0 to 1 spike a frame."""
 _HOT_RATE = 0.3
 """Spikes a frame by which a hot pixel exceeds the median of its neighbours."""
 _HOT_MOST = 64
+"""Hot pixels listed, the worst first."""
 _MEMORY = 0.85
 """Weight of the accumulated image when another is added."""
 _QUALITY = 85
+"""WebP quality, 0 to 100."""
 
 Image = NDArray[np.float32]
 

@@ -36,15 +36,19 @@ from spiked_service.workers.messages import (
 
 _log = logging.getLogger("spiked.reconstruction")
 _WAIT_S = 0.05
+"""Longest wait for frames, seconds."""
 _SPARE_S = 0.1
 """Mapping time per step while no frames wait; short compared with the time that the ring buffers."""
 _UNPACED_FRAMES = 32
+"""Frames between two times of mapping, of a source that can block."""
 _UNPACED_MAPPING_S = 0.3
 """Mapping time after every `_UNPACED_FRAMES` frames of a source that can block."""
 _PUBLISH_S = 1.5
+"""Least time between two published versions, seconds."""
 _PUBLISH_SHARE = 0.1
 """Largest share of the time spent on publishing: trajectories of minutes take seconds to write."""
 _STATUS_S = 0.2
+"""Interval of status events, seconds."""
 _PUNCTUAL_S = 0.04
 """Lateness up to which the mapper runs after every window of a skipping tracker, ..."""
 _MOST_UNMAPPED = 4
@@ -54,6 +58,7 @@ _SKIPPING_MAPPING_S = 0.01
 _LIVE_NICE = 5
 """Mapping uses all cores; acquisition and rendering of views have priority."""
 _OFFLINE_NICE = 10
+"""Niceness of a reconstruction from a recording: live captures have priority."""
 
 
 def run_reconstruction(command: ReconstructionCommand, channel: WorkerChannel) -> None:

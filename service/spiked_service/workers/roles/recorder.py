@@ -20,6 +20,7 @@ from spiked_service.workers.messages import RecorderCommand, RecordingEnded, Rec
 
 _log = logging.getLogger("spiked.recorder")
 _WAIT_S = 0.1
+"""Longest wait for frames, seconds."""
 _BATCH_BLOCKS = 16
 """Most blocks per write."""
 _GATHER_S = 0.005
@@ -27,10 +28,13 @@ _GATHER_S = 0.005
 _LATE_SHARE = 0.25
 """Share of the ring: with a larger backlog, writes go through the page cache."""
 _CLOCK_NS = 1_000_000_000
+"""Least time between two clock pairs in the index, ns."""
 _LOOK_S = 0.1
+"""Interval at which a frame is checked for spikes, seconds: a stream of only zeros or only ones is no picture."""
 _DRAIN_S = 0.5
 """Time to wait for the last frames after a stop."""
 _NICE = -5
+"""Niceness: above the other readers."""
 
 
 def run_recorder(command: RecorderCommand, channel: WorkerChannel) -> None:

@@ -10,7 +10,9 @@ from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.messages import UploadChecked, UploadCommand
 
 _CHUNK_BYTES = 4 << 20
+"""Bytes hashed at a time."""
 _LARGEST_SIDE = 16384
+"""Pixels of a side, at most."""
 
 
 def run_upload(command: UploadCommand, channel: WorkerChannel) -> None:

@@ -9,8 +9,8 @@ from spiked_service.results.image_encoding import ImageFormat
 
 Version = Annotated[
     int | None,
-    IN_DIGITS,
     Query(ge=1, le=LARGEST_INTEGER, description="Default: the newest; `GET versions` lists them."),
+    IN_DIGITS,
 ]
 WishedImage = Annotated[ImageFormat | None, Query(description="Takes precedence over Accept; the default is PNG.")]
 

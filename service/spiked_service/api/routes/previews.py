@@ -26,8 +26,8 @@ from spiked_service.workers.messages import PreviewKind
 
 Frame = Annotated[
     int | None,
-    IN_DIGITS,
     Query(ge=0, le=LARGEST_INTEGER, description="Absolute index of a recorded frame. Default: the newest frames."),
+    IN_DIGITS,
 ]
 Gain = Annotated[float, Query(ge=0.001, le=1000, description="Factor of the brightness.")]
 White = Annotated[

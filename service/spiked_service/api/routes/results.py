@@ -23,11 +23,11 @@ from spiked_service.store.rows import ReconstructionRow
 
 FromS = Annotated[float | None, Query(ge=0, le=1e9, description="First time, seconds since the start of the capture.")]
 ToS = Annotated[float | None, Query(ge=0, le=1e9, description="End time, not included, in seconds.")]
-Step = Annotated[int, IN_DIGITS, Query(ge=1, le=1_000_000, description="Every n-th pose.")]
+Step = Annotated[int, Query(ge=1, le=1_000_000, description="Every n-th pose."), IN_DIGITS]
 MaxSplats = Annotated[
     int | None,
-    IN_DIGITS,
     Query(ge=1, le=10_000_000, description="Most splats: a fixed sample is returned. Default: all."),
+    IN_DIGITS,
 ]
 
 _TEXT: dict[str, Any] = {"schema": {"type": "string"}}

@@ -129,8 +129,8 @@ def _in_digits(text: object) -> object:
 
 
 IN_DIGITS = BeforeValidator(_in_digits)
-"""An integer of a query: digits and a sign."""
-Limit = Annotated[int, IN_DIGITS, Query(ge=1, le=200, description="Most items of an answer.")]
+"""An integer of a query: digits and a sign. Stated after `Query`, whose limits would else be left out of the schema."""
+Limit = Annotated[int, Query(ge=1, le=200, description="Most items of an answer."), IN_DIGITS]
 Cursor = Annotated[
     str | None,
     Query(min_length=1, max_length=64, description="`next_cursor` of the page before."),

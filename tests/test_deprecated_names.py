@@ -8,7 +8,7 @@ import pytest
 from spiked_driver import Faults, FaultySource, Loss, Source, acquire, open_source
 
 import spiked.ring
-from spiked.ring import DeviceState, DeviceStatus, LossCause, Ring, RingLayout, RingWriter
+from spiked.ring import DeviceState, DeviceStatus, LossCause, Policy, Ring, RingLayout, RingReader, RingWriter
 from spiked.sensor import Sensor
 
 SENSOR = Sensor(16, 4, 1000.0)
@@ -46,6 +46,13 @@ def test_device_status_of_a_ring() -> None:
         status = writer.status().writer
         with warned("WriterStatus.condition", "device_status"):
             assert status.condition == DeviceStatus(DeviceState.ARMED, "why")  # type: ignore[attr-defined]
+
+
+def test_frames_that_a_reader_has_read() -> None:
+    with RingWriter.create(SENSOR, slots=8) as writer, RingReader.attach(writer.name, Policy.LATEST, "one"):
+        (status,) = writer.status().readers
+        with warned("ReaderStatus.received", "frames_read"):
+            assert status.received == status.frames_read == 0  # type: ignore[attr-defined]
 
 
 def test_grace_of_a_ring() -> None:

@@ -216,7 +216,7 @@ def test_as_context_manager_frames_say_afterwards_whether_they_were_whole(writer
     with frames as data:
         assert data[3].view(np.int64)[0] == 3
     assert frames.valid()
-    assert writer.status().readers[0].received == 8
+    assert writer.status().readers[0].frames_read == 8
 
 
 def test_a_storm_of_gaps_without_frames_keeps_the_account(writer: RingWriter) -> None:
@@ -358,7 +358,7 @@ def test_status_is_visible_from_outside_and_outlives_the_name() -> None:
     assert (before.writer.committed, before.writer.next_frame, before.writer.end) == (16, 20, None)
     assert before.writer.lost == {LossCause.DEVICE: 0, LossCause.USB: 4, LossCause.RING: 0, LossCause.DISK: 0}
     (row,) = before.readers
-    assert (row.consumer, row.received, row.lost, row.lag_frames, row.alive) == ("test", 16, 4, 0, True)
+    assert (row.consumer, row.frames_read, row.lost, row.lag_frames, row.alive) == ("test", 16, 4, 0, True)
     assert after.writer.end is EndReason.STOPPED
 
 
@@ -456,7 +456,7 @@ steps = st.lists(
 
 @settings(max_examples=100, deadline=None)
 @given(steps)
-def test_whatever_happens_each_frame_is_received_or_lost_once(script: list[Step]) -> None:
+def test_whatever_happens_each_frame_is_read_or_lost_once(script: list[Step]) -> None:
     with RingWriter.create(SENSOR, slots=8) as writer:
         readers = [attach(writer, policy) for policy in Policy]
         taken: list[list[Item]] = [[] for _ in readers]
@@ -473,7 +473,7 @@ def test_whatever_happens_each_frame_is_received_or_lost_once(script: list[Step]
                 if kind == "read" and isinstance(item, Frames):
                     check_content(item)
             for row in writer.status().readers:
-                assert row.received + row.lost == row.next_frame
+                assert row.frames_read + row.lost == row.next_frame
         writer.end(EndReason.FINISHED)
         for reader, items in zip(readers, taken, strict=True):
             items.extend(drain(reader))
@@ -481,7 +481,7 @@ def test_whatever_happens_each_frame_is_received_or_lost_once(script: list[Step]
             told = [item for item in items if isinstance(item, Gap) or (isinstance(item, Frames) and item.valid())]
             assert assert_contiguous(told) == writer.next_frame
         for row in writer.status().readers:
-            assert row.received + row.lost == row.next_frame == writer.next_frame
+            assert row.frames_read + row.lost == row.next_frame == writer.next_frame
 
 
 def test_a_reader_may_start_at_a_frame_that_the_ring_still_holds() -> None:

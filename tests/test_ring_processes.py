@@ -158,7 +158,7 @@ def test_stalling_readers_of_an_impatient_writer_account_for_every_frame(seed: i
         while any(reader.process.poll() is None for reader in readers):
             told = ring.status()
             assert told.writer.committed + sum(told.writer.lost.values()) == told.writer.next_frame
-            assert all(row.received + row.lost == row.next_frame for row in told.readers)
+            assert all(row.frames_read + row.lost == row.next_frame for row in told.readers)
             time.sleep(0.001)
         accounts = [reader.account() for reader in readers]
         assert {account["frames"] for account in accounts} == {ring.status().writer.next_frame}
@@ -197,7 +197,7 @@ def test_a_killed_reader_holds_back_neither_writer_nor_others(seed: int, kill_at
         victim.kill()
         dead = row(ring, f"lossless {seed}")
         assert not dead.alive
-        assert dead.received + dead.lost == dead.next_frame
+        assert dead.frames_read + dead.lost == dead.next_frame
         account = survivor.account()
         told = ring.status().writer
         assert account["reason"] == "finished"

@@ -861,8 +861,12 @@ class ConsumerOut(BaseModel):
         Policy,
         Field(description="latest skips frames by intention; the others want them all."),
     ]
-    received: int
-    lost: int
+    frames_read: Annotated[int, Field(description="Frames that it read intact.")]
+    received: Annotated[int, Field(deprecated=True, description="Deprecated: use frames_read.")]
+    lost: Annotated[
+        int,
+        Field(description="Frames that it did not read, of any cause; frames_read + lost is its next frame."),
+    ]
     lag_frames: int
     fill: Annotated[
         float,
@@ -881,7 +885,7 @@ class CountersOut(BaseModel):
     )
     device: DeviceState
     device_reason: str
-    received: int
+    received: Annotated[int, Field(description="Frames written into the ring.")]
     lost: Annotated[dict[str, int], Field(description="By cause: device, usb, ring, disk.")]
     next_frame: int
     consumers: list[ConsumerOut]

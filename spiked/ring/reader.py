@@ -44,7 +44,7 @@ class Frames:
         return self._reader._holds(self._slot) if self._intact is None else self._intact
 
     def release(self) -> bool:
-        """Return the slot. True if the frames were intact until now; they then count as received.
+        """Return the slot. True if the frames were intact until now; they then count as read.
 
         Otherwise they count as lost and the next item is their gap. Taking the next item releases, too.
         """

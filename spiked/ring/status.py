@@ -11,15 +11,16 @@ from spiked.ring.process import is_alive, own_identity, pid_of
 from spiked.ring.segment import RingLayout, Segment, attach_segment
 
 
+@renamed_attributes(received="frames_read")
 @dataclass(frozen=True)
 class ReaderStatus:
-    """Progress of one reader; `received + lost == next_frame` always."""
+    """Progress of one reader; `frames_read + lost == next_frame` always."""
 
     consumer: str
     policy: Policy
     pid: int
     alive: bool
-    received: int
+    frames_read: int
     """Frames that it released intact."""
     lost: int
     """Frames of the gaps that it got, of any cause."""

@@ -69,7 +69,7 @@ def test_frames_outside_the_windows_are_skipped_and_counted() -> None:
         writer.end(EndReason.FINISHED)
         assert isinstance(latest.take(1.0), End)
         counters = it.status().readers[0]
-        assert (counters.received, counters.lost) == (192, 40)
+        assert (counters.frames_read, counters.lost) == (192, 40)
         assert latest.skipped == 192 - 64
 
 

@@ -100,7 +100,7 @@ class _Totals:
         now.update({("lost", device, cause): count for cause, count in counters.lost.items()})
         now["lost", device, str(LossCause.DISK)] += sample.lost_on_disk
         for consumer in counters.consumers:
-            now["taken", device, consumer.name] += consumer.received
+            now["read", device, consumer.name] += consumer.frames_read
             now["missed", device, consumer.name] += consumer.lost
         with self._lock:
             before = self._seen.get(sample.capture_id, Counter())
@@ -152,9 +152,9 @@ class _Collector(Collector):
                 "Frames lost before the ring or on the disk, by cause.",
                 labels=["device", "cause"],
             ),
-            "taken": CounterMetricFamily("spiked_consumer_frames", "Frames that a consumer read.", labels=consumer),
+            "read": CounterMetricFamily("spiked_consumer_frames", "Frames that a consumer read.", labels=consumer),
             "missed": CounterMetricFamily(
-                "spiked_consumer_frames_lost", "Frames that a consumer did not receive.", labels=consumer
+                "spiked_consumer_frames_lost", "Frames that a consumer did not read.", labels=consumer
             ),
         }
         totals = Counter(self._totals.totals)

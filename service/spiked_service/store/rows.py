@@ -3,6 +3,9 @@
 from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
+from typing import Annotated
+
+from pydantic import AliasChoices, Field
 
 from spiked.recon import State
 from spiked.ring import DeviceState, Policy, RingStatus
@@ -111,7 +114,8 @@ class ConsumerCounters:
 
     name: str
     policy: Policy
-    received: int
+    frames_read: Annotated[int, Field(validation_alias=AliasChoices("frames_read", "received"))]
+    """Called `received` in rows of 0.1."""
     lost: int
     lag_frames: int
     fill: float
@@ -144,7 +148,7 @@ class Counters:
                 ConsumerCounters(
                     reader.consumer,
                     reader.policy,
-                    reader.received,
+                    reader.frames_read,
                     reader.lost,
                     reader.lag_frames,
                     reader.fill,

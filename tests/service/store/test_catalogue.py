@@ -9,12 +9,14 @@ from pathlib import Path
 
 import psutil
 import pytest
+from pydantic import TypeAdapter
 from spiked_service.base.ids import is_id, new_id
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.catalogue import Catalogue, StoreError, UnknownIdError
 from spiked_service.store.rows import (
     CaptureRow,
     CaptureState,
+    ConsumerCounters,
     Grade,
     JobState,
     Origin,
@@ -50,6 +52,12 @@ def test_ids_sort_as_they_were_made_also_within_a_millisecond() -> None:
     assert ids == sorted(set(ids))
     assert all(is_id(one) for one in ids)
     assert not any(is_id(text) for text in ("", "..", ids[0].upper() + "/", f"{ids[0]}\n", "../" + ids[0]))
+
+
+def test_counters_of_the_last_release_are_read() -> None:
+    stored = {"name": "recorder", "policy": "priority", "received": 7, "lost": 1}
+    counters = TypeAdapter(ConsumerCounters).validate_python(stored | {"lag_frames": 0, "fill": 0.0, "lagging": False})
+    assert (counters.frames_read, counters.lost) == (7, 1)
 
 
 def test_a_row_comes_back_as_it_was_put_after_closing_too(tmp_path: Path) -> None:

@@ -34,8 +34,9 @@ class ConsumerOut(Out):
 
     name: str
     policy: Policy = Field(description="latest skips frames by intention; the others want them all.")
-    received: int
-    lost: int
+    frames_read: int = Field(description="Frames that it read intact.")
+    received: int = Field(description="Deprecated: use frames_read.", deprecated=True)
+    lost: int = Field(description="Frames that it did not read, of any cause; frames_read + lost is its next frame.")
     lag_frames: int
     fill: float = Field(description="Its lag as a part of what it may lag; at 1 it loses frames.")
     lagging: bool
@@ -46,7 +47,7 @@ class CountersOut(Out):
 
     device: DeviceState
     device_reason: str
-    received: int
+    received: int = Field(description="Frames written into the ring.")
     lost: dict[str, int] = Field(description="By cause: device, usb, ring, disk.")
     next_frame: int
     consumers: list[ConsumerOut]
@@ -62,7 +63,7 @@ class CountersOut(Out):
             received=counters.received,
             lost=dict(counters.lost),
             next_frame=counters.next_frame,
-            consumers=[ConsumerOut(**vars(consumer)) for consumer in counters.consumers],
+            consumers=[ConsumerOut(**vars(consumer), received=consumer.frames_read) for consumer in counters.consumers],
         )
 
 

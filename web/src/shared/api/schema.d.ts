@@ -1295,9 +1295,21 @@ export interface components {
             name: string;
             /** @description latest skips frames by intention; the others want them all. */
             policy: components["schemas"]["Policy"];
-            /** Received */
+            /**
+             * Frames Read
+             * @description Frames that it read intact.
+             */
+            frames_read: number;
+            /**
+             * Received
+             * @deprecated
+             * @description Deprecated: use frames_read.
+             */
             received: number;
-            /** Lost */
+            /**
+             * Lost
+             * @description Frames that it did not read, of any cause; frames_read + lost is its next frame.
+             */
             lost: number;
             /** Lag Frames */
             lag_frames: number;
@@ -1317,7 +1329,10 @@ export interface components {
             device: components["schemas"]["DeviceState"];
             /** Device Reason */
             device_reason: string;
-            /** Received */
+            /**
+             * Received
+             * @description Frames written into the ring.
+             */
             received: number;
             /**
              * Lost

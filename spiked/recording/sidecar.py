@@ -1,6 +1,8 @@
 """The sidecar of a recording, `NAME.json` beside `NAME.dat`, and the `config.yaml` of SpikeCV's data sets."""
 
 import os
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,14 @@ class Gap(_Strict):
     count: StrictInt = Field(gt=0)
     cause: str
     """Cause of the loss: device, usb, ring or disk."""
+
+
+def lost_by_cause(gaps: Iterable[Gap]) -> dict[str, int]:
+    """Lost frames by cause."""
+    found: Counter[str] = Counter()
+    for gap in gaps:
+        found[gap.cause] += gap.count
+    return dict(found)
 
 
 class ClockPair(_Strict):

@@ -29,11 +29,13 @@ from spiked_service.workers.process import StandbyWorker
 from spiked.errors import ConfigurationError
 from spiked.poses import PoseFile
 from spiked.recon import Reconstructor
-from spiked.recording import open_recording, verify
+from spiked.recording import RecordingWriter, open_recording, verify
+from spiked.ring import LossCause
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
 
 from .survival import (
+    SENSOR,
     SMALL,
     assert_holds,
     children,
@@ -492,6 +494,18 @@ def test_a_disk_that_is_filled_during_a_capture_accounts_for_every_frame(
         data_store.captures.purge(row.id)
         again = over(data_store, data_store.captures.start(recorded_only(source, frames=100)).id).row
         assert again.verdict is not None and again.state is CaptureState.COMPLETE
+
+
+def test_a_replayed_loss_to_the_disk_is_counted_once(data_store: DataStore, tmp_path: Path) -> None:
+    content = np.random.default_rng(0).integers(0, 256, (100, SENSOR.frame_bytes), np.uint8)
+    with RecordingWriter(tmp_path / "full.dat", SENSOR) as writer:
+        writer.append(content)
+        writer.gap(100, 30, LossCause.DISK)
+        writer.append(content)
+    done = over(data_store, data_store.captures.start(recorded_only(f"replay:{tmp_path / 'full.dat'}?pace=max")).id)
+    assert done.row.recording is not None and done.row.recording.lost_by_cause == {"disk": 30}
+    assert done.counters is not None and done.counters.lost["disk"] == 30
+    assert lost_on_disk(data_store) == 30
 
 
 def test_a_disk_gone_read_only_is_survived_and_made_up_for(small_disk: Path, tmp_path: Path) -> None:

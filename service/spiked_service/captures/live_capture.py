@@ -311,12 +311,12 @@ class LiveCapture:
         self._reconstructions.wake_queue()
 
     def _complete_recording(self, counters: Counters) -> None:
-        """Count frames that were received and not recorded as lost; state the reason if none was received."""
+        """Count frames that are not in the recording as lost; state the reason if the capture has none."""
         last = counters.next_frame if self._stop_frame is None else min(counters.next_frame, self._stop_frame)
-        received = last - self._first_frame
-        if received <= 0 and not self.row.reason:
+        frames = last - self._first_frame
+        if frames <= 0 and not self.row.reason:
             self._row.set(reason=f"no frames: {_NO_FRAMES[self._away]}")
-        if self.row.plan.record and received > 0:
+        if self.row.plan.record and frames > 0:
             path = self._folder.recording(self.id)
-            recording, verdict = completed(path, received, self.row.recording, self.row.verdict)
+            recording, verdict = completed(path, frames, self.row.recording, self.row.verdict)
             self._row.set(recording=recording, verdict=verdict)

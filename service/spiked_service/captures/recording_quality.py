@@ -1,7 +1,6 @@
 """Quality of a recording from the report or the files of its recorder; `spiked verify` checks every byte."""
 
 from collections import Counter
-from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +8,6 @@ from pathlib import Path
 from spiked.errors import RecordingError
 from spiked.recording import (
     LIVE,
-    Gap,
     RecordingWriter,
     Recovered,
     Sidecar,
@@ -18,6 +16,7 @@ from spiked.recording import (
     sidecar_path,
     write_sidecar,
 )
+from spiked.recording.sidecar import lost_by_cause
 from spiked.ring import LossCause
 from spiked.sensor import Sensor
 from spiked_service.store.rows import Grade, Quality, Recorded
@@ -94,14 +93,6 @@ def reassess(path: Path) -> tuple[Recorded, Quality, bool]:
     return Recorded(frames, frames * frame_bytes, lost=lost, lost_by_cause=causes), verdict, found.was_finished
 
 
-def lost_by_cause(gaps: Iterable[Gap]) -> dict[str, int]:
-    """Lost frames by cause."""
-    found: Counter[str] = Counter()
-    for gap in gaps:
-        found[gap.cause] += gap.count
-    return dict(found)
-
-
 def recovered(path: Path) -> tuple[Recovered, tuple[str, ...]]:
     """Recover a recording, without its index if that is unreadable; and the problems found. Raises RecordingError."""
     try:
@@ -134,22 +125,20 @@ def write_missing_sidecar(path: Path, sensor: Sensor) -> bool:
     return True
 
 
-def completed(
-    path: Path, received: int, recording: Recorded | None, verdict: Quality | None
-) -> tuple[Recorded, Quality]:
-    """Recording and quality of a capture whose source sent `received` frames, those lost on the way included.
+def completed(path: Path, frames: int, recording: Recorded | None, verdict: Quality | None) -> tuple[Recorded, Quality]:
+    """Recording and quality of a capture of `frames` frames, those lost before the ring included.
 
     Frames after the end of the recording count as lost to the disk, and are appended to the sidecar as a gap.
     """
     recording = recording or Recorded(0, 0)
     verdict = verdict or Quality(Grade.BAD, ("no frame was recorded",))
-    missing = received - recording.frames - recording.lost
+    missing = frames - recording.frames - recording.lost
     if missing <= 0:
         return recording, verdict
     with suppress(RecordingError), RecordingWriter.resume(path, durability=LIVE) as writer:
         writer.gap(writer.next_frame, missing, LossCause.DISK)
     grade = Grade.BAD if verdict.grade is Grade.BAD else Grade.DEGRADED
-    reason = f"the last {missing} of {received} frames were not recorded"
+    reason = f"the last {missing} of {frames} frames were not recorded"
     causes = Counter(recording.lost_by_cause) + Counter({str(LossCause.DISK): missing})
     counted = replace(recording, lost=recording.lost + missing, lost_by_cause=dict(causes))
     return counted, Quality(grade, (*verdict.reasons, reason))

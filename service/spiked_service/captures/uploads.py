@@ -136,7 +136,10 @@ class Uploads:
                 raise UploadError(f"{row.offset_bytes} of {row.bytes} bytes were received; send the rest first")
             stated = json.loads(row.geometry or "{}")
             checked = _checked(self._folder.upload(upload_id), row, stated.get("geometry"))
-            recorded = Recorded(checked.frames, checked.bytes, lost=checked.lost, sha256=checked.sha256)
+            lost = checked.lost
+            recorded = Recorded(
+                checked.frames, checked.bytes, lost=sum(lost.values()), lost_by_cause=lost, sha256=checked.sha256
+            )
             verdict = Quality(Grade(checked.grade), checked.reasons)
             capture_id = self._move_to_capture(row, checked.sensor, recorded, verdict, stated.get("notes", ""))
             captures.publish(capture_id)

@@ -8,6 +8,7 @@ from spiked.ring import LossCause
 from spiked_service.captures.captures import Captures
 from spiked_service.operations.metrics import CaptureSample, MetricsSource
 from spiked_service.reconstructions.queue import Reconstructions
+from spiked_service.store.rows import Counters, Recorded
 from spiked_service.workers.messages import Role
 
 
@@ -22,8 +23,7 @@ def metrics_source_of(captures: Captures, reconstructions: Reconstructions, data
                 continue
             if over:
                 counted.add(snapshot.id)
-            recording = snapshot.row.recording
-            on_disk = 0 if recording is None else recording.lost_by_cause.get(LossCause.DISK, 0)
+            on_disk = lost_behind_ring(snapshot.row.recording, snapshot.counters)
             yield CaptureSample(snapshot.id, device_name(snapshot.row.source), snapshot.counters, over, on_disk)
 
     def workers() -> dict[str, int]:
@@ -38,6 +38,16 @@ def metrics_source_of(captures: Captures, reconstructions: Reconstructions, data
         workers_by_role=workers,
         data=lambda: data,
     )
+
+
+def lost_behind_ring(recording: Recorded | None, counters: Counters) -> int:
+    """Frames that the ring had and the disk did not take.
+
+    A replayed recording brings gaps of cause disk through the ring, which counts them: its copy lists them again.
+    """
+    if recording is None:
+        return 0
+    return max(0, recording.lost_by_cause.get(LossCause.DISK, 0) - counters.lost.get(LossCause.DISK, 0))
 
 
 def device_name(source: str) -> str:

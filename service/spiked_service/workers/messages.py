@@ -254,8 +254,8 @@ class UploadChecked(BaseModel):
     sensor: Sensor
     frames: int
     bytes: int
-    lost: int
-    """Frames in the gaps that its sidecar lists."""
+    lost: dict[str, int]
+    """Frames in the gaps that its sidecar lists, by cause."""
     sha256: str
     grade: str
     """Grade as `spiked verify` gives it."""

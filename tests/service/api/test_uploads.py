@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 
 from spiked.client import ApiError, GeometryModel, IntrinsicsModel, ReconstructionOptions
+from spiked.recording import RecordingWriter
+from spiked.sensor import Sensor
 
 from ..survival import moving_recording
 from .conftest import write_recording
 
 CHUNK = {"Content-Type": "application/octet-stream"}
+SENSOR = Sensor(96, 64, 20_000.0)
 
 
 @pytest.fixture
@@ -61,6 +64,17 @@ def test_an_upload_becomes_a_capture(service: Any, recording: Path) -> None:
     picture = cv2.imdecode(np.frombuffer(small.content, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert picture is not None and picture.shape[1] == 200 and picture.std() > 10
     assert service.http.get(f"captures/{capture.id}/thumbnail").headers["etag"] == small.headers["etag"]
+
+
+def test_an_upload_states_what_was_lost_and_why(service: Any, tmp_path: Path) -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (50, SENSOR.frame_bytes), np.uint8)
+    with RecordingWriter(tmp_path / "gaps.dat", SENSOR) as writer:
+        for first, count, cause in ((50, 7, "usb"), (107, 3, "disk"), (160, 5, "usb")):
+            writer.append(frames)
+            writer.gap(first, count, cause)
+    recording = service.client.upload(tmp_path / "gaps.dat").recording
+    assert (recording.frames, recording.lost) == (150, 15)
+    assert recording.lost_by_cause == {"usb": 12, "disk": 3}
 
 
 def test_an_upload_can_be_reconstructed(service: Any, tmp_path: Path) -> None:

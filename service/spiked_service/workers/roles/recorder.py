@@ -4,7 +4,6 @@ import logging
 import os
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from spiked.errors import RecordingError
 from spiked.recording import LIVE, RecordingWriter
+from spiked.recording.sidecar import lost_by_cause
 from spiked.ring import ClockPair, End, EndReason, Frames, Gap, LossCause, Policy, RingReader
 from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.messages import RecorderCommand, RecordingEnded, RecordingFailed
@@ -198,14 +198,11 @@ class RecordingBuffer:
             self._gap(count, cause)
 
     def account(self, end: End | None) -> RecordingEnded:
-        lost: Counter[str] = Counter()
-        for gap in self.writer.gaps:
-            lost[gap.cause] += gap.count
         looked = self._fired or self._unfired
         return RecordingEnded(
             frames=self.writer.frames,
             bytes=self.writer.bytes,
-            lost=dict(lost),
+            lost=lost_by_cause(self.writer.gaps),
             trouble=self.trouble,
             dark=looked and not self._fired,
             saturated=looked and not self._unfired,

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from spiked.errors import RecordingError
 from spiked.recording import verify
-from spiked.recording.sidecar import Sidecar, sidecar_path, write_sidecar
+from spiked.recording.sidecar import Sidecar, lost_by_cause, sidecar_path, write_sidecar
 from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.messages import UploadChecked, UploadCommand
 
@@ -38,7 +38,7 @@ def run_upload(command: UploadCommand, channel: WorkerChannel) -> None:
             sensor=sensor,
             frames=recording.frames,
             bytes=command.path.stat().st_size,
-            lost=sum(gap.count for gap in recording.gaps),
+            lost=lost_by_cause(recording.gaps),
             sha256=digest,
             grade=found.verdict.value,
             reasons=found.reasons,

@@ -8,6 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,8 @@ from .test_deploy import exposed
 
 ROOT = Path(__file__).parents[1]
 DOCS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs/decisions").glob("*.md"))]
+GLOSSARY = "glossary.md"
+"""The only document with former names."""
 PLACES = (
     "", "spiked", "driver", "service", "driver/spiked_driver", "service/spiked_service",
     "service/spiked_service/workers", "docs", "evaluation", "tests", "web/src", "deploy",
@@ -227,27 +230,30 @@ def missing_files(doc: Path) -> list[str]:
     return [word for word in wrong if not word.startswith(("spiked/spiked.toml", "path/"))]
 
 
-def found(name: str) -> bool:
-    """A module, or something in one."""
+def found(name: str, former: bool) -> bool:
+    """A module, or something in one; with `former` also under a deprecated name."""
     parts = name.split(".")
     for cut in range(len(parts), 0, -1):
         try:
             thing: Any = importlib.import_module(".".join(parts[:cut]))
         except ImportError:
             continue
-        for part in parts[cut:]:
-            if not hasattr(thing, part):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore" if former else "error", DeprecationWarning)
+            try:
+                for part in parts[cut:]:
+                    thing = getattr(thing, part)
+            except (AttributeError, DeprecationWarning):
                 return False
-            thing = getattr(thing, part)
         return True
     return False
 
 
 def unknown_names(doc: Path) -> list[str]:
-    """Modules, and what is in them."""
+    """Modules, and what is in them; former names belong into the glossary only."""
     named = {word for span in code(doc) for word in re.findall(r"^(spiked(?:_driver|_service)?(?:\.\w+)+)$", span)}
     named -= {name for name in named if re.search(r"\.(dat|json|toml|service|txt)$", name)}
-    return [name for name in sorted(named) if not found(name)]
+    return [name for name in sorted(named) if not found(name, former=doc.name == GLOSSARY)]
 
 
 def paged() -> list[str]:
@@ -265,7 +271,7 @@ WRONG = """# Wrong
 `spiked reconstrukt`, `spiked serve --portt 1`, `python evaluation/measure.py --fast`, `pytest tests/test_nothing.py`,
 `make everything`, `SPIKED_PORTT=1`, `limit_requests = true`, `spiked_frames_eaten_total{device}`,
 `GET captures/{id}/soup`, `GET captures?flavour=sweet`, [a page](nowhere.md), [a part](#no-such-part),
-`recon/magic.py`, `spiked.recon.Magic`
+`recon/magic.py`, `spiked.recon.Magic`, `spiked.ring.Geometry`
 """
 CHECKS: dict[Callable[[Path], list[str]], tuple[str, ...]] = {
     unknown_commands: ("spiked reconstrukt", "spiked serve --portt"),
@@ -275,7 +281,7 @@ CHECKS: dict[Callable[[Path], list[str]], tuple[str, ...]] = {
     unknown_routes: ("GET /captures/{id}/soup", "GET /captures?flavour=sweet"),
     dead_links: ("nowhere.md", "#no-such-part"),
     missing_files: ("recon/magic.py", "tests/test_nothing.py"),
-    unknown_names: ("spiked.recon.Magic",),
+    unknown_names: ("spiked.recon.Magic", "spiked.ring.Geometry"),
 }
 """What is looked for in each document, and what of WRONG each has to find."""
 

@@ -3,7 +3,8 @@
     .venv/bin/python evaluation/curve.py STREAM_DIR [STREAM_DIR ...] --out CURVE.png [--live]
 
 Seconds are of work from the first frame on, without those spent on scoring; with --live the map also grows while
-frames come, as in the daemon, half of the time. Views are carried by a similarity and refined, as in `spiked evaluate`.
+frames come, as in the daemon, half of the time. Poses of views are transformed by a similarity and refined, as in
+`spiked evaluate`.
 """
 
 import argparse
@@ -39,24 +40,24 @@ class Curve:
         self._interval_s = interval_s
         self._begun_s, self._scoring_s, self._next_s = time.perf_counter(), 0.0, 0.0
 
-    def look(self, made: Reconstructor, at_once: bool = False) -> None:
+    def score(self, made: Reconstructor, at_once: bool = False) -> None:
         """Score the scene as it is now, if it is time to."""
         now_s = time.perf_counter() - self._begun_s - self._scoring_s
         if len(made.scene()) == 0 or (now_s < self._next_s and not at_once):
             return
         self._next_s = now_s + self._interval_s
-        carry = similarity_of_trajectories(
+        similarity = similarity_of_trajectories(
             truth=self._truth, estimate=made.trajectory(), frame_rate_hz=made.sensor.frame_rate_hz
         )
         poses = [np.array(view["c2w"]) for view in self._held_out["views"]]
-        carried = [carry.poses(pose[:3, :3], pose[:3, 3]) for pose in poses]
+        transformed = [similarity.poses(pose[:3, :3], pose[:3, 3]) for pose in poses]
 
         def render(rotation: np.ndarray, centre: np.ndarray) -> np.ndarray:
             image = made.view(rotation, centre)
             return image[..., 0] if image.shape[2] == 1 else image[..., ::-1]
 
         score = score_views(
-            render, poses=carried, truths=self._pictures, length=carry.scale * self._held_out["median_depth"]
+            render, poses=transformed, truths=self._pictures, length=similarity.scale * self._held_out["median_depth"]
         )
         self.points.append((now_s, score.mean_psnr_db))
         print(f"{now_s:8.1f} s {score.mean_psnr_db:6.2f} dB {len(made.scene())} splats", flush=True)
@@ -70,16 +71,16 @@ def reconstruct(folder: Path, live: bool, interval_s: float) -> list[tuple[float
     curve = Curve(folder, interval_s)
 
     def progress(status: Status) -> None:
-        curve.look(made)
+        curve.score(made)
 
     for first in range(0, recording.frames, FRAMES):
         begin_s = time.perf_counter()
         made.feed(first, recording.read(first, min(FRAMES, recording.frames - first)))
         if live:
             made.improve(LIVE_SHARE * (time.perf_counter() - begin_s))
-            curve.look(made)
+            curve.score(made)
     made.finish(progress)
-    curve.look(made, at_once=True)
+    curve.score(made, at_once=True)
     return curve.points
 
 

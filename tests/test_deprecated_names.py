@@ -10,6 +10,7 @@ from spiked_driver import Faults, FaultySource, Loss, Source, acquire, open_sour
 import spiked.ring
 from spiked.ring import DeviceState, DeviceStatus, LossCause, Policy, Ring, RingLayout, RingReader, RingWriter
 from spiked.sensor import Sensor
+from spiked.simulate import Room
 
 SENSOR = Sensor(16, 4, 1000.0)
 
@@ -53,6 +54,13 @@ def test_frames_that_a_reader_has_read() -> None:
         (status,) = writer.status().readers
         with warned("ReaderStatus.received", "frames_read"):
             assert status.received == status.frames_read == 0  # type: ignore[attr-defined]
+
+
+def test_pictures_of_a_room() -> None:
+    room = Room(colour=False, seed=0)
+    with warned("Room.look", "render"):
+        look: Callable[..., object] = getattr(room, "look")  # noqa: B009
+    assert look == room.render
 
 
 def test_grace_of_a_ring() -> None:

@@ -29,7 +29,7 @@ _RETRY_S = 0.02
 """Pause after the first failed attempt, seconds; it grows by as much with each."""
 
 
-class Status(IntEnum):
+class TransferStatus(IntEnum):
     """How a transfer ended (enum libusb_transfer_status)."""
 
     COMPLETED = 0

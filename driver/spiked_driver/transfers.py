@@ -20,7 +20,7 @@ import usb.core
 from numpy.typing import NDArray
 
 from spiked_driver.ft60x import DATA_IN, READ_REQUEST_BYTES, SESSION_OUT, read_request
-from spiked_driver.libusb import Callback, OutOfUsbMemoryError, Status, Transfer, UsbContext
+from spiked_driver.libusb import Callback, OutOfUsbMemoryError, Transfer, TransferStatus, UsbContext
 from spiked_driver.usb_budget import MIN_TRANSFERS, TransferPlan
 
 
@@ -34,10 +34,10 @@ class TransferError(StrEnum):
 
 
 _ERRORS = {
-    Status.ERROR: TransferError.FAILED,
-    Status.STALL: TransferError.STALLED,
-    Status.NO_DEVICE: TransferError.GONE,
-    Status.OVERFLOW: TransferError.BABBLE,
+    TransferStatus.ERROR: TransferError.FAILED,
+    TransferStatus.STALL: TransferError.STALLED,
+    TransferStatus.NO_DEVICE: TransferError.GONE,
+    TransferStatus.OVERFLOW: TransferError.BABBLE,
 }
 """Cancelled and timed-out transfers are no errors: their bytes are used like all others."""
 _BY_NUMBER = {
@@ -180,7 +180,7 @@ class AsynchronousBulkReader:
             error, self._request_error = self._request_error, None
             return CompletedTransfer(self._queue[0].buffer[:0], error) if error else None
         read = self._current = self._queue.popleft()
-        status = Status(read.transfer.status)
+        status = TransferStatus(read.transfer.status)
         return CompletedTransfer(read.buffer[: read.transfer.actual_length], _ERRORS.get(status))
 
     def release(self) -> None:
@@ -301,8 +301,8 @@ class AsynchronousBulkReader:
         self._completions += 1
         if isinstance(one, _Request):
             self._free_requests.append(one)
-            if one.transfer.status != Status.COMPLETED and self._running:
-                self._request_error = _ERRORS.get(Status(one.transfer.status), TransferError.FAILED)
+            if one.transfer.status != TransferStatus.COMPLETED and self._running:
+                self._request_error = _ERRORS.get(TransferStatus(one.transfer.status), TransferError.FAILED)
         else:
             self._in_flight -= 1
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import spiked.native._simulate as _simulate
+from spiked.deprecation import renamed_attributes
 from spiked.sensor import Intrinsics
 from spiked.simulate.motion import Stage
 from spiked.simulate.textures import Material, paint
@@ -81,6 +82,7 @@ _SHELL = (Material.BRICK, Material.PLASTER, Material.PLASTER, Material.BRICK, Ma
 _SHELL_COLOURS = (_WHITE, _GREEN, _WHITE, _RED, _OAK, _WHITE)
 
 
+@renamed_attributes(look="render")
 class Room:
     """The room as a scene. The seed changes the textures, not the furniture."""
 
@@ -94,7 +96,7 @@ class Room:
         """A good place to start from: facing the far wall over the table."""
         return Stage(_START, _TARGET, np.array([0.0, 0.0, 1.0]), intrinsics.fx, flow_px, parallax)
 
-    def look(
+    def render(
         self,
         intrinsics: Intrinsics,
         width: int,
@@ -102,7 +104,7 @@ class Room:
         rotation: NDArray[np.float64],
         centre: NDArray[np.float64],
     ) -> View:
-        """See `ViewableScene.look`."""
+        """See `ViewableScene.render`."""
         image = np.empty((height, width, self._channels), np.float32)
         depth = np.empty((height, width), np.float32)
         self._native.render(

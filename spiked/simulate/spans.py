@@ -55,7 +55,7 @@ class PathRadiance:
 
     def view(self, rotation: Array, centre: Array) -> View:
         """The scene's picture at a camera-to-world pose."""
-        return self.scene.look(self.intrinsics, self.sensor.width, self.sensor.height, rotation, centre)
+        return self.scene.render(self.intrinsics, self.sensor.width, self.sensor.height, rotation, centre)
 
     def intensity(self, view: View) -> Image:
         """Its grey [H, W], on a mosaic sensor its colours [H, W, 3]."""

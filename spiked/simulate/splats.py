@@ -18,7 +18,7 @@ class SplatScene:
         self._threads = threads
         self._rasteriser: Rasteriser | None = None
 
-    def look(
+    def render(
         self,
         intrinsics: Intrinsics,
         width: int,
@@ -26,7 +26,7 @@ class SplatScene:
         rotation: NDArray[np.float64],
         centre: NDArray[np.float64],
     ) -> View:
-        """See `ViewableScene.look`; the depth is that of the rasteriser, the mean over what a pixel sees."""
+        """See `ViewableScene.render`; the depth is that of the rasteriser, the mean over what a pixel sees."""
         camera = Camera(intrinsics, width, height)
         if self._rasteriser is None or self._rasteriser.camera != camera:
             self._rasteriser = Rasteriser(camera, self._threads)

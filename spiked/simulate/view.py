@@ -26,7 +26,7 @@ class View:
 class ViewableScene(Protocol):
     """A scene that can be rendered."""
 
-    def look(
+    def render(
         self,
         intrinsics: Intrinsics,
         width: int,

@@ -83,7 +83,7 @@ def test_no_loop_is_closed_between_different_places(walked: tuple[Reconstructor,
         view = sparse_map.views[number]
         if late[number] and view.pose is not None:
             stage = other.stage(SENSOR.intrinsics)
-            seen = other.look(
+            seen = other.render(
                 SENSOR.intrinsics, SENSOR.width, SENSOR.height, stage.rotation @ view.pose.rotation, stage.centre
             )
             grey = np.ascontiguousarray(seen.intensity[..., 0], np.float32)

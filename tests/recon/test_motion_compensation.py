@@ -59,9 +59,9 @@ def test_the_motion_is_found_and_taken_out() -> None:
     frames, _ = moving_scene(64, np.random.default_rng(1))
     data = stored(frames, sensor)
     assert abs(speed(data[:32], sensor) - np.linalg.norm(STEP)) < 0.2
-    sharpener = MotionCompensator(sensor, 4)
-    sharpener.look(data, 0, 2.0)
-    sharp = sharpener.sharp(data, 0, 30.0)
+    compensator = MotionCompensator(sensor, 4)
+    compensator.estimate(data, 0, 2.0)
+    sharp = compensator.sharp(data, 0, 30.0)
     assert sharp is not None
     scene = moving_scene(60, np.random.default_rng(1))[1][30:-30, 36:-36].ravel()
     assert np.corrcoef(sharp[30:-30, 36:-36].ravel(), scene)[0, 1] > 0.8
@@ -71,10 +71,10 @@ def test_nothing_to_follow_gives_no_field_and_no_speed() -> None:
     sensor = Sensor(W, H, 40_000.0)
     assert speed(np.zeros((32, sensor.frame_bytes), np.uint8), sensor) == 0
     assert fit_field(np.zeros((5, 2)), np.zeros((5, 2)), W, H) is None
-    sharpener = MotionCompensator(sensor, 4)
+    compensator = MotionCompensator(sensor, 4)
     data = np.zeros((64, sensor.frame_bytes), np.uint8)
-    sharpener.look(data, 0, 2.0)
-    seen = sharpener.sharp(data, 0, 30.0)
+    compensator.estimate(data, 0, 2.0)
+    seen = compensator.sharp(data, 0, 30.0)
     assert seen is None or np.isfinite(seen).all()
 
 

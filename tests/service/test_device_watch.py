@@ -22,7 +22,7 @@ def test_a_device_that_streams_and_rests_is_told_once_each_time(tmp_path: Path) 
     heard = bus.subscribe([Topic.DEVICE])
 
     def states() -> list[tuple[str, str | None]]:
-        watch.look()
+        watch.check()
         found = []
         while (message := heard.take()) is not None:
             told = message.payload.model_dump()

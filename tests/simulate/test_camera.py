@@ -89,7 +89,7 @@ def test_the_room_is_textured_everywhere() -> None:
     stage = room.stage(k)
     for degrees in range(0, 360, 60):
         turn = cv2.Rodrigues(np.array([0.0, np.radians(degrees), 0.0]))[0]
-        view = room.look(k, 192, 120, stage.rotation @ turn, stage.centre)
+        view = room.render(k, 192, 120, stage.rotation @ turn, stage.centre)
         assert np.isfinite(view.depth).all() and view.depth.min() > 0.1
         patches = view.intensity[..., 0].reshape(6, 20, 6, 32)
         assert (patches.std((1, 3)) / patches.mean((1, 3))).min() > 0.04
@@ -100,8 +100,8 @@ def test_pictures_are_free_of_aliasing() -> None:
     room = Room()
     k, fine = Intrinsics.from_fov(400, 240, 60), Intrinsics.from_fov(1600, 960, 60)
     stage = room.stage(k)
-    small = room.look(k, 400, 240, stage.rotation, stage.centre).intensity[..., 0]
-    large = room.look(fine, 1600, 960, stage.rotation, stage.centre).intensity[..., 0]
+    small = room.render(k, 400, 240, stage.rotation, stage.centre).intensity[..., 0]
+    large = room.render(fine, 1600, 960, stage.rotation, stage.centre).intensity[..., 0]
     assert psnr(large.reshape(240, 4, 400, 4).mean((1, 3)), small) > 33
 
 

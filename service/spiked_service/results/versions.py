@@ -60,7 +60,7 @@ class Publisher:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._versions = versions(folder)
-        self._held: set[int] = set()
+        self._protected: set[int] = set()
 
     @property
     def folder(self) -> Path:
@@ -82,10 +82,10 @@ class Publisher:
         """The available versions, oldest first."""
         return self._versions
 
-    def hold(self) -> None:
+    def protect_newest(self) -> None:
         """Keep the current newest version for the life of this process."""
         if self._versions:
-            self._held.add(self.version)
+            self._protected.add(self.version)
 
     def again(self, earlier: Published) -> Published:
         """Publish the files of an earlier version under the next number. Raises OSError as `publish` does."""
@@ -130,7 +130,7 @@ class Publisher:
         return published
 
     def _list(self, published: Published) -> None:
-        kept = _thinned([*self._versions, published], self._held)
+        kept = _thinned([*self._versions, published], self._protected)
         write_atomically(self._folder / _INDEX, _Index(versions=kept).model_dump_json().encode())
         gone = {one.version: one for one in self._versions}.keys() - {one.version for one in kept}
         for one in self._versions:

@@ -85,7 +85,7 @@ class Tokens:
     def all(self) -> list[StoredToken]:
         """Oldest first. Raises ConfigurationError if the file is damaged."""
         with self._lock:
-            self._look()
+            self._reload_if_changed()
             return list(self._known)
 
     def some(self) -> bool:
@@ -141,7 +141,7 @@ class Tokens:
         except OSError as error:
             raise ConfigurationError(f"cannot keep tokens in {self._path}: {error.strerror}") from error
 
-    def _look(self) -> None:
+    def _reload_if_changed(self) -> None:
         try:
             stat = self._path.stat()
         except FileNotFoundError:

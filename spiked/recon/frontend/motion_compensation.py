@@ -187,7 +187,7 @@ class MotionCompensator:
         self._motions = Motions(sensor.width, sensor.height, 0.5 * interval)
         self._last: Picture | None = None
 
-    def look(self, frames: NDArray[np.uint8], first: int, begin: float) -> None:
+    def estimate(self, frames: NDArray[np.uint8], first: int, begin: float) -> None:
         """Estimate the motion in stored `frames` [n, frame_bytes], the first of absolute index `first`, every
         `interval` frames from `begin` on."""
         motions = self._motions

@@ -259,7 +259,7 @@ class Windows:
             return None
         if self._compensator is None or self._compensator.interval != self.length:
             self._compensator = MotionCompensator(self.sensor, self.length)
-        self._compensator.look(self._frames[: stop - self._first], self._first, time)
+        self._compensator.estimate(self._frames[: stop - self._first], self._first, time)
         return self._compensator.sharp(self._frames, self._first, time)
 
 

@@ -34,7 +34,7 @@ def test_a_held_version_outlasts_many_and_can_be_made_the_newest_again(tmp_path:
     trajectory = Trajectory(np.array([0.5, 1.5]), np.eye(3)[None].repeat(2, 0), np.ones((2, 3)))
     for number in range(1, 9):
         best = publisher.publish(Scene.empty(1), trajectory, white=0.1 * number, psnr_db=20.0 + number)
-    publisher.hold()
+    publisher.protect_newest()
     for _ in range(200):
         publisher.publish(Scene.empty(1), trajectory, white=5.0)
     again = publisher.again(best)

@@ -124,7 +124,7 @@ class DeviceWatch:
         self._over.set()
         self._thread.join()
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Publish devices that changed since the last check; counters are not compared."""
         found = {device.source: shown(self._captures, device) for device in self._sources.devices()}
         for key, device in list(self._published.items()):
@@ -139,7 +139,7 @@ class DeviceWatch:
     def _run(self) -> None:
         while True:
             try:
-                self.look()
+                self.check()
             except SpikedError as error:
                 _log.warning("the devices cannot be checked", reason=str(error))
             if self._over.wait(_LOOK_S):

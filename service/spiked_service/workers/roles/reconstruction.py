@@ -303,7 +303,7 @@ class ProgressReporter:
         self._hold()
 
     def _hold(self) -> None:
-        self._publisher.hold()
+        self._publisher.protect_newest()
         self._candidates.add(self._publisher.version)
 
     def last(self, cut_short: bool) -> None:

@@ -17,10 +17,10 @@ function stored(): Theme {
 }
 
 let chosen = stored();
-const tell = (): void => {
+const notify = (): void => {
   for (const listener of listeners) listener();
 };
-dark.addEventListener("change", tell);
+dark.addEventListener("change", notify);
 
 export const isDark = (): boolean => (chosen === "system" ? dark.matches : chosen === "dark");
 
@@ -38,7 +38,7 @@ export function choose(theme: Theme): void {
     // as above: the choice lasts until the page is closed
   }
   applyTheme();
-  tell();
+  notify();
 }
 
 const subscribe = (listener: () => void): (() => void) => {

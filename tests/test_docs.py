@@ -429,3 +429,18 @@ def test_options_say_what_the_motion_makes_of_them() -> None:
     source = inspect.getsource(Options)
     assert windows in source and f"up to {Schedule.fast_steps} times as many" in source
     assert f"more than {Schedule.small_pixels:,} pixels" in source
+
+
+def places(line: str) -> list[Path]:
+    """Files and folders of the repository that a line names."""
+    return [ROOT / span for span in re.findall(r"`([^`]+)`", line) if "/" in span and (ROOT / span).exists()]
+
+
+def test_a_new_sensor_finds_each_name_where_it_is_said_to_be() -> None:
+    lines = [line for line in (ROOT / "docs/new-sensor.md").read_text().splitlines() if places(line)]
+    assert len(lines) > 20
+    for line in lines:
+        files = [file for place in places(line) for file in ([place] if place.is_file() else place.iterdir())]
+        text = "".join(f"{file.name}\n{file.read_text()}" for file in files if file.is_file())
+        names = re.findall(r"`([A-Za-z_]\w+(?:\.\w+)?)`", line)
+        assert [name for name in names if name.split(".")[-1] not in text and name not in text] == [], line

@@ -24,7 +24,9 @@ __all__ = ["PoseAppender", "PoseFile", "UnorderedError", "convert_tum"]
 
 _MAGIC = b"SPKPOSES"
 _VERSION = 1
+"""Of the format."""
 _HEADER_BYTES = 128
+"""Length of the header."""
 _LAYOUT = b"time_s f8, position 3f8, quaternion_wxyz 4f8, state S8"
 _RECORD = np.dtype([("time_s", "<f8"), ("position", "<f8", 3), ("quaternion_wxyz", "<f8", 4), ("state", "S8")])
 _HEADER = (_MAGIC + struct.pack("<4I", _VERSION, _HEADER_BYTES, _RECORD.itemsize, 0) + _LAYOUT).ljust(

@@ -27,6 +27,7 @@ __all__ = ["SpzVersion", "decode", "encode", "fractional_bits", "position_step"]
 Bytes = NDArray[np.uint8]
 
 _MAGIC = 0x5053474E
+"""First word of a file: NGSP."""
 _HEADER = struct.Struct("<IIIBBBB")  # magic, version, number of points, degree of SH, fractional bits, flags, reserved
 _COLOUR_SCALE = 0.15
 """Scale of the constant colour coefficient in a byte, of the SPZ format."""

@@ -16,6 +16,7 @@ PRODUCTS = {0x601E: "FT600", 0x601F: "FT601"}
 """Chip by USB product id; the SPS10-002 camera has an FT601."""
 
 SESSION_INTERFACE, DATA_INTERFACE = 0, 1
+"""Numbers of the chip's USB interfaces."""
 SESSION_OUT = 0x01
 """Bulk endpoint for requests."""
 NOTIFICATION_IN = 0x81

@@ -11,6 +11,7 @@ from spiked.errors import RecordingError
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic
 
 DEFAULT_RATE_HZ = 20_000.0
+"""Frame rate where neither sidecar nor options state one: that of both cameras."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,9 @@ _ENTRY = struct.Struct("<qIHHqI")
 _CHECK = struct.Struct("<I")
 _MAGIC = b"SPIKEIDX"
 _VERSION = 1
+"""Of the format."""
 ENTRY_BYTES = 32
+"""Length of an entry."""
 _DTYPE = np.dtype(
     [
         ("first", "<i8"),

@@ -16,6 +16,7 @@ from spiked.recording.recover import damaged_blocks
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic
 
 _CHUNK_BYTES = 4 << 20
+"""Bytes read at a time."""
 
 
 class Verdict(StrEnum):

@@ -23,7 +23,9 @@ from spiked.sensor import Intrinsics, Sensor
 FORWARD_OPERATIONS, BACKWARD_OPERATIONS = 18, 34
 """Vector arithmetic instructions that a splat costs a pixel, for one colour."""
 MOTION_PX = 2.0
+"""Image motion of the moving camera."""
 CHARGE_FRAMES = 24
+"""Frames that a render is compared with in the step by the charge."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from spiked.render.splats import Floats, Gradients, RenderedImage
 from spiked.scene import Scene
 
 MAX_THREADS = 256
+"""Most threads of a rasteriser."""
 
 
 def usable_cores() -> int:

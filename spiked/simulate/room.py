@@ -19,12 +19,15 @@ from spiked.simulate.textures import Material, paint
 from spiked.simulate.view import LUMINANCE, View
 
 _SIZE = (6.0, 5.0, 2.8)
+"""Width, depth and height of the room, metres."""
 _LAMP = np.array([3.4, 2.2, 2.6])
 _START = np.array([3.1, 0.75, 1.55])
 _TARGET = np.array([3.0, 4.0, 1.15])
 
 _WHITE, _OAK, _RED = (0.75, 0.72, 0.66), (0.52, 0.36, 0.22), (0.55, 0.27, 0.19)
+"""Albedos, linear."""
 _BLUE, _GREEN, _DARK = (0.25, 0.36, 0.55), (0.33, 0.50, 0.28), (0.16, 0.12, 0.10)
+"""Albedos, linear."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,9 @@ from spiked.errors import ConfigurationError
 from spiked.sensor import BitOrder, Image, Layout, Sensor
 
 _BOLTZMANN_J_PER_K = 1.380649e-23
+"""Exact by definition of the SI."""
 _ELEMENTARY_CHARGE_C = 1.602176634e-19
+"""Exact by definition of the SI."""
 
 
 def thermal_reset_noise(electrons_a_spike: float, swing_v: float = 1.0, temperature_k: float = 300.0) -> float:

@@ -20,6 +20,7 @@ from spiked_service.store.catalogue import StoreError, UnknownIdError
 
 MEDIA_TYPE = "application/problem+json"
 _RETRY_S = 1
+"""`Retry-After` of a busy service, seconds."""
 
 
 class Problem(BaseModel):
@@ -259,6 +260,7 @@ _DESCRIPTIONS = {
     507: "The disk is full, or the catalogue cannot be written.",
 }
 _ALWAYS = (401, 403, 422, 429, 503)
+"""Status codes that every route may answer."""
 _Responses = dict[int | str, dict[str, Any]]
 
 

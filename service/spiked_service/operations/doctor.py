@@ -38,6 +38,7 @@ _MINUTES = 5
 PROBE_BYTES = 128 << 20
 """Written to measure the speed of the disk."""
 _PIECE = bytes(range(256)) * (4 << 10)
+"""One write of the probe, 1 MiB."""
 
 
 class DiagnosisStatus(StrEnum):

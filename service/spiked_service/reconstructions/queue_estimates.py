@@ -15,8 +15,9 @@ _RECENT = 8
 _STEPS_OF_TRACKING = 200
 """Tracking takes about as long as this many refinement steps."""
 _CHANGE_S = 5.0
+"""Changes of an estimate by less seconds, ..."""
 _CHANGE_SHARE = 0.2
-"""Changes of an estimate below 5 s and this share of it are not published."""
+"""... or by a smaller share of it, are not published."""
 
 
 class QueueEstimates:

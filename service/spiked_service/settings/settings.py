@@ -32,6 +32,7 @@ NOT_SETTINGS = frozenset(
 _SWITCHES = ("render", "simd")
 """Settings that compiled modules and workers read from the environment, where an empty one is as good as none."""
 MIB = 1 << 20
+"""Bytes."""
 MOST_BYTES = 1 << 60
 """Upper bound of settings in bytes."""
 MOST_DAYS = 36_500.0

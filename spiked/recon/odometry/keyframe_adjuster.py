@@ -33,8 +33,9 @@ REFITTED_VIEWS = 48
 LOOP_ROUNDS = 4
 """Searches for loops, at most: each closes the first loop of the path that is open (decision 15)."""
 WINDOW_ITERATIONS, LOOP_ITERATIONS, FINAL_ITERATIONS = 4, 4, 12
+"""Most iterations of an adjustment in the window, after a loop and at the end."""
 TOLERANCE = 1e-3
-"""Most iterations of an adjustment in the window, after a loop and at the end; relative gain of one that ends it."""
+"""Relative gain of an iteration below which an adjustment ends."""
 
 
 @dataclass

@@ -23,10 +23,13 @@ NOISE_MARGIN = 1.3
 MIN_POINTS = 15
 """Known points that a pose needs: below, tracking is lost; below twice as many it is degraded."""
 WORST_CHI2 = 2.5
+"""Largest `PnPResult.chi2` of a pose that is not degraded."""
 WORST_SIGMA_PX = 1.0
+"""Largest predicted standard deviation of such a pose."""
 WORST_INLIERS = 0.5
+"""Least share of its known points that agree with it."""
 WORST_OVERLAP = 0.25
-"""Tracking counts as degraded beyond any of these; overlap is the share of the tracks whose points are known."""
+"""Least share of its tracks whose points are known."""
 LOST_CHI2, LOST_INLIERS = 25.0, 0.35
 """A pose is rejected if points lie 5 times as far off as noise explains, or if a smaller share of them agrees (decision
 10)."""

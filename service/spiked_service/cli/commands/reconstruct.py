@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 INTERRUPTED = 130
 """Exit status after Ctrl-C: 128 + SIGINT, as in shells."""
 _STDERR = 2
+"""File descriptor: a signal handler must not use buffered output."""
 _FEED_SHARE = 0.3
 """Part of the progress bar for feeding; the refinement has the rest."""
 

@@ -1,8 +1,25 @@
-"""Spikes to trajectory and scene: views, sparse odometry, depth, mapping and refinement behind one `Reconstructor`."""
+"""Spikes to trajectory and scene: views, sparse odometry, depth, mapping and refinement behind one `Reconstructor`.
 
+`MapIndex` and `Localiser` find a camera in a scene that is known.
+"""
+
+from spiked.recon.localisation.localiser import Localisation, LocalisedView, Localiser
+from spiked.recon.localisation.map_index import MapIndex
 from spiked.recon.odometry.tracking_state import State
 from spiked.recon.options import MapOptions, Options
 from spiked.recon.reconstructor import Reconstructor
 from spiked.recon.report import Sample, Status, Tracked
 
-__all__ = ["MapOptions", "Options", "Reconstructor", "Sample", "State", "Status", "Tracked"]
+__all__ = [
+    "Localisation",
+    "LocalisedView",
+    "Localiser",
+    "MapIndex",
+    "MapOptions",
+    "Options",
+    "Reconstructor",
+    "Sample",
+    "State",
+    "Status",
+    "Tracked",
+]

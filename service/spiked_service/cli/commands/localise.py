@@ -1,0 +1,158 @@
+"""`spiked localise`: where the camera of a recording was in a known map."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.progress import track
+
+from spiked.errors import ConfigurationError, RecordingError
+from spiked.recon import Localisation, Localiser, MapIndex
+from spiked.recording import Recording, RecordingGeometry, open_recording
+from spiked.render import Camera
+from spiked.sensor import Intrinsics, Sensor
+from spiked_service.cli import outputs
+from spiked_service.cli import recording_flags as g
+from spiked_service.cli.console import messages, output, report_warning
+from spiked_service.results.map_folder import MapFolder
+from spiked_service.results.recording_feed import pieces
+
+NOT_RECOGNISED = 1
+"""Exit code; errors have 2."""
+
+
+# Longer than 60 lines, because each option is a parameter.
+def localise(
+    map_folder: Annotated[Path, typer.Argument(metavar="MAP", help="Output folder of `spiked reconstruct`.")],
+    file: Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording.", readable=False)],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for trajectory.tum.")] = None,
+    start: Annotated[int, typer.Option(help="First stored frame to use.", min=0)] = 0,
+    frames: Annotated[int | None, typer.Option(help="Number of frames to use. Default: all.", min=1)] = None,
+    json_out: Annotated[Path | None, typer.Option("--json", help="Also write the figures to this file.")] = None,
+    fov: g.Fov = None,
+    intrinsics: g.IntrinsicsText = None,
+    width: g.Width = None,
+    height: g.Height = None,
+    rate: g.Rate = None,
+    layout: g.FrameLayout = None,
+    bit_order: g.Bits = None,
+    flipped: g.Flipped = None,
+    mosaic: g.Colours = None,
+) -> None:
+    """Find where the camera of a recording was in a map.
+
+    Prints the first and the last pose, in the map's frame of reference and unit of length, and how sure they are. With
+    `-o`, trajectory.tum has one pose for each window of frames. 1,000 frames at 20 kHz suffice.
+    If the map is not recognised, the exit code is 1.
+
+    Examples:
+
+    - `spiked localise out again.dat`
+
+    - `spiked localise out again.dat -o where --start 20000 --frames 1000`
+    """
+    if out is not None:
+        outputs.try_folder("--out", out, ("trajectory.tum",))
+    if json_out is not None:
+        outputs.try_file("--json", json_out)
+    known = MapFolder.read(map_folder)
+    geometry = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic)
+    recording = open_recording(file, **geometry.stated())
+    for warning in recording.warnings:
+        report_warning(warning)
+    end = _end(recording, start, frames)
+    sensor = g.with_optics(recording.sensor, fov, intrinsics)
+    index = MapIndex(known.scene, known.trajectory, Camera(_optics(sensor, known), sensor.width, sensor.height))
+    localiser = Localiser(index, sensor)
+    for first_frame, part in track(
+        list(_parts(recording, start, end)), "localising", console=messages, transient=True,
+        disable=not messages.is_terminal,
+    ):  # fmt: skip
+        localiser.feed(first_frame, recording.read(*part))
+    found = localiser.finish()
+    _show(found, sensor)
+    if json_out is not None:
+        with outputs.writing("--json", json_out):
+            json_out.write_text(json.dumps(_figures(found, sensor), indent=1), encoding="utf-8")
+    if not found.recognised:
+        raise typer.Exit(NOT_RECOGNISED)
+    if out is not None:
+        with outputs.writing("--out", out):
+            out.mkdir(parents=True, exist_ok=True)
+            found.trajectory(sensor.frame_rate_hz).write_tum(out / "trajectory.tum")
+        output.print(f"{out / 'trajectory.tum'}: {len(found.views)} poses", markup=False)
+
+
+def _end(recording: Recording, start: int, frames: int | None) -> int:
+    if start >= recording.frames:
+        raise RecordingError(f"--start {start} is beyond the {recording.frames} frames of {recording.path}")
+    end = recording.frames if frames is None else start + frames
+    if end > recording.frames:
+        raise RecordingError(f"--start {start} --frames {frames} is beyond the {recording.frames} frames there are")
+    return end
+
+
+def _optics(sensor: Sensor, known: MapFolder) -> Intrinsics:
+    """The recording's intrinsics, or the map's if they are not known and the images are of the same size."""
+    if sensor.intrinsics is not None:
+        return sensor.intrinsics
+    if (sensor.width, sensor.height) != (known.width, known.height):
+        raise ConfigurationError(
+            f"the recording is {sensor.width}x{sensor.height} and the map was made with {known.width}x{known.height}, "
+            "so it is another camera: give its --fov or --intrinsics"
+        )
+    return known.intrinsics
+
+
+def _parts(recording: Recording, start: int, end: int) -> Iterator[tuple[int, tuple[int, int]]]:
+    """Absolute index of the first frame, and first and count of the stored frames, of pieces without gaps."""
+    for piece in pieces(recording):
+        first, last = max(piece.first, start), min(piece.first + piece.count, end)
+        if first < last:
+            yield piece.index + first - piece.first, (first, last - first)
+
+
+def _show(found: Localisation, sensor: Sensor) -> None:
+    output.print(f"{found.reason}", markup=False)
+    if not found.views:
+        return
+    for name, view in (("first", found.views[0]), ("last", found.views[-1])):
+        place = " ".join(f"{value:.4f}" for value in view.pose.centre)
+        output.print(
+            f"{name} pose, at {sensor.seconds(view.time):.4f} s: position {place} +- {view.fit.sigma:.4f}, "
+            f"{view.fit.inliers} points agree ({view.fit.share:.0%}), correlation {view.correlation:.2f}",
+            markup=False,
+        )
+
+
+def _figures(found: Localisation, sensor: Sensor) -> dict[str, object]:
+    views = [
+        {
+            "time_s": sensor.seconds(view.time),
+            "rotation": _rounded(view.pose.rotation),
+            "position": _rounded(view.pose.centre),
+            "inliers": view.fit.inliers,
+            "inlier_share": round(view.fit.share, 4),
+            "correlation": round(view.correlation, 4),
+            "sigma": round(view.fit.sigma, 9),
+            "sigma_px": round(view.fit.sigma_px, 4),
+        }
+        for view in found.views
+    ]
+    return {
+        "recognised": found.recognised,
+        "reason": found.reason,
+        "searches": found.searches,
+        "agreeing": found.agreeing,
+        "references": found.references,
+        "best_inliers": found.best_inliers,
+        "views": views,
+    }
+
+
+def _rounded(values: NDArray[np.float64]) -> list[object]:
+    return list(np.round(values, 9).tolist())

@@ -56,14 +56,24 @@ def walked() -> tuple[Reconstructor, Trajectory]:
 
 
 def test_a_long_path_is_followed_and_its_loop_closed(walked: tuple[Reconstructor, Trajectory]) -> None:
-    """As a spline the path had 3.2 % ATE and 1.7 times the work; without closures it has 4.5 %."""
+    """0.9 % ATE; 1.4 without recovered tracks and warped templates, 3.2 as a spline."""
     reconstructor, truth = walked
     odometry = reconstructor.odometry
     assert odometry.sparse and odometry.views[-1].time - odometry.views[0].time > LONG_FRAMES
     score = score_trajectory(truth=truth, estimate=reconstructor.trajectory(), frame_rate_hz=SENSOR.frame_rate_hz)
     assert score.coverage > 0.99
-    assert score.errors.ate_percent < 2.5
+    assert score.errors.ate_percent < 1.8
     assert odometry.closures > 10
+
+
+def test_tracks_that_ended_are_found_again(walked: tuple[Reconstructor, Trajectory]) -> None:
+    """Between a break of a few views and the return after a loop there is nothing else that resumes a track."""
+    views = walked[0].odometry.views
+    ids = np.concatenate([view.ids for view in views])
+    numbers = np.repeat([view.id for view in views], [len(view.ids) for view in views])
+    order = np.lexsort((numbers, ids))
+    breaks = np.diff(numbers[order])[np.diff(ids[order]) == 0]
+    assert ((breaks > 3) & (breaks < 60)).sum() > 100
 
 
 def test_no_loop_is_closed_between_different_places(walked: tuple[Reconstructor, Trajectory]) -> None:

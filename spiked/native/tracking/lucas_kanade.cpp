@@ -94,11 +94,47 @@ template <class Take>
     }
 }
 
-// The window around (x, y), with its gradients (Scharr), which are 0 beyond its last column.
-[[gnu::always_inline]] inline void extract(const PaddedImage& of, float x, float y, Window& window) {
-    float patch[kPatch][kLanes + 4] = {};
+// An offset from the middle of a window (x to the right, y down) in the image whose appearance is compared: a linear
+// map, row by row.
+struct Affine {
+    float xx, xy, yx, yy;
+
+    Affine inverse() const {
+        const float scale = 1 / (xx * yy - xy * yx);
+        return {scale * yy, -scale * xy, -scale * yx, scale * xx};
+    }
+};
+
+using Patch = float[kPatch][kLanes + 4];
+
+// The patch around (x, y).
+[[gnu::always_inline]] inline void sample(const PaddedImage& of, float x, float y, Patch& patch) {
     each_row(of, x - kHalf - 1, y - kHalf - 1, kPatch,
              [&](int n, const Row& row) { std::memcpy(patch[n], &row, sizeof row); });
+}
+
+// The patch around (x, y) whose pixel at an offset d is that at offset `warp` d of the image, interpolated bilinearly.
+[[gnu::always_inline]] inline void sample_warped(const PaddedImage& of, float x, float y, const Affine& warp,
+                                                 Patch& patch) {
+    const auto low = static_cast<float>(-kMargin), right = static_cast<float>(of.width + kMargin - 2),
+               bottom = static_cast<float>(of.height + kMargin - 2);
+    for (int row = 0; row < kPatch; ++row) {
+        const float v = static_cast<float>(row) - kHalf - 1;
+        for (int column = 0; column < kPatch; ++column) {
+            const float u = static_cast<float>(column) - kHalf - 1;
+            const float at_x = std::clamp(x + warp.xx * u + warp.xy * v, low, right);
+            const float at_y = std::clamp(y + warp.yx * u + warp.yy * v, low, bottom);
+            const float left = std::floor(at_x), top = std::floor(at_y), a = at_x - left, b = at_y - top;
+            const float* p = of.at(left, top);
+            const float* q = p + of.stride;
+            const float above = p[0] + a * (p[1] - p[0]), below = q[0] + a * (q[1] - q[0]);
+            patch[row][column] = above + b * (below - above);
+        }
+    }
+}
+
+// The window in the middle of a patch, with its gradients (Scharr), which are 0 beyond its last column.
+[[gnu::always_inline]] inline void differentiate(const Patch& patch, Window& window) {
     const Row inside = kInside / 32;
     for (int y = 0; y < kWindow; ++y) {
         const float *p = patch[y], *q = patch[y + 1], *r = patch[y + 2];
@@ -217,13 +253,19 @@ inline bool iterate(const Window& window, const PaddedImage& to, float last2, fl
     return to.holds(*u, *v);
 }
 
-// Moves (*u, *v) to the position in `to` of the window around (x, y) of `from`; returns whether it was found.
-// Appearance is projected out at the end only: without it, the basin of convergence is wider.
-SPIKED_CLONES bool align(const PaddedImage& from, const PaddedImage& to, float x, float y, bool exactly, float* u,
-                         float* v) {
+// Moves (*u, *v) to the position in `to` of the window around (x, y) of `from`, warped if there is a `warp`; returns
+// whether it was found. Appearance is projected out at the end only: without it, the basin of convergence is wider.
+SPIKED_CLONES bool align(const PaddedImage& from, const PaddedImage& to, float x, float y, const Affine* warp,
+                         bool exactly, float* u, float* v) {
     if (!from.holds(x, y)) return false;
+    Patch patch = {};
+    if (warp == nullptr) {
+        sample(from, x, y, patch);
+    } else {
+        sample_warped(from, x, y, *warp, patch);
+    }
     Window window;
-    extract(from, x, y, window);
+    differentiate(patch, window);
     if (!iterate(window, to, exactly ? kNear2 : kConverged2, u, v)) return false;
     if (!exactly) return true;
     project_out_appearance(window, difference2(window, to, *u, *v));
@@ -252,7 +294,7 @@ bool track_pyramid(const std::vector<PaddedImage>& from, const std::vector<Padde
     for (int level = static_cast<int>(from.size()) - 1; level >= 0; --level) {
         const float scale = 1.0f / static_cast<float>(1 << level);
         float at_u = *u * scale, at_v = *v * scale;
-        found = align(from[level], to[level], x * scale, y * scale, level == 0, &at_u, &at_v);
+        found = align(from[level], to[level], x * scale, y * scale, nullptr, level == 0, &at_u, &at_v);
         *u = at_u / scale;
         *v = at_v / scale;
     }
@@ -315,12 +357,16 @@ void track(const Images& a, const Images& b, const Array<const double, 2>& start
 
 // Aligns each track between its own image of `births` and the newest one, at full size.
 void refine_tracks(const Images& births, const Array<const int64_t, 1>& birth, const Array<const float, 2>& newest,
-                   const Array<const double, 2>& start, const Array<double, 2>& at, float reach, float near,
-                   const Array<bool, 1>& good) {
+                   const Array<const double, 2>& start, const Array<const float, 3>& warps, const Array<double, 2>& at,
+                   float reach, float near, const Array<bool, 1>& good) {
     const size_t count = start.shape(0);
+    const bool warped = warps.shape(0) > 0;
     if (birth.shape(0) != count || start.shape(1) != 2 || at.shape(0) != count || at.shape(1) != 2 ||
         good.shape(0) != count) {
         throw std::invalid_argument("expected birth [n], start and at [n, 2], good [n]");
+    }
+    if ((warped && warps.shape(0) != count) || warps.shape(1) != 2 || warps.shape(2) != 2) {
+        throw std::invalid_argument("expected warps [n, 2, 2] or [0, 2, 2]");
     }
     const std::vector<PaddedImage> from = padded_images(births), to = padded_images({newest});
     for (const PaddedImage& one : from) {
@@ -341,8 +387,16 @@ void refine_tracks(const Images& births, const Array<const int64_t, 1>& birth, c
         const auto guess_u = static_cast<float>(at.data()[2 * n] - 0.5);
         const auto guess_v = static_cast<float>(at.data()[2 * n + 1] - 0.5);
         float u = guess_u, v = guess_v, back_x = x, back_y = y;
-        good.data()[n] = align(born, to[0], x, y, true, &u, &v) && std::hypot(u - guess_u, v - guess_v) < near &&
-                         align(to[0], born, u, v, true, &back_x, &back_y) && std::hypot(back_x - x, back_y - y) < reach;
+        Affine onto = {}, from_birth = {};
+        if (warped) {
+            const float* w = warps.data() + 4 * n;
+            onto = {w[0], w[1], w[2], w[3]};
+            from_birth = onto.inverse();
+        }
+        good.data()[n] = align(born, to[0], x, y, warped ? &from_birth : nullptr, true, &u, &v) &&
+                         std::hypot(u - guess_u, v - guess_v) < near &&
+                         align(to[0], born, u, v, warped ? &onto : nullptr, true, &back_x, &back_y) &&
+                         std::hypot(back_x - x, back_y - y) < reach;
         at.data()[2 * n] = u + 0.5;
         at.data()[2 * n + 1] = v + 0.5;
     }
@@ -360,10 +414,12 @@ void bind_lucas_kanade(nb::module_& m) {
         "before, padded by `pad`. `at` [n, 2] holds guesses and gets the result. `good` [n]: found and, with `back`,\n"
         "less than `reach` px from the start when tracked back. Pixel centres are at +0.5.");
     m.def("refine_tracks", &refine_tracks, nb::arg("births"), nb::arg("birth"), nb::arg("newest"), nb::arg("start"),
-          nb::arg("at").noconvert(), nb::arg("reach"), nb::arg("near"), nb::arg("good").noconvert(),
+          nb::arg("warps"), nb::arg("at").noconvert(), nb::arg("reach"), nb::arg("near"), nb::arg("good").noconvert(),
           "Tracks the positions `start` [n, 2] from image `birth` [n] of `births` to `newest`. `at` [n, 2] holds "
           "guesses\n"
-          "and gets the result. `good` [n]: found less than `near` px from the guess and, tracked back, less than\n"
+          "and gets the result. `warps` [n, 2, 2], invertible, or [0, 2, 2]: how offsets from a position of the birth\n"
+          "image appear in the newest. `good` [n]: found less than `near` px from the guess and, tracked back, less "
+          "than\n"
           "`reach` px from the start.");
 }
 

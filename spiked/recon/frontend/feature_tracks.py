@@ -43,6 +43,8 @@ THUMBNAIL_SCALE = 0.25
 """Size of the images of `search` over the full size."""
 REACH_PX = 0.6
 """Largest forward-backward distance of a good track."""
+NO_WARPS = np.zeros((0, 2, 2), np.float32)
+"""Templates are used as they are."""
 
 
 def picture(rate: NDArray[np.float32], white: float) -> Picture:
@@ -81,14 +83,17 @@ class Tracks:
     motion_px: float = np.inf
     """Median motion to the newest window."""
     newest: int = -1
+    _warps: NDArray[np.float32] = field(default_factory=lambda: NO_WARPS)
     _spare: list[Pyramid] = field(default_factory=list)
     """Buffers for the next image."""
 
-    def add(self, window: int, image: Picture, after_gap: bool = False) -> float:
+    def add(self, window: int, image: Picture, after_gap: bool = False, warps: NDArray[np.float32] = NO_WARPS) -> float:
         """Track into a window and start new tracks; returns the median motion in px, 0 without tracks.
 
-        After a gap the predictions are dropped.
+        After a gap the predictions are dropped. `warps` [live, 2, 2]: how offsets from a track in its first window
+        appear in the new one.
         """
+        self._warps = warps
         if after_gap:
             self.pace[:] = np.nan
         motion, levels = 0.0, pyramid(image, LEVELS, self._spare.pop() if self._spare else None)
@@ -163,7 +168,9 @@ class Tracks:
         births, at = [levels[0] for levels in self.pictures.values()], np.array(guess)
         number = {window: n for n, window in enumerate(self.pictures)}
         row = np.array([number[window] for window in self.born.tolist()], np.int64)
-        _tracking.refine_tracks(births, row, levels[0], self.birthplace, at, self.reach_px, PREDICTION_RADIUS_PX, good)
+        _tracking.refine_tracks(
+            births, row, levels[0], self.birthplace, self._warps, at, self.reach_px, PREDICTION_RADIUS_PX, good
+        )
         return at, good
 
     def _start(self, window: int, image: Picture) -> None:

@@ -79,6 +79,11 @@ class GlobalAdjuster:
         return []
 
     @property
+    def newest_keyframe(self) -> TrackedView | None:
+        """None: the whole path is adjusted."""
+        return None
+
+    @property
     def due(self) -> bool:
         """Whether the map has grown enough since the last adjustment."""
         return len(self.map.views) >= self._next_count

@@ -22,16 +22,21 @@ LONG_FRAMES, LONG_VIEWS = 12_000, 1000
 15)."""
 KEYFRAME_PX = 4.0
 """Image motion from one keyframe to the next: 10 px triple the error, 2 px do not lower it (decision 15)."""
-WINDOW_KEYFRAMES, FIXED_KEYFRAMES = 24, 6
+LEAST_MOTION_PX = 2.0
+"""Image motion between views whose images are kept, at least."""
+WINDOW_KEYFRAMES, FIXED_KEYFRAMES = 60, 10
 """Newest keyframes that are adjusted while tracking, and those before them that fix the gauge (decision 15)."""
-ADJUST_EVERY = 3
+ADJUST_EVERY = 8
 """New keyframes from one adjustment to the next (decision 15)."""
-REFERENCE_KEYFRAMES = 30
+REFERENCE_KEYFRAMES = 60
 """Newest keyframes from which tracks are triangulated, and to which the newest views are adjusted (decision 15)."""
 REFITTED_VIEWS = 48
 """Newest views that are fitted again after an adjustment while tracking; those before move with their keyframe."""
 LOOP_ROUNDS = 4
 """Searches for loops, at most: each closes the first loop of the path that is open (decision 15)."""
+FINAL_SCALE_PX = 0.1
+"""Scale of the Cauchy loss in the adjustment of all keyframes: tracks across a whole image are off by up to 0.3 px
+where their surroundings lie at several depths (decision 15)."""
 WINDOW_ITERATIONS, LOOP_ITERATIONS, FINAL_ITERATIONS = 4, 4, 12
 """Most iterations of an adjustment in the window, after a loop and at the end."""
 TOLERANCE = 1e-3
@@ -64,6 +69,12 @@ class KeyframeAdjuster:
         """Keyframes that fix the newest views."""
         self._choose()
         return self.keyframes[-REFERENCE_KEYFRAMES:]
+
+    @property
+    def newest_keyframe(self) -> TrackedView | None:
+        """The newest keyframe."""
+        self._choose()
+        return self.keyframes[-1] if self.keyframes else None
 
     @property
     def due(self) -> bool:
@@ -104,7 +115,7 @@ class KeyframeAdjuster:
         if len(keyframes) <= 2 or (made := self.map.bundle(keyframes)) is None:
             return
         made.bundle.focal_free = self.map.focal is not None
-        banded_bundle.optimise(made.bundle, iterations, SCALE_PX, np.arange(len(keyframes)) < 1, TOLERANCE)
+        banded_bundle.optimise(made.bundle, iterations, FINAL_SCALE_PX, np.arange(len(keyframes)) < 1, TOLERANCE)
         if self.map.focal is not None:
             self.map.intrinsics = made.bundle.intrinsics
             self.map.focal = replace(self.map.focal, intrinsics=made.bundle.intrinsics)

@@ -13,7 +13,7 @@ from spiked.recon.frontend.spike_intervals import SpikeIntervals
 from spiked.recon.frontend.track_timestamps import TrackTimestamps
 from spiked.recon.odometry.global_adjuster import GlobalAdjuster
 from spiked.recon.odometry.initialiser import Initialiser
-from spiked.recon.odometry.keyframe_adjuster import LONG_FRAMES, LONG_VIEWS, KeyframeAdjuster
+from spiked.recon.odometry.keyframe_adjuster import LEAST_MOTION_PX, LONG_FRAMES, LONG_VIEWS, KeyframeAdjuster
 from spiked.recon.odometry.path_adjuster import PathAdjuster
 from spiked.recon.odometry.pnp import fit_pose
 from spiked.recon.odometry.pose_tracker import LOCAL_BA_EVERY, PoseTracker
@@ -160,6 +160,7 @@ class Odometry:
             return
         posed = self._map.posed()
         if posed and (len(posed) >= LONG_VIEWS or posed[-1].time - posed[0].time >= LONG_FRAMES):
+            self._relocaliser.least_motion_px = LEAST_MOTION_PX
             self._adjuster = self._tracker.adjuster = KeyframeAdjuster(self._map, self._relocaliser.keyframes)
 
     def _track(
@@ -167,7 +168,7 @@ class Odometry:
     ) -> TrackedView:
         """Append a view with its tracks, moved to its time."""
         number = len(self.views)
-        motion_px = self._tracks.add(number, picture, after_gap)
+        motion_px = self._tracks.add(number, picture, after_gap, self._tracker.template_warps(time))
         ids, at = self._tracks.ids.copy(), self._tracks.at.copy()
         late = np.zeros(len(ids)) if intervals is None else intervals.delays(picture, at)
         pixels, sigma_px = self._timestamps.align(time, ids, at, late)

@@ -26,6 +26,10 @@ class PathAdjuster(Protocol):
         """
 
     @property
+    def newest_keyframe(self) -> TrackedView | None:
+        """The newest keyframe; None on short paths."""
+
+    @property
     def due(self) -> bool:
         """Whether the map has grown enough since the last adjustment."""
 

@@ -3,14 +3,16 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spiked.pose import exp_so3, log_so3
-from spiked.recon.frontend.feature_tracks import Picture, Tracks
+from spiked.recon.frontend.feature_tracks import NO_WARPS, Picture, Tracks
 from spiked.recon.odometry.initialisation import SCALE_PX
 from spiked.recon.odometry.path_adjuster import PathAdjuster
 from spiked.recon.odometry.pnp import LOST_CHI2, MIN_POINTS, WORST_CHI2, WORST_INLIERS, PnPResult, fit_pose
 from spiked.recon.odometry.relocaliser import Relocaliser
 from spiked.recon.odometry.sparse_map import Pose, SparseMap, TrackedView
+from spiked.recon.odometry.template_warps import template_warps
 from spiked.recon.odometry.tracking_state import State, TrackingState
 
 RECENT_VIEWS = 48
@@ -40,8 +42,7 @@ class PoseTracker:
     def track(self, picture: Picture) -> None:
         """Estimate the pose of the newest view, then extend and adjust the map."""
         view = self.map.views[-1]
-        known = [v for v in self.map.views[-PREDICTION_VIEWS:-1] if v.pose is not None] or self.map.posed()
-        fit = fit_pose(self.map, view, predict(known[-2:], view.time))
+        fit = fit_pose(self.map, view, predict(self._known(PREDICTION_VIEWS), view.time))
         if (why := fit.lost_reason()) is not None:
             found = self.relocaliser.find(view, picture)
             if found is None:
@@ -53,13 +54,31 @@ class PoseTracker:
             self.tracks.resume(view.id, view.ids, view.pixels)
             self.status.set(view.time, State.RELOC, f"found again by {fit.points} points of earlier views")
         fit.store(view)
+        if self.adjuster.newest_keyframe is view:
+            self._recover_tracks(view, picture)
         self._extend_map(view, fit)
+
+    def template_warps(self, time: float) -> NDArray[np.float32]:
+        """See `template_warps`, for a view at `time` frames on a long path; none on a short one."""
+        if self.adjuster.newest_keyframe is None:
+            return NO_WARPS
+        return template_warps(self.map, self.tracks, predict(self._known(PREDICTION_VIEWS), time))
 
     def triangulate_recent(self) -> None:
         """Triangulate tracks from the newest views."""
         recent = self.map.views[-RECENT_VIEWS:]
         older = [view for view in self.adjuster.reference_views if view.id < recent[0].id]
         self.map.triangulate(older + recent)
+
+    def _known(self, newest: int) -> list[TrackedView]:
+        """The last two views with a pose, or one: if possible of the `newest` views."""
+        return ([v for v in self.map.views[-newest:] if v.pose is not None] or self.map.posed())[-2:]
+
+    def _recover_tracks(self, view: TrackedView, picture: Picture) -> None:
+        """Resume tracks that ended, or left the image, before the newest view: they tie more keyframes together."""
+        ids, pixels = self.relocaliser.recover(view, picture)
+        self.tracks.resume(view.id, ids, pixels)
+        view.ids, view.pixels = np.concatenate([view.ids, ids]), np.concatenate([view.pixels, pixels])
 
     def _extend_map(self, view: TrackedView, fit: PnPResult) -> None:
         """Triangulate and adjust after the newest view got its pose, then update the state."""

@@ -3,8 +3,10 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from spiked.recon.frontend.feature_tracks import Picture, flow, search
+from spiked.pose import Array
+from spiked.recon.frontend.feature_tracks import Picture, flow, follow, pyramid, search
 from spiked.recon.odometry.initialisation import INLIER_PX
 from spiked.recon.odometry.pnp import MIN_POINTS, PnPResult, fit_pose
 from spiked.recon.odometry.sparse_map import SparseMap, TrackedView
@@ -15,10 +17,16 @@ NEWEST_KEYFRAMES, OLDER_KEYFRAMES = 3, 12
 """Keyframes tried: the newest, and about so many of the older ones, evenly spaced."""
 RELOCALISED_CHI2, RELOCALISED_INLIERS = 4.0, 0.6
 """Relocalisation needs points within twice their noise: blurred views match much by chance (decision 10)."""
-REPROJECTION_SEARCH_PX = (0.5, 4.0)
-"""Largest forward-backward error of a keyframe point matched again, and its largest distance from the projection."""
+MAX_RETURN_PX = 0.5
+"""Largest forward-backward error of a keyframe point matched again."""
+REPROJECTION_RADIUS_PX = 4.0
+"""Largest distance of such a point from its projection after tracking was lost."""
 REPROJECTED_INLIER_PX = 2 * INLIER_PX
 """Largest residual of a matched point that becomes a track again."""
+RECOVERY_KEYFRAMES = 50
+"""Newest keyframes whose points are searched again in a view: most of the motion across an image (decision 15)."""
+RECOVERY_RADIUS_PX = 3.0
+"""Largest distance of a recovered point from its projection."""
 
 
 @dataclass
@@ -28,11 +36,36 @@ class Relocaliser:
     map: SparseMap
     keyframes: dict[int, Picture] = field(default_factory=dict)
     """Images of the keyframes by view id."""
+    least_motion_px: float = 0.0
+    """Image motion from one keyframe to the next, at least: with more than 0 a camera at rest adds none."""
+    _moved_px: float = 0.0
+    """Image motion since the newest keyframe."""
 
     def remember(self, view: TrackedView, picture: Picture) -> None:
         """Keep the image of a view with a pose if it is a keyframe."""
-        if view.pose is not None and view.id % KEYFRAME_EVERY == 0:
+        self._moved_px += view.moved_px
+        if view.pose is not None and view.id % KEYFRAME_EVERY == 0 and self._moved_px >= self.least_motion_px:
             self.keyframes[view.id] = picture
+            self._moved_px = 0.0
+
+    def recover(self, view: TrackedView, picture: Picture) -> tuple[NDArray[np.int64], Array]:
+        """Ids [n] and places [n, 2] px, in a view with a pose, of points of recent keyframes without a track in it."""
+        assert view.pose is not None
+        last_seen = np.full(len(self.map.points), -1)
+        for number in list(self.keyframes)[-RECOVERY_KEYFRAMES:]:
+            last_seen[self.map.views[number].ids] = number
+        last_seen[view.ids] = -1
+        ids = np.flatnonzero((last_seen >= 0) & np.isfinite(self.map.points[:, 0]))
+        inside, guess = self.map.project_into(ids, view.pose, picture.shape)
+        ids, guess = ids[inside], guess[inside]
+        at, found = guess.copy(), np.zeros(len(ids), bool)
+        levels = pyramid(picture, 1)
+        for number in np.unique(last_seen[ids]).tolist():
+            rows = np.flatnonzero(last_seen[ids] == number)
+            before, key = pyramid(self.keyframes[number], 1), self.map.views[number]
+            at[rows], found[rows] = follow(before, levels, key.pixels_of(ids[rows]), guess[rows], MAX_RETURN_PX)
+        found &= np.linalg.norm(at - guess, axis=1) < RECOVERY_RADIUS_PX
+        return ids[found], at[found]
 
     def find(self, view: TrackedView, picture: Picture) -> PnPResult | None:
         """The pose of a lost view by the points of a keyframe; the matched points become the tracks of the view.
@@ -67,8 +100,8 @@ class Relocaliser:
             if not inside.any():
                 continue
             ids, guess = ids[inside], guess[inside]
-            at, good = flow(self.keyframes[number], picture, pixels[inside], guess, REPROJECTION_SEARCH_PX[0], levels=1)
-            good &= np.linalg.norm(at - guess, axis=1) < REPROJECTION_SEARCH_PX[1]
+            at, good = flow(self.keyframes[number], picture, pixels[inside], guess, MAX_RETURN_PX, levels=1)
+            good &= np.linalg.norm(at - guess, axis=1) < REPROJECTION_RADIUS_PX
             view.ids, view.pixels = np.concatenate([view.ids, ids[good]]), np.concatenate([view.pixels, at[good]])
         fit = fit_pose(self.map, view, fit.pose)
         agree = self.map.errors_px(view, fit.pose) < REPROJECTED_INLIER_PX

@@ -206,25 +206,25 @@ class Reconstructor:
         """Track the buffered frames and refine path and map together.
 
         If the steps of the options take longer than `budget_s`, the schedule is compressed to fewer steps. Stops when
-        `cancelled` returns true, with the map of that moment. If there is a live map, the first `progress` call of the
-        refinement precedes any change of it.
+        `cancelled` returns true, with the map of that moment; the loops of a long path may then be open. If there is a
+        live map, the first `progress` call of the refinement precedes any change of it.
         """
         deadline = np.inf if budget_s is None else time.perf_counter() + budget_s
         progress = progress or (lambda status: None)
         with self._log.measure("tracking"):
-            self._end_tracking()
+            self._end_tracking(lambda: cancelled() or time.perf_counter() > deadline)
         with self._log.measure("refining"):
             if (path := self._mappable_path()) is not None:
                 self._refine(path, progress, cancelled, deadline)
         self._stage = "done"
         progress(self.status())
 
-    def _end_tracking(self) -> None:
+    def _end_tracking(self, stop: Callable[[], bool]) -> None:
         with self._one_blas_thread():
             for view in self._windows.flush():
                 self._track(view)
             if self._given is None:
-                self.odometry.end()
+                self.odometry.end(stop)
                 self._waypoints = -1, None  # the views have moved
             else:
                 self._unit = self._given.end(self.odometry, self._frames)

@@ -1,5 +1,6 @@
 """Long paths: keyframes instead of a spline, and loops that close."""
 
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from spiked.recon import Options, Reconstructor
 from spiked.recon.frontend.feature_tracks import picture, white_of
 from spiked.recon.odometry.keyframe_adjuster import LONG_FRAMES
 from spiked.recon.odometry.loop_closure import find_closures
+from spiked.recon.odometry.odometry import Odometry
 from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import SimulatedCamera
 from spiked.simulate.motion import HandShake, Stage, hand_shake
@@ -42,17 +44,30 @@ class ThereAndBack:
 
 
 @pytest.fixture(scope="module")
-def walked() -> tuple[Reconstructor, Trajectory]:
-    """The odometry of a path there and back, and its truth."""
+def fed() -> tuple[Reconstructor, Trajectory]:
+    """All frames of a path there and back, tracked, and its truth."""
     assert SENSOR.intrinsics is not None
     stage = Room(colour=False, seed=2).stage(SENSOR.intrinsics, flow_px=0.02, parallax=0.01)
     camera = SimulatedCamera(SENSOR, seed=2, motion=ThereAndBack(stage, hand_shake(stage, seed=3)), step_px=0.3)
     reconstructor = Reconstructor(SENSOR, Options(steps=0))
     for first in range(0, FRAMES, 500):
         reconstructor.feed(first, camera.next_frames(500))
-    reconstructor.odometry.end()
     rotations, centres = camera.truth(np.arange(FRAMES))
     return reconstructor, Trajectory((np.arange(FRAMES) + 0.5) / SENSOR.frame_rate_hz, rotations, centres)
+
+
+@pytest.fixture(scope="module")
+def not_ended(fed: tuple[Reconstructor, Trajectory]) -> Odometry:
+    """The odometry before its end."""
+    return deepcopy(fed[0].odometry)
+
+
+@pytest.fixture(scope="module")
+def walked(fed: tuple[Reconstructor, Trajectory], not_ended: Odometry) -> tuple[Reconstructor, Trajectory]:
+    """The reconstruction with its last adjustment, and the truth."""
+    del not_ended
+    fed[0].odometry.end()
+    return fed
 
 
 def test_a_long_path_is_followed_and_its_loop_closed(walked: tuple[Reconstructor, Trajectory]) -> None:
@@ -74,6 +89,26 @@ def test_tracks_that_ended_are_found_again(walked: tuple[Reconstructor, Trajecto
     order = np.lexsort((numbers, ids))
     breaks = np.diff(numbers[order])[np.diff(ids[order]) == 0]
     assert ((breaks > 3) & (breaks < 60)).sum() > 100
+
+
+@pytest.mark.parametrize("asked", [0, 1, 3])
+def test_the_last_adjustment_ends_when_it_is_told(
+    walked: tuple[Reconstructor, Trajectory], not_ended: Odometry, asked: int
+) -> None:
+    """A whole one asks more often; every view keeps a pose, whenever it ends."""
+    odometry = deepcopy(not_ended)
+    calls = []
+
+    def stop() -> bool:
+        calls.append(0)
+        return len(calls) > asked
+
+    odometry.end(stop)
+    assert asked < len(calls) < asked + 25  # each step that is refused raises the damping
+    assert sum(view.pose is not None for view in odometry.views) == sum(
+        view.pose is not None for view in walked[0].odometry.views
+    )
+    assert (odometry.closures > 0) == (asked > 0)
 
 
 def test_no_loop_is_closed_between_different_places(walked: tuple[Reconstructor, Trajectory]) -> None:

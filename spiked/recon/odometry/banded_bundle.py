@@ -5,6 +5,7 @@ band narrow where the path closes loops (E. Cuthill, J. McKee, "Reducing the ban
 1969).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -160,13 +161,23 @@ def _of_group(bundle: Bundle, group: _Group) -> Bundle:
 
 
 def optimise(
-    bundle: Bundle, iterations: int, scale_px: float, fixed: NDArray[np.bool_], tolerance: float = 1e-4
+    bundle: Bundle,
+    iterations: int,
+    scale_px: float,
+    fixed: NDArray[np.bool_],
+    tolerance: float = 1e-4,
+    stop: Callable[[], bool] = lambda: False,
 ) -> float:
-    """As `Bundle.optimise`, in time and memory that grow linearly with the number of poses. Changes the bundle."""
+    """As `Bundle.optimise`, in time and memory that grow linearly with the number of poses. Changes the bundle.
+
+    Ends after the iteration during which `stop` becomes true.
+    """
     free = ~fixed
     structure = BandedStructure.of(bundle, free)
 
     def attempt(damping: float) -> tuple[float, Bundle]:
+        if stop():
+            return np.inf, bundle
         try:
             step = _BandedSystem.of(bundle, structure, scale_px, damping).solve(damping, bundle.focal_free)
         except np.linalg.LinAlgError:  # not positive definite: more damping

@@ -1,5 +1,6 @@
 """Global bundle adjustment: the path as a spline, adjusted to the tracks of the whole recording."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -112,12 +113,12 @@ class GlobalAdjuster:
                     view.pose, view.state = None, State.LOST
             effort = FULL_EFFORT
 
-    def finish(self) -> None:
-        """The last adjustments: an estimated focal length may need several."""
+    def finish(self, stop: Callable[[], bool] = lambda: False) -> None:
+        """The last adjustments: an estimated focal length may need several. Ends after one if `stop` is true."""
         self.adjust()
         for _ in range(MAX_FOCAL_ROUNDS):
             before = self.map.intrinsics.fx
-            if self.map.focal is None or self.spline is None:
+            if self.map.focal is None or self.spline is None or stop():
                 return
             self.adjust()
             if abs(self.map.intrinsics.fx / before - 1) < FOCAL_TOLERANCE:

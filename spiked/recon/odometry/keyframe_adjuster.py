@@ -4,6 +4,7 @@ The cost of one adjustment while tracking is bounded; the last one grows with th
 interpolated between the views, see `SparseMap.waypoints`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -93,11 +94,13 @@ class KeyframeAdjuster:
         made.bundle.optimise(WINDOW_ITERATIONS, SCALE_PX, fixed, TOLERANCE)
         self._take(made, self.map.views[keyframes[0].id :], len(self.map.views) - REFITTED_VIEWS)
 
-    def finish(self) -> None:
-        """Close loops and adjust all keyframes; every view follows."""
+    def finish(self, stop: Callable[[], bool] = lambda: False) -> None:
+        """Close loops and adjust all keyframes; every view follows. See `PathAdjuster.finish` about `stop`."""
         self._choose()
         chosen = {view.id: view for view in self.keyframes if view.pose is not None}
         for _ in range(LOOP_ROUNDS):
+            if stop():
+                return
             closures = spread_drift(self.map, find_closures(self.map, self.pictures))
             if not closures:
                 break
@@ -105,17 +108,18 @@ class KeyframeAdjuster:
                 closure.add_tracks()
                 chosen |= {closure.earlier.id: closure.earlier, closure.later.id: closure.later}
             self.closures += len(closures)
-            self._adjust_all(chosen, LOOP_ITERATIONS)
-        self._adjust_all(chosen, FINAL_ITERATIONS)
+            self._adjust_all(chosen, LOOP_ITERATIONS, stop)
+        self._adjust_all(chosen, FINAL_ITERATIONS, stop)
         self.map.triangulate(self.keyframes)
 
-    def _adjust_all(self, chosen: dict[int, TrackedView], iterations: int) -> None:
+    def _adjust_all(self, chosen: dict[int, TrackedView], iterations: int, stop: Callable[[], bool]) -> None:
         """Adjust these views, by id, and their points; all others follow."""
         keyframes = [chosen[number] for number in sorted(chosen)]
         if len(keyframes) <= 2 or (made := self.map.bundle(keyframes)) is None:
             return
         made.bundle.focal_free = self.map.focal is not None
-        banded_bundle.optimise(made.bundle, iterations, FINAL_SCALE_PX, np.arange(len(keyframes)) < 1, TOLERANCE)
+        first = np.arange(len(keyframes)) < 1
+        banded_bundle.optimise(made.bundle, iterations, FINAL_SCALE_PX, first, TOLERANCE, stop)
         if self.map.focal is not None:
             self.map.intrinsics = made.bundle.intrinsics
             self.map.focal = replace(self.map.focal, intrinsics=made.bundle.intrinsics)

@@ -3,6 +3,7 @@
 It needs no map of Gaussians: a trajectory exists within a second or two, and mapping then refines it.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -177,11 +178,14 @@ class Odometry:
         self._map.reserve(self._tracks.next_id)
         return view
 
-    def end(self) -> None:
-        """After the last view: a last bootstrap attempt if needed, then the final global adjustment."""
+    def end(self, stop: Callable[[], bool] = lambda: False) -> None:
+        """After the last view: a last bootstrap attempt if needed, then the final global adjustment.
+
+        `stop`: see `PathAdjuster.finish`.
+        """
         if self.state is State.BOOT and self._initialiser.last_attempt():
             self._adjuster.adjust()
-        self._adjuster.finish()
+        self._adjuster.finish(stop)
         self.path_error = self._adjuster.path_error()
         self._reassess_views()
 

@@ -1,5 +1,6 @@
 """What adjusts the path of a map while it grows."""
 
+from collections.abc import Callable
 from typing import Protocol
 
 from spiked.pose import Array
@@ -36,8 +37,9 @@ class PathAdjuster(Protocol):
     def adjust(self, final: bool = True) -> None:
         """Adjust what is due; without `final`, with less effort where that suffices."""
 
-    def finish(self) -> None:
-        """The last adjustment, of the whole path."""
+    def finish(self, stop: Callable[[], bool] = lambda: False) -> None:
+        """The last adjustment, of the whole path. On a long path it ends soon after `stop` becomes true: loops may then
+        be open."""
 
     def path_error(self) -> float | None:
         """Predicted error of the path relative to its RMS radius; None if it is not predicted."""

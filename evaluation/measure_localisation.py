@@ -151,6 +151,8 @@ def known_place(folder: MapFolder, recording: Recording, map_truth: Path | None,
     print(*reasons, sep="\n")
     wall, cpu = np.array(seconds).T
     print(f"starts {len(starts)}, recognised {len(local)}")
+    if not local:
+        return
     for name, errors_ in (("local", np.array(local)), ("global", np.array(whole))):
         recall = (errors_ <= GOOD_PERCENT).sum() / len(starts)
         print(

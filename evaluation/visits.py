@@ -35,6 +35,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--beside-m", type=float, default=0.1, help="standard deviation along each axis")
     parser.add_argument("--turned-deg", type=float, default=4.0, help="standard deviation about each axis")
+    parser.add_argument("--gain", type=float, help="spikes a frame of white; default: the scene's, or 0.35")
     parser.add_argument("--fov", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
@@ -46,7 +47,7 @@ def main() -> None:
     shake = tremor_like(np.concatenate([path.centres - calm.centres, turns], 1), step, len(path), rng)
     rotations, centres = calm.rotations @ exp_so3(shake[:, 3:]), calm.centres + shake[:, :3]
     scene = Scene.read_ply(given.scene)
-    splats, gain = SplatScene(scene, 2), scene.white or DEFAULT_GAIN
+    splats, gain = SplatScene(scene, 2), given.gain or scene.white or DEFAULT_GAIN
     given.out.mkdir(parents=True)
     seen, moments = [], np.arange(given.frames)
     with RecordingWriter(given.out / "visits.dat", sensor) as out:

@@ -79,10 +79,10 @@ def twice(one: RoomMap) -> RoomMap:
     )
 
 
-def visitor(seed: int, noise_seed: int = 5, gain: float = GAIN) -> SimulatedCamera:
+def visitor(seed: int, noise_seed: int = 5, gain: float = GAIN, flow_px: float = 0.05) -> SimulatedCamera:
     """A camera in the room of a seed, beside the path of its map."""
     room = Room(seed=seed)
-    stage = room.stage(OPTICS, flow_px=0.05)
+    stage = room.stage(OPTICS, flow_px=flow_px)
     turn, beside = exp_so3(0.3 * UP), np.array([0.1, 0.05, 0.03])
     target = stage.centre + turn @ (stage.target - stage.centre)
     stage = replace(stage, centre=stage.centre + beside, target=target)

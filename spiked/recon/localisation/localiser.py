@@ -12,7 +12,7 @@ from spiked.calibration import Calibration
 from spiked.errors import ConfigurationError, RecordingError
 from spiked.pose import exp_so3, log_so3
 from spiked.recon.frontend.feature_tracks import LEVELS, Picture, Pyramid, Tracks, picture, pyramid, white_of
-from spiked.recon.frontend.windowing import View, Windows, luminance
+from spiked.recon.frontend.windowing import WINDOWS, View, Windows, luminance
 from spiked.recon.localisation.alignment import NEAR_LEVELS, Anchor, Fit, align, correlation
 from spiked.recon.localisation.map_index import MapIndex
 from spiked.recon.localisation.recognition import LEAST_CORRELATION, LEAST_INLIERS, LEAST_SHARE, Recognition
@@ -27,6 +27,9 @@ SEARCH_EVERY_S = (0.001, 0.32)
 """Time from a start or a loss to the second search, which doubles from search to search, and the longest time."""
 CONFIRM_S = 0.01
 """Least time from a search that found the path to the next: nearer views say much the same."""
+DIM_SPIKES = 2.0
+"""Spikes a pixel of a view, below which the next one is twice as long: windows do not follow a motion that has no
+tracks. They are shortened again where the camera moves by more than a pixel in them."""
 LEAST_VIEWS = 2
 """Views of a recording: searches in different views have to agree."""
 ANCHOR_PX = 2.0
@@ -136,6 +139,8 @@ class Localiser:
         motion = self._tracks.add(self._seen, image, view.after_gap)
         if self._seen:
             self._windows.follow(motion, view.time - self._time)
+        if view.spikes_a_pixel < DIM_SPIKES and not self._windows.sharpen:
+            self._windows.length = min(2 * (view.end - view.begin), WINDOWS[-1])
         if view.after_gap:
             self._lose(view)
         self._seen, self._time, self._last = self._seen + 1, view.time, (view, image)

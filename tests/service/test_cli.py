@@ -177,6 +177,7 @@ def test_reconstruct_with_known_poses_writes_all_results(room: Path, tmp_path: P
     figures = json.loads((tmp_path / "score.json").read_text())
     assert figures["ate_percent"] < 0.5
     assert figures["psnr_db"] > 20
+    assert 10 < figures["worst_psnr_db"] < figures["psnr_db"]
     bare = tmp_path / "bare"
     bare.mkdir()
     for name in ("room.dat", "room.json", "groundtruth.tum"):

@@ -28,7 +28,7 @@ def evaluate(
     recording: Annotated[Path, typer.Option(help="The recording, with groundtruth.tum and views.json beside it.")],
     json_out: Annotated[Path | None, typer.Option("--json", help="Also write the figures to this file.")] = None,
 ) -> None:
-    """Print coverage, ATE and RPE of a trajectory, and PSNR and SSIM of held-out views.
+    """Print coverage, ATE and RPE of a trajectory, and PSNR and SSIM of held-out views: the mean, and the worst PSNR.
 
     ATE is in percent of the RMS radius of the true path, after alignment by a similarity. RPE is over 32 frames.
 
@@ -47,7 +47,7 @@ def evaluate(
         figures |= vars(score.errors)
         views = _score_views(source, truth, estimate, Scene.read_ply(result / "scene.ply"))
         if views is not None:
-            figures |= {"psnr_db": views.mean_psnr_db, "ssim": views.mean_ssim}
+            figures |= {"psnr_db": views.mean_psnr_db, "worst_psnr_db": min(views.psnr_db), "ssim": views.mean_ssim}
     for name, value in figures.items():
         output.print(f"{name:14s} {value:.4f}")
     if json_out is not None:

@@ -20,13 +20,21 @@ WRITERS: dict[tuple[str, str], list[str]] = {
     ("calibrate", "--out"): [MISSING],
     ("convert", "OUT"): [MISSING],
     ("evaluate", "--json"): [MISSING, "--recording", MISSING],
+    ("localise", "--out"): [MISSING, MISSING],
+    ("localise", "--json"): [MISSING, MISSING],
     ("noise-report", "--json"): [MISSING],
     ("bench", "--json"): ["--stream", MISSING],
     ("bench", "--folder"): ["--stream", MISSING],
     ("openapi", "--out"): [],
     ("backup", "--to"): ["--data", MISSING],
 }
-FOLDERS = {("reconstruct", "--out"), ("render", "--out"), ("simulate", "--out"), ("bench", "--folder")}
+FOLDERS = {
+    ("reconstruct", "--out"),
+    ("render", "--out"),
+    ("simulate", "--out"),
+    ("localise", "--out"),
+    ("bench", "--folder"),
+}
 READS = {
     "file",
     "files",
@@ -40,6 +48,7 @@ READS = {
     "calibration",
     "stream",
     "token_file",
+    "map_folder",
 }
 """Parameters that are paths to read."""
 OF_THE_SERVICE = {"data", "runtime", "config"}

@@ -189,10 +189,6 @@ class Captures:
         found = self._catalogue.read("SELECT state, count(*) FROM captures WHERE deleted_at IS NULL GROUP BY state")
         return dict(found)
 
-    def folder(self, capture_id: str) -> Path:
-        """Where its files lie. Raises UnknownIdError."""
-        return self._folder.capture(self._catalogue.captures.get(capture_id).id)
-
     def recording(self, capture_id: str) -> Path:
         """Path of its `.dat`, which may not exist or still grow. Raises UnknownIdError."""
         return self._folder.recording(self._catalogue.captures.get(capture_id).id)

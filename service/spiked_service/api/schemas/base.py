@@ -1,7 +1,6 @@
 """What the models of the API share."""
 
 import re
-from datetime import UTC, datetime
 from itertools import combinations, permutations
 from typing import Annotated, Any, Generic, TypeVar
 
@@ -166,8 +165,3 @@ class IntrinsicsModel(In):
         if intrinsics is None:
             return None
         return cls(fx=intrinsics.fx, fy=intrinsics.fy, cx=intrinsics.cx, cy=intrinsics.cy)
-
-
-def utc(at: datetime | None) -> datetime | None:
-    """Times go out as UTC."""
-    return None if at is None else at.astimezone(UTC)

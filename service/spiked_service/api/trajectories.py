@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import orjson
 from fastapi import Request, Response
 from numpy.typing import NDArray
-from pydantic_core import to_json
 
 from spiked.errors import ConfigurationError, SceneError
 from spiked.pose import Array
@@ -35,7 +35,7 @@ from spiked_service.results.versions import Published, pose_file
 
 _PIECE = 4096
 """Poses of a piece: between pieces other requests run and a disconnect of the client is noticed."""
-_KEPT = 16
+_KEPT = 48
 """Pieces cached for all columns of JSON: with a large step every pose is on another page of the file."""
 _DECIMALS = 9
 """Decimals of positions and quaternions in JSON."""
@@ -183,15 +183,15 @@ def _json(poses: PoseFile, rows: range, version: int, rate_hz: float) -> Iterato
 
     yield b'{"version":%d' % version
     for name, column in columns.items():
-        yield from _array(name, (column(part).tolist() for part in found()))
+        yield from _array(name, (np.ascontiguousarray(column(part)) for part in found()))
     yield from _array("states", ([_state(one) for one in part["state"].tolist()] for part in found()))
     yield b"}"
 
 
-def _array(name: str, parts: Iterable[list[Any]]) -> Iterator[bytes]:
+def _array(name: str, parts: Iterable[NDArray[Any] | list[str | None]]) -> Iterator[bytes]:
     begin = b',"%s":[' % name.encode()
     for part in parts:
-        yield begin + to_json(part)[1:-1]
+        yield begin + orjson.dumps(part, option=orjson.OPT_SERIALIZE_NUMPY)[1:-1]
         begin = b","
     yield b"]"
 

@@ -19,6 +19,8 @@ RECENT_VIEWS = 48
 """Newest views from which tracks are triangulated between global adjustments: it bounds the time of one call."""
 TRIANGULATE_EVERY, LOCAL_BA_EVERY = 4, 8
 """Views between triangulations and between local bundle adjustments."""
+PREDICTED_LENGTHS = 4
+"""Lengths of the newest view over which its motion is taken to go on, for the templates of tracks."""
 PREDICTION_VIEWS = 40
 """Newest views in which posed ones are sought to predict the next pose."""
 LOCAL_BA_VIEWS, LOCAL_BA_FIXED, LOCAL_BA_OLDER = 10, 4, 4
@@ -59,8 +61,14 @@ class PoseTracker:
         self._extend_map(view, fit)
 
     def template_warps(self, time: float) -> NDArray[np.float32]:
-        """See `template_warps`, for a view at `time` frames on a long path; none on a short one."""
-        if self.adjuster.newest_keyframe is None:
+        """See `template_warps`, for a view at `time` frames on a long path.
+
+        None on a short one, and where the pose cannot be predicted: while lost, and after a gap.
+        """
+        newest = self.map.views[-1] if self.map.views else None
+        if self.adjuster.newest_keyframe is None or newest is None or newest.pose is None:
+            return NO_WARPS
+        if time - newest.time > PREDICTED_LENGTHS * newest.length:
             return NO_WARPS
         return template_warps(self.map, self.tracks, predict(self._known(PREDICTION_VIEWS), time))
 

@@ -83,7 +83,6 @@ class Tracks:
     motion_px: float = np.inf
     """Median motion to the newest window."""
     newest: int = -1
-    _warps: NDArray[np.float32] = field(default_factory=lambda: NO_WARPS)
     _spare: list[Pyramid] = field(default_factory=list)
     """Buffers for the next image."""
 
@@ -93,12 +92,11 @@ class Tracks:
         After a gap the predictions are dropped. `warps` [live, 2, 2]: how offsets from a track in its first window
         appear in the new one.
         """
-        self._warps = warps
         if after_gap:
             self.pace[:] = np.nan
         motion, levels = 0.0, pyramid(image, LEVELS, self._spare.pop() if self._spare else None)
         if self.newest_picture is not None and len(self.ids):
-            motion = self._follow(image, levels)
+            motion = self._follow(image, levels, warps)
         self.newest, self.newest_picture, self.motion_px = window, image, motion
         self.pictures[window] = levels
         if len(self.ids) < REFILL_SHARE * self.target:
@@ -127,12 +125,12 @@ class Tracks:
         self.born = np.concatenate([self.born, np.full(len(ids), window)])
         self.birthplace = np.concatenate([self.birthplace, at])
 
-    def _follow(self, image: Picture, levels: Pyramid) -> float:
+    def _follow(self, image: Picture, levels: Pyramid, warps: NDArray[np.float32]) -> float:
         """Refine tracks from their predictions; search them in the previous image if too few match."""
-        moved, good = self._refined(levels, self._expected())
+        moved, good = self._refined(levels, self._expected(), warps)
         if good.sum() <= MIN_PREDICTED_SHARE * len(good):
             moved, found = self._searched(image, levels)
-            moved, good = self._refined(levels, moved)
+            moved, good = self._refined(levels, moved, warps)
             good &= found
         height, width = image.shape
         motion = median(np.linalg.norm(moved - self.at, axis=1)[good]) if good.any() else 0.0
@@ -160,7 +158,9 @@ class Tracks:
             moved, good = follow(before, levels, self.at, self.at, self.reach_px, back=False)
         return moved, good
 
-    def _refined(self, levels: Pyramid, guess: Array | None) -> tuple[Array, NDArray[np.bool_]]:
+    def _refined(
+        self, levels: Pyramid, guess: Array | None, warps: NDArray[np.float32]
+    ) -> tuple[Array, NDArray[np.bool_]]:
         """Positions [live, 2] near a guess, aligned with the first window of each track, and which were found."""
         good = np.zeros(len(self.ids), bool)
         if guess is None:
@@ -169,7 +169,7 @@ class Tracks:
         number = {window: n for n, window in enumerate(self.pictures)}
         row = np.array([number[window] for window in self.born.tolist()], np.int64)
         _tracking.refine_tracks(
-            births, row, levels[0], self.birthplace, self._warps, at, self.reach_px, PREDICTION_RADIUS_PX, good
+            births, row, levels[0], self.birthplace, warps, at, self.reach_px, PREDICTION_RADIUS_PX, good
         )
         return at, good
 
@@ -178,15 +178,18 @@ class Tracks:
         mask[inside, inside] = 255
         for x, y in self.at:
             cv2.circle(mask, (int(x), int(y)), CORNER_DISTANCE_PX, 0, -1)
-        wanted = self.target - len(self.ids)
-        corners = cv2.goodFeaturesToTrack(
-            image, wanted, CORNER_QUALITY, CORNER_DISTANCE_PX, mask=mask, blockSize=CORNER_BLOCK_PX
-        )
-        if corners is None:
-            return
-        fresh = corners[:, 0].astype(float) + 0.5
+        fresh = find_corners(image, self.target - len(self.ids), CORNER_DISTANCE_PX, mask=mask)
         self._begin(window, self.next_id + np.arange(len(fresh)), fresh)
         self.next_id += len(fresh)
+
+
+def find_corners(
+    image: Picture, count: int, distance_px: float, *, block_px: int = CORNER_BLOCK_PX, mask: Picture | None = None
+) -> Array:
+    """The strongest corners [n, 2] px of an image, at most `count`, at least `distance_px` apart, where `mask` is not
+    0."""
+    corners = cv2.goodFeaturesToTrack(image, count, CORNER_QUALITY, distance_px, mask=mask, blockSize=block_px)
+    return np.zeros((0, 2)) if corners is None else corners[:, 0].astype(float) + 0.5
 
 
 def flow(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 import spiked.native._tracking as _tracking
 from spiked.blocks import aligned_window
 from spiked.pose import Array
-from spiked.recon.frontend.feature_tracks import CORNER_QUALITY, Picture, flow, picture, white_of
+from spiked.recon.frontend.feature_tracks import Picture, find_corners, flow, picture, white_of
 from spiked.sensor import BitOrder, Image, Sensor
 
 FIELD_CELL_PX = 16
@@ -249,12 +249,9 @@ def _small(count: NDArray[np.uint16]) -> Picture:
 
 def _coarse_motion(a: Picture, b: Picture, sensor: Sensor) -> Field | None:
     blurred = cv2.GaussianBlur(a, (0, 0), COARSE_BLUR_PX)
-    corners = cv2.goodFeaturesToTrack(
-        blurred, COARSE_CORNERS, CORNER_QUALITY, COARSE_DISTANCE_PX, blockSize=COARSE_BLOCK_PX
-    )
-    if corners is None:
+    start = find_corners(blurred, COARSE_CORNERS, COARSE_DISTANCE_PX, block_px=COARSE_BLOCK_PX)
+    if not len(start):
         return None
-    start = corners[:, 0].astype(float) + 0.5
     end, good = flow(a, b, start, start, reach_px=COARSE_REACH_PX, levels=COARSE_LEVELS)
     return fit_field(2 * start[good], 2 * end[good], sensor.width, sensor.height)
 

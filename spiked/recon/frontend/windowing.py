@@ -14,6 +14,8 @@ from spiked.recon.frontend.motion_compensation import BINOMIAL, MotionCompensato
 from spiked.recon.frontend.spike_intervals import SpikeIntervals
 from spiked.sensor import Image, Mosaic, Sensor
 
+SITE_SHARES = np.array([0.25, 0.5, 0.25], np.float32)
+"""Share of the red, green and blue sites in a mosaic."""
 EXPOSURE_PERCENTILE = 10.0
 """Percentile of exposure starts and ends that bound the rendered span: the darkest pixels gather charge for too long to
 render their whole exposure in straight sub-frames (decision 6)."""
@@ -261,6 +263,11 @@ class Windows:
             self._compensator = MotionCompensator(self.sensor, self.length)
         self._compensator.estimate(self._frames[: stop - self._first], self._first, time)
         return self._compensator.sharp(self._frames, self._first, time)
+
+
+def grey(image: Image) -> Image:
+    """Grey [h, w] of colours [h, w, 3] in the proportion of a mosaic's sites; grey images pass through."""
+    return image if image.ndim == 2 else np.ascontiguousarray(image @ SITE_SHARES)
 
 
 def luminance(rate: Image, mosaic: Mosaic | None) -> Image:

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.pose import Array
-from spiked.recon.frontend.feature_tracks import LEVELS, Picture, Pyramid, picture, pyramid, white_of
+from spiked.recon.frontend.feature_tracks import LEVELS, Picture, Pyramid, find_corners, picture, pyramid, white_of
+from spiked.recon.frontend.windowing import grey
 from spiked.recon.odometry.sparse_map import Pose
 from spiked.render import Camera, rasteriser_for
 from spiked.scene import Scene
@@ -22,8 +23,6 @@ STEP = 0.5
 """Largest relative step of depth in that square: where surfaces meet, the rendered depth is of neither."""
 BORDER_PX = 6
 """Points nearer to the border are not used."""
-MIXED = np.array([0.25, 0.5, 0.25], np.float32)
-"""Share of red, green and blue in grey: as a mosaic mixes them."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +53,7 @@ class MapView:
 
     def corners(self, count: int, spacing_px: float) -> tuple[Array, Array]:
         """Corners [n, 2] px of the picture on sound pixels, `spacing_px` apart, and their points [n, 3]."""
-        mask = self.sound.astype(np.uint8)
-        found = cv2.goodFeaturesToTrack(self.picture, count, 0.003, spacing_px, mask=mask, blockSize=5)
-        pixels = np.zeros((0, 2)) if found is None else found[:, 0].astype(float) + 0.5
+        pixels = find_corners(self.picture, count, spacing_px, mask=self.sound.astype(np.uint8))
         return pixels, self.points(pixels)[0]
 
 
@@ -70,7 +67,7 @@ class MapRenderer:
     def render(self, pose: Pose) -> MapView:
         """The map from a pose."""
         shown = self._rasteriser.forward(self.scene, pose.rotation[None], pose.centre[None])
-        values = shown.values if shown.values.ndim == 2 else shown.values @ MIXED
+        values = grey(shown.values)
         square = np.ones((AROUND_PX, AROUND_PX), np.uint8)
         low, high = cv2.erode(shown.depth, square), cv2.dilate(shown.depth, square)
         sound = (cv2.erode(shown.alpha, square) > OPAQUE) & (high - low < STEP * high)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import spiked.native._dense as _dense
 from spiked.pose import Array, log_so3
 from spiked.recon.frontend.motion_compensation import warp_frames
-from spiked.recon.frontend.windowing import View
+from spiked.recon.frontend.windowing import View, grey
 from spiked.recon.mapping.frame_warp import FrameWarp
 from spiked.recon.mapping.mapper import Mapper
 from spiked.recon.mapping.pyramid import Level
@@ -203,4 +203,4 @@ def _warped(request: RenderRequest, warp: FrameWarp, mapper: Mapper, level: Leve
     image = level.rasteriser.forward(mapper.scene, request.rotations, request.centres)
     moved = warp.displacements(mapper.camera, request.rotations[0], request.centres[0], image.depth)
     seen = level.shrunk(warp_frames(warp.frames, mapper.sensor, moved, WARP_CELL_PX))
-    return image, level.mixed(image.values), seen, np.ones_like(seen)
+    return image, grey(image.values), seen, np.ones_like(seen)

@@ -13,8 +13,6 @@ from spiked.sensor import Image, Mosaic, Sensor
 
 SMALLEST_PIXELS = 50_000
 """No level has fewer pixels (decision 5)."""
-SITE_SHARES = np.array([0.25, 0.5, 0.25], np.float32)
-"""Share of the red, green and blue sites in a mosaic."""
 
 
 @dataclass(frozen=True)
@@ -81,10 +79,6 @@ class Level:
             np.stack([_mean(values[..., c], rest) for c in range(3)], -1),
             np.stack([_mean(deviation[..., c], rest) / np.float32(rest) for c in range(3)], -1),
         )
-
-    def mixed(self, image: Image) -> Image:
-        """Grey [h, w] of colours [h, w, 3] in the proportion of a mosaic's sites; grey images pass through."""
-        return image if image.ndim == 2 else np.ascontiguousarray(image @ SITE_SHARES)
 
     def shrunk(self, image: Image) -> Image:
         """A grey image [H, W] at this size."""

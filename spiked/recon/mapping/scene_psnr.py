@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from spiked.recon.frontend.windowing import View, luminance
-from spiked.recon.mapping.pyramid import SITE_SHARES
+from spiked.recon.frontend.windowing import View, grey, luminance
 from spiked.recon.statistics import WHITE_PERCENTILE
 from spiked.render import AnyRasteriser
 from spiked.scene import Scene
@@ -33,8 +32,8 @@ def scene_psnr_db(
         seen = luminance(view.rate, sensor.mosaic) if view.sharp is None else view.sharp
         shown = np.zeros_like(seen)
         if row >= 0:
-            values = rasteriser.forward(scene, trajectory.rotations[row, None], trajectory.centres[row, None]).values
-            shown = values if values.ndim == 2 else values @ SITE_SHARES
+            rendered = rasteriser.forward(scene, trajectory.rotations[row, None], trajectory.centres[row, None])
+            shown = grey(rendered.values)
         brightness = float((seen * shown).sum()) / max(float((shown * shown).sum()), 1e-12)
         errors.append(float(np.mean((seen - brightness * shown) ** 2)))
         whites.append(float(np.percentile(seen, WHITE_PERCENTILE)))

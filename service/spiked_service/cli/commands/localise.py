@@ -25,7 +25,6 @@ NOT_RECOGNISED = 1
 """Exit code; errors have 2."""
 
 
-# Longer than 60 lines, because each option is a parameter.
 def localise(
     map_folder: Annotated[Path, typer.Argument(metavar="MAP", help="Output folder of `spiked reconstruct`.")],
     file: Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording.", readable=False)],

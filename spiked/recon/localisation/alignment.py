@@ -6,11 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-import spiked.native._bundle as _bundle
 from spiked.pose import Array
 from spiked.recon.frontend.feature_tracks import LEVELS, Picture, Pyramid, follow
 from spiked.recon.localisation.map_views import MapRenderer, MapView
-from spiked.recon.odometry.pnp import FIT_SCALES_PX, LEAST_POINTS
+from spiked.recon.odometry.pnp import FIT_SCALES_PX, LEAST_POINTS, solve_pose
 from spiked.recon.odometry.sparse_map import Pose
 from spiked.recon.statistics import RAYLEIGH_MEDIAN, median
 from spiked.sensor import Intrinsics
@@ -55,23 +54,14 @@ def fit(points: Array, pixels: Array, sought: int, start: Pose, intrinsics: Intr
     """
     if len(points) < LEAST_POINTS:
         return None
-    k = intrinsics
-    rotation, centre = start.rotation.copy(), start.centre.copy()
-    error, hessian = np.empty(len(points)), np.empty((6, 6))
-    lengths = np.array(FIT_SCALES_PX)
-    _bundle.fit_pose(
-        np.ascontiguousarray(points), np.ascontiguousarray(pixels), k.fx, k.fy, k.cx, k.cy, lengths, rotation, centre,
-        error, hessian, True,
-    )  # fmt: skip
-    agree = error < AGREES_PX
+    solved = solve_pose(np.ascontiguousarray(points), np.ascontiguousarray(pixels), intrinsics, start, FIT_SCALES_PX)
+    agree = solved.errors_px < AGREES_PX
     inliers = int(agree.sum())
-    if inliers < LEAST_POINTS or not np.isfinite(centre).all():
+    if inliers < LEAST_POINTS or not np.isfinite(solved.pose.centre).all():
         return None
-    noise_px = SYSTEMATIC * median(error[agree]) / RAYLEIGH_MEDIAN
-    depth = max(median((points - centre) @ rotation[:, 2]), 1e-6)
-    sigma_px = noise_px * _bundle.displacement(hessian, rotation, k.fx, k.fy, k.cx, k.cy, depth)
-    sigma = noise_px * float(np.sqrt(max(np.trace(np.linalg.inv(hessian)[3:, 3:]), 0.0)))
-    return Fit(Pose(rotation, centre), inliers, inliers / max(sought, 1), sigma, float(sigma_px))
+    noise_px = SYSTEMATIC * median(solved.errors_px[agree]) / RAYLEIGH_MEDIAN
+    sigma = noise_px * float(np.sqrt(max(np.trace(np.linalg.inv(solved.hessian)[3:, 3:]), 0.0)))
+    return Fit(solved.pose, inliers, inliers / max(sought, 1), sigma, float(noise_px * solved.displacement_px))
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,19 @@
 """Pose of one view from known points (PnP), and whether it can be trusted."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 import spiked.native._bundle as _bundle
+from spiked.pose import Array
 from spiked.recon.odometry.initialisation import INLIER_PX, SCALE_PX
 from spiked.recon.odometry.sparse_map import Pose, SparseMap, TrackedView
 from spiked.recon.statistics import RAYLEIGH_MEDIAN, median
+from spiked.sensor import Intrinsics
 
+LEAST_DEPTH_SCALE = 1e-6
+"""Median depth of points behind the camera is taken as this, to predict deviations."""
 LEAST_POINTS = 6
 """Known points below which no pose is computed: a pose has six parameters, a point gives two equations."""
 FIT_SCALES_PX = (4.0, 2.0, 1.0, *[SCALE_PX] * 5)
@@ -89,6 +94,36 @@ def chi2_of(median_px: float, noise_px: float) -> float:
     return float((median_px / (RAYLEIGH_MEDIAN * noise_px)) ** 2)
 
 
+@dataclass(frozen=True)
+class SolvedPose:
+    """A pose from points and their pixels, and how well it is determined."""
+
+    pose: Pose
+    errors_px: Array
+    """[n] distances of the pixels from the projections."""
+    hessian: Array
+    """[6, 6] of the pose, for a noise of 1 px."""
+    displacement_px: float
+    """Predicted deviation of the pose as image displacement at the median depth, for a noise of 1 px."""
+
+
+def solve_pose(
+    points: Array, pixels: Array, intrinsics: Intrinsics, start: Pose, scales_px: Sequence[float], move: bool = True
+) -> SolvedPose:
+    """Robust Gauss-Newton of one pose on points [n, 3] seen at pixels [n, 2]: an iteration for each scale of the loss.
+
+    Without `move` the start is only evaluated.
+    """
+    k = intrinsics
+    rotation, centre = start.rotation.copy(), start.centre.copy()
+    errors, hessian = np.empty(len(points)), np.empty((6, 6))
+    scales = np.array(scales_px)
+    _bundle.fit_pose(points, pixels, k.fx, k.fy, k.cx, k.cy, scales, rotation, centre, errors, hessian, move)
+    depth = max(median((points - centre) @ rotation[:, 2]), LEAST_DEPTH_SCALE)
+    seen_px = _bundle.displacement(hessian, rotation, k.fx, k.fy, k.cx, k.cy, depth)
+    return SolvedPose(Pose(rotation, centre), errors, hessian, seen_px)
+
+
 def fit_pose(sparse_map: SparseMap, view: TrackedView, start: Pose, move: bool = True) -> PnPResult:
     """Robust Gauss-Newton of one pose on the known points; without `move` the start is only evaluated."""
     points = sparse_map.points[view.ids]
@@ -96,15 +131,10 @@ def fit_pose(sparse_map: SparseMap, view: TrackedView, start: Pose, move: bool =
     points, pixels = points[known], view.pixels[known]
     if len(points) < LEAST_POINTS:
         return PnPResult(start, 0.0, len(points))
-    k = sparse_map.intrinsics
-    rotation, centre = start.rotation.copy(), start.centre.copy()
-    size, hessian = np.empty(len(points)), np.empty((6, 6))
-    scales = np.array(FIT_SCALES_PX if move else FIT_SCALES_PX[-1:])
-    _bundle.fit_pose(points, pixels, k.fx, k.fy, k.cx, k.cy, scales, rotation, centre, size, hessian, move)
-    inliers = float(np.mean(size < COUNTED_INLIER_PX))
+    scales = FIT_SCALES_PX if move else FIT_SCALES_PX[-1:]
+    solved = solve_pose(points, pixels, sparse_map.intrinsics, start, scales, move)
+    inliers = float(np.mean(solved.errors_px < COUNTED_INLIER_PX))
     noise = noise_outside_px(sparse_map.noise_px, view.timing_sigma_px)
-    chi2 = chi2_of(median(size), noise)
-    depth = median((points - centre) @ rotation[:, 2])
-    seen_px = _bundle.displacement(hessian, rotation, k.fx, k.fy, k.cx, k.cy, max(depth, 1e-6))
-    sigma_px = float(np.sqrt(max(chi2, 1.0)) * noise * seen_px)
-    return PnPResult(Pose(rotation, centre), inliers, len(points), chi2, sigma_px)
+    chi2 = chi2_of(median(solved.errors_px), noise)
+    sigma_px = float(np.sqrt(max(chi2, 1.0)) * noise * solved.displacement_px)
+    return PnPResult(solved.pose, inliers, len(points), chi2, sigma_px)

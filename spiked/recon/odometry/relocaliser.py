@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.pose import Array
-from spiked.recon.frontend.feature_tracks import Picture, flow, follow, pyramid, search
+from spiked.recon.frontend.feature_tracks import Picture, Pyramid, follow, pyramid, search
 from spiked.recon.odometry.initialisation import INLIER_PX
 from spiked.recon.odometry.pnp import MIN_POINTS, PnPResult, fit_pose
-from spiked.recon.odometry.sparse_map import SparseMap, TrackedView
+from spiked.recon.odometry.sparse_map import Pose, SparseMap, TrackedView
 
 KEYFRAME_EVERY = 8
 """Every eighth view is a keyframe, if it has a pose."""
@@ -56,16 +56,31 @@ class Relocaliser:
             last_seen[self.map.views[number].ids] = number
         last_seen[view.ids] = -1
         ids = np.flatnonzero((last_seen >= 0) & np.isfinite(self.map.points[:, 0]))
-        inside, guess = self.map.project_into(ids, view.pose, picture.shape)
-        ids, guess = ids[inside], guess[inside]
-        at, found = guess.copy(), np.zeros(len(ids), bool)
         levels = pyramid(picture, 1)
+        found, at = [view.ids[:0]], [view.pixels[:0]]
         for number in np.unique(last_seen[ids]).tolist():
-            rows = np.flatnonzero(last_seen[ids] == number)
-            before, key = pyramid(self.keyframes[number], 1), self.map.views[number]
-            at[rows], found[rows] = follow(before, levels, key.pixels_of(ids[rows]), guess[rows], MAX_RETURN_PX)
-        found &= np.linalg.norm(at - guess, axis=1) < RECOVERY_RADIUS_PX
-        return ids[found], at[found]
+            of = ids[last_seen[ids] == number]
+            pixels = self.map.views[number].pixels_of(of)
+            more, places = self._find_near_projections(number, of, pixels, view.pose, levels, RECOVERY_RADIUS_PX)
+            found.append(more)
+            at.append(places)
+        new = np.concatenate(found)
+        order = np.argsort(new)
+        return new[order], np.concatenate(at)[order]
+
+    def _find_near_projections(
+        self, number: int, ids: NDArray[np.int64], pixels: Array, pose: Pose, levels: Pyramid, radius_px: float
+    ) -> tuple[NDArray[np.int64], Array]:
+        """Those of the known points `ids` [n], at `pixels` [n, 2] of a keyframe, that are found in an image less than
+        `radius_px` from where `pose` projects them: ids [m] and places [m, 2] px."""
+        picture = self.keyframes[number]
+        inside, guess = self.map.project_into(ids, pose, picture.shape)
+        ids, pixels, guess = ids[inside], pixels[inside], guess[inside]
+        if not len(ids):
+            return ids, guess
+        at, good = follow(pyramid(picture, 1), levels, pixels, guess, MAX_RETURN_PX)
+        good &= np.linalg.norm(at - guess, axis=1) < radius_px
+        return ids[good], at[good]
 
     def find(self, view: TrackedView, picture: Picture) -> PnPResult | None:
         """The pose of a lost view by the points of a keyframe; the matched points become the tracks of the view.
@@ -92,17 +107,14 @@ class Relocaliser:
 
     def _reproject_keyframe_points(self, view: TrackedView, picture: Picture, fit: PnPResult) -> PnPResult:
         """Search the points of all keyframes near their projections in a view: they fix scale and pose."""
+        levels = pyramid(picture, 1)
         for number in sorted(self.keyframes, reverse=True):
             ids, pixels = self.map.known_tracks(self.map.views[number])
             new = ~np.isin(ids, view.ids)
-            ids, pixels = ids[new], pixels[new]
-            inside, guess = self.map.project_into(ids, fit.pose, picture.shape)
-            if not inside.any():
-                continue
-            ids, guess = ids[inside], guess[inside]
-            at, good = flow(self.keyframes[number], picture, pixels[inside], guess, MAX_RETURN_PX, levels=1)
-            good &= np.linalg.norm(at - guess, axis=1) < REPROJECTION_RADIUS_PX
-            view.ids, view.pixels = np.concatenate([view.ids, ids[good]]), np.concatenate([view.pixels, at[good]])
+            ids, at = self._find_near_projections(
+                number, ids[new], pixels[new], fit.pose, levels, REPROJECTION_RADIUS_PX
+            )
+            view.ids, view.pixels = np.concatenate([view.ids, ids]), np.concatenate([view.pixels, at])
         fit = fit_pose(self.map, view, fit.pose)
         agree = self.map.errors_px(view, fit.pose) < REPROJECTED_INLIER_PX
         view.ids, view.pixels = view.ids[agree], view.pixels[agree]

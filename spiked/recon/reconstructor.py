@@ -274,6 +274,11 @@ class Reconstructor:
         """The views tracked so far, in order, without the first `since`."""
         return [Tracked.of(record, self.sensor.frame_rate_hz, self._unit) for record in self.views.since(since)]
 
+    def closures(self) -> list[tuple[float, float]]:
+        """Closed loops so far: times (s) of an earlier view and of a later one that sees the same place again."""
+        rate = self.sensor.frame_rate_hz
+        return [(earlier / rate, later / rate) for earlier, later in self.odometry.closures]
+
     def trajectory(self) -> Trajectory:
         """Poses at the middle of every frame near a tracked view; empty before the bootstrap."""
         path = self.path
@@ -331,6 +336,7 @@ class Reconstructor:
             "warnings": list(self.warnings),
             **report.tracking_section(odometry, sensor.frame_rate_hz),
             **report.path_section(self.path, odometry, aligned),
+            "closures": report.closures_section(self.closures()),
             **report.map_section(mapper),
             **self._log.report(),
         }

@@ -185,6 +185,12 @@ def _view(view: TrackedView, frame_rate_hz: float) -> dict[str, object]:
     }
 
 
+def closures_section(closures: list[tuple[float, float]]) -> list[dict[str, float]]:
+    """Closed loops in order of the later view."""
+    ordered = sorted(closures, key=lambda closure: closure[1])
+    return [{"earlier_s": round(earlier, 6), "later_s": round(later, 6)} for earlier, later in ordered]
+
+
 def focal_section(mapper: Mapper, focal: Focal | None) -> dict[str, object]:
     """The focal length in use; `focal` where it was estimated."""
     sigma = None if focal is None or not np.isfinite(focal.relative_sigma) else focal.relative_sigma

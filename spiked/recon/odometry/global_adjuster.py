@@ -1,7 +1,7 @@
 """Global bundle adjustment: the path as a spline, adjusted to the tracks of the whole recording."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,8 +67,8 @@ class GlobalAdjuster:
     """The path in frames; None before the first adjustment."""
     interpolated: bool = False
     """Views are too far apart for a spline: there are no global adjustments."""
-    closures: int = 0
-    """Loops are searched on long paths only."""
+    closures: list[tuple[float, float]] = field(default_factory=list)
+    """None: loops are searched on long paths only."""
     _newest: tuple[Bundle, Array] | None = None
     """Bundle and times of the newest adjustment."""
     _next_count: int = 0

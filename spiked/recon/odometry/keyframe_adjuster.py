@@ -56,8 +56,8 @@ class KeyframeAdjuster:
     """There is no spline: the path is interpolated between views."""
     spline: Spline | None = None
     """None: see `interpolated`."""
-    closures: int = 0
-    """Loops closed by `finish`."""
+    closures: list[tuple[float, float]] = field(default_factory=list)
+    """Closed loops: times in frames of an earlier view and of a later one that sees the same place again."""
     _travelled_px: float = 0.0
     """Image motion since the newest keyframe."""
     _next_view: int = 0
@@ -107,7 +107,7 @@ class KeyframeAdjuster:
             for closure in closures:
                 closure.add_tracks()
                 chosen |= {closure.earlier.id: closure.earlier, closure.later.id: closure.later}
-            self.closures += len(closures)
+            self.closures += [(closure.earlier.time, closure.later.time) for closure in closures]
             self._adjust_all(chosen, LOOP_ITERATIONS, stop)
         self._adjust_all(chosen, FINAL_ITERATIONS, stop)
         self.map.triangulate(self.keyframes)

@@ -65,8 +65,8 @@ class Odometry:
         return self._relocaliser.keyframes
 
     @property
-    def closures(self) -> int:
-        """Loops that were closed by `end`."""
+    def closures(self) -> list[tuple[float, float]]:
+        """Closed loops: times in frames of an earlier view and of a later one that sees the same place again."""
         return self._adjuster.closures
 
     @property

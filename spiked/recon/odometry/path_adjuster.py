@@ -16,8 +16,8 @@ class PathAdjuster(Protocol):
 
     spline: Spline | None
     """The path in frames; None before the first adjustment, and where it is interpolated."""
-    closures: int
-    """Loops that were closed by `finish`."""
+    closures: list[tuple[float, float]]
+    """Closed loops: times in frames of an earlier view and of a later one that sees the same place again."""
 
     @property
     def reference_views(self) -> list[TrackedView]:

@@ -120,6 +120,16 @@ class Recording:
             k += gap.count
         return k
 
+    def captured(self, first: int, count: int) -> NDArray[np.uint8] | None:
+        """Stored frames `first` to `first + count - 1` of the capture, uint8 [count, frame_bytes], a view of the memory
+        map; None if one of them was lost or is not in the file."""
+        row = first
+        for gap in self.gaps:
+            if gap.first < first + count and first < gap.first + gap.count:
+                return None
+            row -= gap.count if gap.first < first else 0
+        return self.data[row : row + count] if row >= 0 and row + count <= self.frames else None
+
 
 def open_recording(
     path: str | os.PathLike[str],

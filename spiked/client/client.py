@@ -37,6 +37,7 @@ from spiked.client.models import (
     VersionsOut,
 )
 from spiked.errors import SpikedError
+from spiked.scene_changes import SceneChanges, SceneMirror
 
 _CHUNK_BYTES = 8 << 20
 """Bytes of an upload in one request."""
@@ -254,6 +255,17 @@ class Spiked:
         """The scene as a file; a fixed sample of it with max_splats."""
         query = {"format": kind, "version": version, "max_splats": max_splats}
         return self._connection.request("GET", f"reconstructions/{reconstruction_id}/scene", query=query).content
+
+    def update_scene(self, reconstruction_id: str, mirror: SceneMirror, *, level: int | None = None) -> SceneChanges:
+        """Bring a mirror of the scene to its newest version; only what has visibly changed since the last call travels.
+
+        `level` 0 has a sixteenth of the splats, 1 a quarter, 2 all. Return what changed.
+        """
+        query = {"since": mirror.state, "level": level}
+        answer = self._connection.request("GET", f"reconstructions/{reconstruction_id}/scene/changes", query=query)
+        changes = SceneChanges.read(answer.content)
+        mirror.apply(changes)
+        return changes
 
     def view(
         self,

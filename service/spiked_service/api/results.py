@@ -2,6 +2,8 @@
 
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -9,8 +11,10 @@ from pathlib import Path
 from fastapi import Request, Response
 
 from spiked import spz
+from spiked.errors import SceneError
 from spiked.poses import PoseFile
 from spiked.scene import Scene
+from spiked.scene_changes import SceneChanges
 from spiked.sensor import Intrinsics, Sensor
 from spiked_service.api import files
 from spiked_service.api.problems import GoneError, NothingError, NotReadyError
@@ -18,11 +22,12 @@ from spiked_service.api.trajectories import Range, TrajectoryFormat, open_poses,
 from spiked_service.base.limits import ConcurrencyLimit
 from spiked_service.captures.captures import Captures
 from spiked_service.reconstructions.repository import ReconstructionRepository
+from spiked_service.results.shown_scene import ShownScene
 from spiked_service.results.versions import Published, at
 from spiked_service.store.rows import ReconstructionRow
 
 _ENCODED = 8
-"""SPZ files and samples in memory, so that each is encoded once for many viewers."""
+"""SPZ files, samples and changes in memory, so that each is encoded once for many viewers."""
 
 
 class SceneFormat(StrEnum):
@@ -76,6 +81,46 @@ class SceneFiles:
             if len(self._encoded) > _ENCODED:
                 self._encoded.popitem(last=False)
         return files.content(request, body, "application/octet-stream", tag, name, **version)
+
+    def changes(self, request: Request, result: Result, since: str | None, level: int) -> Response:
+        """What changed in the slots of a version since the state `since`, all of them if that is another scene's.
+
+        Raises NotReadyError, SceneError.
+        """
+        version = result.published.version
+        tag = files.etag("changes", version, level, since or "")
+        if files.unchanged(request, tag):
+            return files.not_modified(tag)
+        key = (result.scene, "changes", since, level)
+        body = self._kept(key, lambda: _changes(result, since, level).write())
+        headers = {"X-Scene-Version": str(version), "X-White": repr(result.published.white)}
+        return files.content(request, body, "application/octet-stream", tag, **headers)
+
+    def _kept(self, key: tuple[object, ...], encode: Callable[[], bytes]) -> bytes:
+        """The bytes of one of the latest responses, encoded once."""
+        with self._lock:
+            body = self._encoded.get(key) or encode()
+            self._encoded[key] = body
+            self._encoded.move_to_end(key)
+            if len(self._encoded) > _ENCODED:
+                self._encoded.popitem(last=False)
+        return body
+
+
+def _changes(result: Result, since: str | None, level: int) -> SceneChanges:
+    shown = _slots(result)
+    began, version, known_level = (0, 0, 0) if since is None else (int(part) for part in since.split("-"))
+    continues = began > 0 and (began, known_level) == (shown.began, level) and version <= shown.version
+    return shown.since(version if continues else None, level)
+
+
+def _slots(result: Result) -> ShownScene:
+    """The slots of a version; made of its scene if it is an old one."""
+    published = result.published
+    if published.slots is not None:
+        with suppress(SceneError):  # the disk may have lost them: they are not synchronised with it
+            return ShownScene.read(result.folder / published.slots, published.slots_began, published.version)
+    return ShownScene.of(Scene.read_ply(result.scene), published.white, published.version)
 
 
 def _encoded(result: Result, kind: SceneFormat, max_splats: int | None) -> bytes:

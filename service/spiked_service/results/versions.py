@@ -3,6 +3,7 @@
 import os
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from spiked.poses import PoseAppender
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics
 from spiked.trajectory import Trajectory
+from spiked_service.results.shown_scene import TOLERANCE, ShownScene
 from spiked_service.store.rows import VersionRow
 
 _NEWEST = 3
@@ -37,6 +39,10 @@ class Published(BaseModel):
     psnr_db: float | None = None
     intrinsics: tuple[float, float, float, float] | None = None
     """fx, fy, cx, cy (px), given or estimated."""
+    slots: str | None = None
+    """Name of the file of `ShownScene`, which only the newest versions have."""
+    slots_began: int = 0
+    """First version of these slots."""
 
 
 class _Index(BaseModel):
@@ -61,6 +67,7 @@ class Publisher:
         self._folder = folder
         self._versions = versions(folder)
         self._protected: set[int] = set()
+        self._shown = ShownScene()
 
     @property
     def folder(self) -> Path:
@@ -91,7 +98,9 @@ class Publisher:
         """Publish the files of an earlier version under the next number. Raises OSError as `publish` does."""
         version = self.version + 1
         names = {"scene": f"scene-{version:06d}.ply", "trajectory": f"trajectory-{version:06d}.poses"}
-        published = earlier.model_copy(update={"version": version, "at": datetime.now(UTC), **names})
+        scene = Scene.read_ply(self._folder / earlier.scene)
+        slots = self._write_slots(scene, earlier.white, version, tolerance=0.0)
+        published = earlier.model_copy(update={"version": version, "at": datetime.now(UTC), **names, **slots})
         write_atomically(self._folder / published.scene, (self._folder / earlier.scene).read_bytes())
         write_atomically(self._folder / published.trajectory, pose_file(self._folder, earlier).read_bytes())
         self._list(published)
@@ -105,8 +114,10 @@ class Publisher:
         psnr_db: float | None = None,
         intrinsics: Intrinsics | None = None,
         states: NDArray[np.bytes_] | None = None,
+        tolerance: float = TOLERANCE,
     ) -> Published:
-        """Publish the next version and remove old ones; `states` [n] is the tracking state at each pose.
+        """Publish the next version and remove old ones; `states` [n] is the tracking state at each pose, `tolerance`
+        that of `ShownScene.update`.
 
         Raises OSError if it cannot be written.
         """
@@ -123,17 +134,30 @@ class Publisher:
             scene_bytes=len(content),
             psnr_db=psnr_db,
             intrinsics=None if intrinsics is None else (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy),
+            **self._write_slots(scene, white, version, tolerance),
         )
         write_atomically(self._folder / published.scene, content)
         _write_poses(self._folder / published.trajectory, trajectory, states)
         self._list(published)
         return published
 
+    def _write_slots(self, scene: Scene, white: float, version: int, tolerance: float) -> dict[str, Any]:
+        """Bring the slots up to date and write them. Return what `Published` says of them."""
+        self._shown.update(scene, white, version, tolerance)
+        name = f"scene-{version:06d}.slots"
+        self._shown.write(self._folder / name)
+        return {"slots": name, "slots_began": self._shown.began}
+
     def _list(self, published: Published) -> None:
         kept = _thinned([*self._versions, published], self._protected)
+        without_slots = [one.model_copy(update={"slots": None}) for one in kept[:-_NEWEST]]
+        kept = without_slots + kept[-_NEWEST:]
         write_atomically(self._folder / _INDEX, _Index(versions=kept).model_dump_json().encode())
         gone = {one.version: one for one in self._versions}.keys() - {one.version for one in kept}
+        slots = {one.slots for one in kept}
         for one in self._versions:
+            if one.slots is not None and one.slots not in slots:
+                (self._folder / one.slots).unlink(missing_ok=True)
             if one.version in gone:
                 (self._folder / one.scene).unlink(missing_ok=True)
                 (self._folder / one.trajectory).unlink(missing_ok=True)

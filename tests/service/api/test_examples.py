@@ -45,9 +45,11 @@ def test_curl(daemon: Callable[..., Any], tmp_path: Path) -> None:
 
 
 def test_python(daemon: Callable[..., Any], tmp_path: Path) -> None:
-    first, second = blocks("python", daemon().address)
+    first, follow, second = blocks("python", daemon().address)
     told = run([sys.executable, "-c", first], tmp_path)
     assert "the camera went" in told and "422" in told
+    came = run([sys.executable, "-c", follow], tmp_path).splitlines()
+    assert " 0 splats came" not in came[0] and " 0 splats came" in came[-1], came
     poses = run([sys.executable, "-c", second], tmp_path).splitlines()
     assert len(poses) > 10, poses
 

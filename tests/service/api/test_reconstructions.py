@@ -15,6 +15,7 @@ import pytest
 from spiked.client import ApiError, CaptureOut, ReconstructionOptions
 from spiked.pose import quaternion, rotation_of
 from spiked.scene import Scene
+from spiked.scene_changes import SceneChanges, SceneMirror
 from spiked.spz import decode
 from spiked.trajectory import Trajectory
 
@@ -71,7 +72,7 @@ def test_versions_have_validators(service: Any, job: str) -> None:
     versions = service.client.versions(job)
     newest = service.client.reconstruction(job).version
     assert versions[-1].version == newest
-    for kind in ("scene", "trajectory"):
+    for kind in ("scene", "scene/changes", "trajectory"):
         answer = service.http.get(f"reconstructions/{job}/{kind}")
         assert answer.headers["x-scene-version"] == str(newest)
         known = {"If-None-Match": answer.headers["etag"]}
@@ -91,6 +92,33 @@ def test_spz_and_a_sample_are_the_scene(service: Any, job: str, tmp_path: Any) -
     np.testing.assert_array_equal(Scene.read_ply(tmp_path / "s.ply").means, scene.sample(100).means)
     part = service.http.get(f"reconstructions/{job}/scene", headers={"Range": "bytes=0-2"})
     assert (part.status_code, part.content) == (206, b"ply")
+
+
+def test_changes_since_a_state(service: Any, job: str, tmp_path: Any) -> None:
+    mirror = SceneMirror()
+    assert service.client.update_scene(job, mirror).whole
+    versions = service.client.versions(job)
+    (tmp_path / "s.ply").write_bytes(service.client.scene(job))
+    scene = Scene.read_ply(tmp_path / "s.ply")
+    shown = mirror.scene(scene.white)
+    assert len(shown) == len(scene) == versions[-1].splats
+    order = np.lexsort(scene.means.T), np.lexsort(shown.means.T)
+    np.testing.assert_array_equal(scene.means[order[0]], shown.means[order[1]])
+    nothing = service.client.update_scene(job, mirror)
+    assert (nothing.whole, len(nothing), nothing.state) == (False, 0, mirror.state)
+    # Of other slots, of another level, and of a version yet to come: everything.
+    began, version, _ = (int(part) for part in mirror.state.split("-"))
+    url = f"reconstructions/{job}/scene/changes"
+    for since in (f"{began + 1}-{version}-2", f"{began}-{version}-1", f"{began}-{version + 9}-2", "0-0-0"):
+        changes = SceneChanges.read(service.http.get(url, params={"since": since}).content)
+        assert changes.whole and len(changes) == len(scene)
+    assert 0 < len(SceneChanges.read(service.http.get(url, params={"level": 1}).content)) < len(scene) / 3
+    old = SceneChanges.read(
+        service.http.get(url, params={"version": versions[0].version, "since": mirror.state}).content
+    )
+    assert old.whole and len(old) == versions[0].splats
+    for wrong in ({"since": "1"}, {"since": "1-2-3-4"}, {"level": 3}, {"level": -1}):
+        assert service.http.get(url, params=wrong).status_code == 422
 
 
 @pytest.mark.parametrize(("kind", "magic"), [("png", b"\x89PNG"), ("webp", b"RIFF"), ("jpeg", b"\xff\xd8\xff")])
@@ -246,7 +274,7 @@ def test_options_out_of_range_are_refused(service: Any, done: CaptureOut) -> Non
         assert next(iter(options)) in answer.json()["detail"]
 
 
-@pytest.mark.parametrize("what", ["scene?format=spz", "scene?max_splats=5", "log"])
+@pytest.mark.parametrize("what", ["scene?format=spz", "scene?max_splats=5", "scene/changes?level=1", "log"])
 def test_what_is_no_file_comes_in_ranges_too(service: Any, job: str, what: str) -> None:
     url = f"reconstructions/{job}/{what}"
     whole = service.http.get(url).content

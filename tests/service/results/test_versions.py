@@ -25,7 +25,9 @@ def test_files_of_the_last_three_versions_are_kept_and_old_versions_thinned(tmp_
     assert at(tmp_path, kept[5].version) == kept[5]
     assert at(tmp_path, 2) is None
     files = {path.name for path in tmp_path.iterdir()}
-    assert files == {name for one in kept for name in (one.scene, one.trajectory)} | {"published.json"}
+    slots = {one.slots for one in kept[-3:]}
+    assert all(one.slots is None for one in kept[:-3]) and None not in slots
+    assert files == {name for one in kept for name in (one.scene, one.trajectory)} | slots | {"published.json"}
     assert Publisher(tmp_path).publish(Scene.empty(1), trajectory, 0.1).version == 61
 
 

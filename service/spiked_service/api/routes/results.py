@@ -17,6 +17,7 @@ from spiked_service.api.schemas.views import ViewRequest
 from spiked_service.api.trajectories import Range, TrajectoryFormat
 from spiked_service.api.views import image_format, views_response
 from spiked_service.reconstructions.repository import ReconstructionRepository
+from spiked_service.results.shown_scene import FINEST
 from spiked_service.results.view_renderer import ViewRenderer
 from spiked_service.settings.tokens import Scope
 from spiked_service.store.rows import ReconstructionRow
@@ -27,6 +28,18 @@ Step = Annotated[int, Query(ge=1, le=1_000_000, description="Every n-th pose."),
 MaxSplats = Annotated[
     int | None,
     Query(ge=1, le=10_000_000, description="Most splats: a fixed sample is returned. Default: all."),
+    IN_DIGITS,
+]
+Since = Annotated[
+    str | None,
+    Query(
+        pattern=r"^[0-9]{1,10}-[0-9]{1,10}-[0-9]$",
+        description="State of the answer before, `began-version-level`, to get what changed since. Default: all.",
+    ),
+]
+Level = Annotated[
+    int,
+    Query(ge=0, le=FINEST, description="Level of detail: 0 has a sixteenth of the splats, 1 a quarter, 2 all."),
     IN_DIGITS,
 ]
 
@@ -56,6 +69,16 @@ _SCENE: dict[int | str, dict[str, Any]] = {
     **NOT_MODIFIED,
     **problems(404, 416),
 }
+_CHANGES: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The changes.",
+        "headers": {**ETAG, **_VERSION},
+        "content": {"application/octet-stream": BINARY},
+    },
+    206: {"description": "The requested range.", "content": {"application/octet-stream": BINARY}},
+    **NOT_MODIFIED,
+    **problems(404, 416),
+}
 _VIEWS: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "The image; for several views a ZIP of images and views.json.",
@@ -64,6 +87,8 @@ _VIEWS: dict[int | str, dict[str, Any]] = {
     },
     **problems(404),
 }
+
+_CHANGES_SAID = "The splats that visibly changed since an earlier answer; docs/api.md has the format."
 
 
 @dataclass(frozen=True)
@@ -87,6 +112,7 @@ def capture_result_routes(results: Results, views: ViewRenderer, route_class: ty
         views,
         trajectory=_Operation("get_trajectory", "The trajectory of its newest reconstruction."),
         scene=_Operation("get_scene", "The scene of its newest reconstruction; its ETag changes with the version."),
+        changes=_Operation("get_scene_changes", _CHANGES_SAID),
         render=_Operation(
             "render_views",
             "Images of its newest reconstruction: from one camera, from several, or along the path.",
@@ -115,6 +141,7 @@ def reconstruction_result_routes(
             "get_reconstruction_scene",
             "The scene of a version as 3DGS PLY (RDF axes) or SPZ (RUB axes); X-White is the radiance of colour 1.",
         ),
+        changes=_Operation("get_reconstruction_scene_changes", _CHANGES_SAID),
         render=_Operation(
             "render_reconstruction_views",
             "Images of a version: from one camera, from several, or along the path; colour, depth or alpha.",
@@ -130,6 +157,7 @@ def _result_routes(
     *,
     trajectory: _Operation,
     scene: _Operation,
+    changes: _Operation,
     render: _Operation,
 ) -> APIRouter:
     """Add the routes to `router`; `find` takes the id in its path and returns the reconstruction."""
@@ -162,6 +190,22 @@ def _result_routes(
         max_splats: MaxSplats = None,
     ) -> Response:
         return results.scenes.response(request, results.of(row, version), format, max_splats)
+
+    @router.get(
+        "/scene/changes",
+        name=changes.name,
+        description=changes.description,
+        responses=_CHANGES,
+        response_class=Response,
+    )
+    def get_scene_changes(
+        request: Request,
+        row: Annotated[ReconstructionRow, Depends(find)],
+        version: Version = None,
+        since: Since = None,
+        level: Level = FINEST,
+    ) -> Response:
+        return results.scenes.changes(request, results.of(row, version), since, level)
 
     @router.post(
         "/views",

@@ -20,6 +20,7 @@ from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
 from spiked_service.events.payloads import PosePayload
 from spiked_service.results.recording_feed import pieces
+from spiked_service.results.shown_scene import TOLERANCE
 from spiked_service.results.timeline import frames_at
 from spiked_service.results.timeline_writer import TimelineWriter
 from spiked_service.results.versions import Published, Publisher, pose_file
@@ -312,7 +313,7 @@ class ProgressReporter:
         self._least_poses = 0
         status = self._reconstructor.status()
         if len(self._reconstructor.trajectory()):
-            self._publish(status)
+            self._publish(status, tolerance=0.0)
         shown = self._best(cut_short)
         self._poses = self._poses if shown is None else shown.poses
         if shown is not None and shown.version != self._publisher.version:
@@ -365,7 +366,7 @@ class ProgressReporter:
             latency_s=None if latency_frames is None else latency_frames / rate,
         )
 
-    def _publish(self, status: Status) -> None:
+    def _publish(self, status: Status, tolerance: float = TOLERANCE) -> None:
         trajectory = self._reconstructor.trajectory()
         self._published_s, self._seen = time.monotonic(), status.version
         if not len(trajectory) or len(trajectory) < self._least_poses:
@@ -375,7 +376,8 @@ class ProgressReporter:
             optics = self._reconstructor.camera.intrinsics
             rate_hz = self._reconstructor.sensor.frame_rate_hz
             states = self._timeline.states_at(frames_at(trajectory.times_s, rate_hz))
-            published = self._publisher.publish(scene, trajectory, white, _psnr_db(status.loss), optics, states)
+            psnr_db = _psnr_db(status.loss)
+            published = self._publisher.publish(scene, trajectory, white, psnr_db, optics, states, tolerance)
         except OSError as error:
             raise _write_error(error) from error
         self._send_version(published)

@@ -271,7 +271,7 @@ def run(row: Row, streams: Path, steps: int) -> dict[str, Any]:
     )
     begin = time.process_time()
     with row.patches() if row.patches else ExitStack():
-        made = Reconstructor(recording.sensor, options)
+        made = Reconstructor(recording.sensor, options, recording=recording)
         for first in range(0, recording.frames, CHUNK):
             made.feed(first, recording.read(first, min(CHUNK, recording.frames - first)))
         made.finish()

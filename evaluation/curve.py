@@ -67,7 +67,7 @@ class Curve:
 def reconstruct(folder: Path, live: bool, interval_s: float) -> list[tuple[float, float]]:
     """The curve of one stream."""
     recording = open_recording(folder / f"{folder.name}.dat")
-    made = Reconstructor(recording.sensor, Options())
+    made = Reconstructor(recording.sensor, Options(), recording=recording)
     curve = Curve(folder, interval_s)
 
     def progress(status: Status) -> None:

@@ -348,6 +348,10 @@ class ReconstructionOptions(BaseModel):
         Field(description="Threads of the rasteriser; all cores if not given."),
     ] = None
     max_views: Annotated[int, Field(description="Views kept for mapping; beyond it older ones thin out.")] = 400
+    memory_mb: Annotated[
+        int,
+        Field(description="MiB of images held in memory; the others are built anew from the recording."),
+    ] = 512
     refine_poses: Annotated[bool, Field(description="Whether the map corrects the trajectory.")] = True
     intrinsics: Annotated[
         IntrinsicsOption | None,

@@ -25,6 +25,9 @@ class Options:
     """Threads of the rasteriser; None takes all cores."""
     max_views: int = 400
     """Views kept for mapping; beyond it those are dropped between whose neighbours the camera moved least."""
+    memory_mb: int = 512
+    """MiB of images in memory, those of views and of keyframes; the others are built anew from the recording. Without a
+    recording fewer are kept."""
     poses: Trajectory | None = None
     """Given camera poses: the map is fitted to them and they are not changed."""
     calibration: Calibration | None = None
@@ -40,3 +43,5 @@ class Options:
             raise ConfigurationError(f"refinement of {self.steps} steps is negative")
         if self.max_views < 20:
             raise ConfigurationError(f"{self.max_views} views are too few to map from; 20 is the least")
+        if self.memory_mb < 16:
+            raise ConfigurationError(f"{self.memory_mb} MiB for images are too few; 16 is the least")

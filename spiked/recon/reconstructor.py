@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
@@ -13,13 +13,15 @@ from threadpoolctl import ThreadpoolController
 from spiked.errors import ConfigurationError
 from spiked.pose import Array
 from spiked.recon import report
-from spiked.recon.frontend.feature_tracks import picture, white_of
+from spiked.recon.frontend.feature_tracks import Picture, picture, white_of
 from spiked.recon.frontend.mosaic_check import mosaic_warning
+from spiked.recon.frontend.recorded_views import RecordedFrames, RecordedViews
 from spiked.recon.frontend.windowing import View, Windows, luminance
 from spiked.recon.given_poses import GivenPoses
 from spiked.recon.mapping.pose_alignment import TrajectoryPrior
-from spiked.recon.mapping.scene_psnr import scene_psnr_db
+from spiked.recon.mapping.scene_psnr import COMPARED_VIEWS, scene_psnr_db
 from spiked.recon.mapping.trainer import MapTrainer
+from spiked.recon.odometry.keyframe_pictures import KeyframePictures
 from spiked.recon.odometry.odometry import Odometry
 from spiked.recon.odometry.self_calibration import FIRST_DEG, FOCAL_TOLERANCE, Focal
 from spiked.recon.options import Options
@@ -34,6 +36,8 @@ from spiked.trajectory import Trajectory
 
 BRIDGED_S = 0.03
 """Longest time between views over which the path is interpolated: hand tremor has about 10 Hz."""
+KEYFRAME_SHARE = 0.125
+"""Share of `Options.memory_mb` for the images of keyframes: a byte a pixel, while those of views take three or more."""
 LEAST_VIEWS = 10
 """Views with a pose that a map needs."""
 
@@ -44,10 +48,18 @@ class Reconstructor:
     Poses are camera-to-world; the length unit is the median depth of the first views, or the unit of given poses.
     """
 
-    def __init__(self, sensor: Sensor, options: Options | None = None, *, live: bool = False) -> None:
+    def __init__(
+        self,
+        sensor: Sensor,
+        options: Options | None = None,
+        *,
+        live: bool = False,
+        recording: RecordedFrames | None = None,
+    ) -> None:
         """A sensor without intrinsics has its focal length estimated; `sensor` and `camera` follow it.
 
-        `live`: the frames come from a live camera; reasons advise how to move it.
+        `live`: the frames come from a live camera; reasons advise how to move it. `recording`: the frames that are fed,
+        by the same indices: images beyond `Options.memory_mb` are built anew from it.
 
         Raises ConfigurationError when poses are given without intrinsics.
         """
@@ -58,10 +70,13 @@ class Reconstructor:
             )
         intrinsics = sensor.intrinsics or Intrinsics.from_fov(sensor.width, sensor.height, FIRST_DEG)
         focal = Focal(intrinsics, np.inf) if sensor.intrinsics is None else None
-        self.odometry = Odometry(intrinsics, options.seed, focal, live)
-        """The tracker: its views, points and states."""
-        self.views = ViewStore(options.max_views)
+        recorded = None if recording is None else RecordedViews(recording, sensor, options.calibration)
+        memory_bytes = options.memory_mb * 2**20
+        self.views = ViewStore(options.max_views, (1 - KEYFRAME_SHARE) * memory_bytes, recorded)
         """One record a view."""
+        pictures = KeyframePictures(KEYFRAME_SHARE * memory_bytes, None if recording is None else _Pictures(self))
+        self.odometry = Odometry(intrinsics, options.seed, focal, live, pictures)
+        """The tracker: its views, points and states."""
         self.warnings: list[str] = []
         """Warnings about the recording, one sentence each."""
         self._windows = Windows(sensor, options.window_frames, options.calibration)
@@ -139,9 +154,7 @@ class Reconstructor:
 
     def _track(self, view: View, skipped: bool = False) -> None:
         """Track a view and store it; with `skipped`, frames before it were left out."""
-        sharp = view.sharp
-        grey = luminance(view.preview_rate(self._preview), self.sensor.mosaic) if sharp is None else sharp
-        image, intervals = picture(grey, white_of(grey)), view.intervals if sharp is None else None
+        image, intervals = self.picture(view), view.intervals if view.sharp is None else None
         known = None if self._given is None else self._given.at(view.time)
         tracked = self.odometry.add(view.time, view.end - view.begin, image, known, intervals, view.after_gap)
         since = np.inf if self._after_gap else view.time - self.views[-1].time
@@ -156,6 +169,12 @@ class Reconstructor:
         self._path_version += tracked.rotation is not None
         if self.views.thin():
             self._trainer.forget_views()
+
+    def picture(self, view: View) -> Picture:
+        """The image of a view that tracks are followed in."""
+        sharp = view.sharp
+        grey = luminance(view.preview_rate(self._preview), self.sensor.mosaic) if sharp is None else sharp
+        return picture(grey, white_of(grey))
 
     def _warn(self, warning: str | None) -> None:
         if warning is not None:
@@ -310,7 +329,8 @@ class Reconstructor:
     def scene_psnr_db(self, scene: Scene, trajectory: Trajectory, intrinsics: Intrinsics) -> float:
         """PSNR of a scene along a trajectory against the recording, to compare versions of a reconstruction."""
         rasteriser = rasteriser_for(Camera(intrinsics, self.sensor.width, self.sensor.height), self.options.threads)
-        return scene_psnr_db(self.views.images(), self.sensor, rasteriser, scene, trajectory)
+        views = [self.views.image(i, sharp=True) for i in self.views.spread(self.views.kept, COMPARED_VIEWS)]
+        return scene_psnr_db(views, self.sensor, rasteriser, scene, trajectory)
 
     def level(self, time_s: float) -> float:
         """Brightness of the image at a time relative to the map's (flicker, lamps); 1 before any map."""
@@ -343,3 +363,17 @@ class Reconstructor:
 
     # Names of earlier releases, deprecated: they go with the next release.
     glance, glance_frames, likeness_db = track_latest, latest_frames, scene_psnr_db
+
+
+@dataclass(frozen=True)
+class _Pictures:
+    """Builds the images of keyframes anew from the recording."""
+
+    of: Reconstructor
+
+    def holds(self, view_id: int) -> bool:
+        return self.of.views.rebuildable(view_id)
+
+    def build(self, view_id: int) -> Picture | None:
+        view = self.of.views.rebuilt(view_id)
+        return None if view is None else self.of.picture(view)

@@ -47,7 +47,7 @@ class Refiner:
         trainer.reshuffle()
         ids = trainer.views.mappable(self.path)
         trainer.seed(self.path, self._points, trainer.options.seeding.order(ids, trainer.extent))
-        fast = float(np.mean([trainer.views.image(i).frames is not None for i in ids]))
+        fast = float(np.mean([trainer.views[i].frames.warped is not None for i in ids]))
         pixels = trainer.camera.width * trainer.camera.height
         steps = schedule.steps(most_steps, pixels, fast, trainer.extent)
         begin = time.perf_counter()
@@ -71,7 +71,8 @@ class Refiner:
         ids = ids[:: -(-len(ids) // ALIGNED_VIEWS)]
         self.path = align_spline(
             self.path,
-            [(i, views.image(i)) for i in ids],
+            [views[i].time for i in ids],
+            views.images(ids),
             self._trainer.mapper,
             self._trainer.planner,
             self._prior,

@@ -92,8 +92,8 @@ def samples(views: ViewStore, mapper: Mapper, path: Path | None, frame_rate_hz: 
     path = path if len(mapper.scene) else None
     ids = views.kept if path is None else views.mappable(path)
     out = []
-    for i in np.unique(np.linspace(0, len(ids) - 1, min(count, len(ids))).round().astype(int)):
-        view, rendered = views.image(ids[i]), None
+    for view_id in views.spread(ids, count):
+        view, rendered = views.image(view_id), None
         if path is not None:
             rotations, centres = path.poses([view.time])
             rendered = mapper.render(rotations[0], centres[0])

@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from spiked.blocks import aligned_window
+from spiked.recon.frontend.recorded_views import RecordedViews
 from spiked.recon.frontend.windowing import View, make_view
 from spiked.recon.odometry.sparse_map import Pose, TrackedView
 from spiked.recon.odometry.tracking_state import State
@@ -23,6 +25,19 @@ def view(number: int) -> View:
     begin = LENGTH * number
     window = aligned_window(frames, SENSOR, begin - LENGTH // 2, begin, begin + LENGTH)
     return make_view(window, after_gap=False)
+
+
+class Frames:
+    """A recording of half a spike a frame; frames from `end` on are not written yet."""
+
+    def __init__(self, end: int) -> None:
+        self.end = end
+        self.frames = np.tile(np.uint8([[0xFF], [0x00]]), (end // 2 + LENGTH, SENSOR.height))
+
+    def captured(self, first: int, count: int) -> NDArray[np.uint8] | None:
+        """See `RecordedFrames`."""
+        begin = first + LENGTH // 2  # that many frames before the first view
+        return self.frames[begin : begin + count] if first + count <= self.end else None
 
 
 def tracked(number: int, posed: bool = True, state: State = State.TRACK) -> TrackedView:
@@ -49,7 +64,7 @@ def path(count: int) -> Waypoints:
 def test_a_view_keeps_its_id_when_images_of_others_are_dropped() -> None:
     views = store(21, most=20)
     assert views.kept == [0, 2, 4, 6, 8, *range(10, 21)]
-    assert len(views) == 21 and views[3].image is None
+    assert len(views) == 21 and 3 not in views.kept
     assert [views.image(i).begin for i in views.kept] == [LENGTH * i for i in views.kept]
     assert [record.id for record in views.since(19)] == [19, 20]
     with pytest.raises(AssertionError, match="view 3 was dropped"):
@@ -58,8 +73,40 @@ def test_a_view_keeps_its_id_when_images_of_others_are_dropped() -> None:
 
 def test_images_stay_within_their_limit() -> None:
     views = store(200, most=20)
-    assert len(views.images()) <= 20 and len(views) == 200
+    assert len(views.kept) <= 20 and len(views) == 200
     assert views.kept[-5:] == list(range(195, 200))
+
+
+def test_images_beyond_the_memory_are_built_anew() -> None:
+    most_bytes = 30 * view(0).nbytes
+    views = ViewStore(100, most_bytes, RecordedViews(Frames(80 * LENGTH), SENSOR))
+    first = [view(number) for number in range(100)]
+    for number in range(100):
+        views.add(first[number], tracked(number))
+        assert not views.thin()
+    assert len(views.kept) == 100 and views.held_bytes <= most_bytes
+    for number in (*range(80), *range(40)):
+        again = views.image(number)
+        assert (again.begin, again.end) == (first[number].begin, first[number].end)
+        np.testing.assert_array_equal(again.rate, first[number].rate)
+        assert views.held_bytes <= most_bytes
+
+
+def test_images_that_cannot_be_built_anew_are_thinned_out() -> None:
+    views = ViewStore(100, 30 * view(0).nbytes)
+    for number in range(100):
+        views.add(view(number), tracked(number))
+        views.thin()
+    assert views.held_bytes <= 30 * view(0).nbytes
+    assert len(views.kept) <= 30 and views.kept[-5:] == list(range(95, 100))
+    assert all(views.image(number).begin == LENGTH * number for number in views.kept)
+
+
+def test_an_image_that_is_used_takes_no_more_memory() -> None:
+    views = store(3)
+    before = views.held_bytes
+    assert views.image(1).light and "light" not in vars(views.image(1))
+    assert views.held_bytes == before
 
 
 def test_the_kept_images_are_spread_over_the_path() -> None:

@@ -49,6 +49,12 @@ class ReconstructionOptions(BaseModel):
     max_views: StrictInt = Field(
         default=_LIBRARY.max_views, ge=20, le=5000, description="Views kept for mapping; beyond it older ones thin out."
     )
+    memory_mb: StrictInt = Field(
+        default=_LIBRARY.memory_mb,
+        ge=16,
+        le=2**20,
+        description="MiB of images held in memory; the others are built anew from the recording.",
+    )
     refine_poses: StrictBool = Field(
         default=_LIBRARY.refine_poses, description="Whether the map corrects the trajectory."
     )
@@ -65,5 +71,6 @@ class ReconstructionOptions(BaseModel):
             seed=self.seed,
             threads=self.threads,
             max_views=self.max_views,
+            memory_mb=self.memory_mb,
             refine_poses=self.refine_poses,
         )

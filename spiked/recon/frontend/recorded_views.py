@@ -41,9 +41,24 @@ class ViewFrames:
         warped = None if view.frames is None else (view.first, len(view.frames))
         return cls(view.begin, view.end, first, view.intervals.frames, view.after_gap, warped)
 
-    def read(self, source: RecordedFrames) -> NDArray[np.uint8] | None:
-        """The frames read for the view, uint8 [count, frame_bytes]; None if they cannot be read."""
-        return source.captured(self.first, self.count)
+
+@dataclass
+class RecordedViews:
+    """The views of a recording, built anew from its frames."""
+
+    source: RecordedFrames
+    sensor: Sensor
+    calibration: Calibration | None = None
+
+    def holds(self, of: ViewFrames) -> bool:
+        """Whether all frames of a view can be read."""
+        if of.warped is not None and self.source.captured(*of.warped) is None:
+            return False
+        return self.source.captured(of.first, of.count) is not None
+
+    def build(self, of: ViewFrames, sharp: bool = False) -> View | None:
+        """See `build_view`."""
+        return build_view(of, self.source, self.sensor, self.calibration, sharp)
 
 
 def build_view(
@@ -53,7 +68,7 @@ def build_view(
 
     The motion-compensated image is built only with `sharp`, from the motion in the frames read.
     """
-    frames = of.read(source)
+    frames = source.captured(of.first, of.count)
     warped = None if of.warped is None else source.captured(*of.warped)
     if frames is None or (of.warped is not None and warped is None):
         return None

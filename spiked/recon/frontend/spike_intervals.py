@@ -50,6 +50,11 @@ class SpikeIntervals:
             middle,
         )
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the arrays."""
+        return self.spikes.nbytes + self.start.nbytes + self.stop.nbytes
+
     def rate(self, out: Image | None = None) -> Image:
         """Spikes a frame; where no whole interval was seen, half of its upper bound. Written to `out` if given."""
         out = np.empty(self.spikes.shape, np.float32) if out is None else out

@@ -89,6 +89,12 @@ class View:
         """Standard deviation of `rate`."""
         return self.light[1]
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes held by the view: spikes, the compensated image, and its share of the frames."""
+        frames = 0 if self.frames is None else (self.end - self.begin) * self.frames.shape[1]
+        return self.intervals.nbytes + frames + (0 if self.sharp is None else self.sharp.nbytes)
+
     def preview_rate(self, out: Image) -> Image:
         """`rate` without caching; written to `out` if there is no calibration."""
         return self.rate if self.calibration is not None else self.intervals.rate(out)

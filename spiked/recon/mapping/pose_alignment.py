@@ -6,6 +6,7 @@ path, so landmarks are free and marginalised like the points of a bundle adjustm
 the path is a prior. Basis weights map the blocks of the views to the knots.
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -64,22 +65,22 @@ class TrajectoryPrior:
 
 def align_spline(
     spline: Spline,
-    views: list[tuple[int, View]],
+    times: Sequence[float],
+    views: Iterable[tuple[int, View]],
     mapper: Mapper,
     planner: RenderPlanner,
     known: TrajectoryPrior | None = None,
     share: float = 1.0,
 ) -> Spline:
-    """One Gauss-Newton step of the spline towards agreement of map and views, given with their ids.
+    """One Gauss-Newton step of the spline towards agreement of the map and views at `times`, given with ids.
 
     `known` is a prior on a spline with the same knots. `share` of the step is taken.
     """
-    times = np.array([v.time for _, v in views])
     pixel = mapper.alignment_level.factor
     sums = []
     for (key, view), rotation, centre in zip(views, *spline.poses(times), strict=True):
         sums.append(_view_normals(key, view, planner.request(view, spline, pixel), rotation, centre, mapper))
-    square, gradient = marginalise_landmarks(sums, *spline.locate(times), len(spline.centres))
+    square, gradient = marginalise_landmarks(sums, *spline.locate(np.array(times)), len(spline.centres))
     variance = float(np.mean([s.variance for s in sums]))
     if not variance:  # no view has a valid pixel
         return spline

@@ -18,13 +18,12 @@ NEAREST_FRAMES = 0.51
 
 
 def scene_psnr_db(
-    views: Sequence[View], sensor: Sensor, rasteriser: AnyRasteriser, scene: Scene, trajectory: Trajectory
+    chosen: Sequence[View], sensor: Sensor, rasteriser: AnyRasteriser, scene: Scene, trajectory: Trajectory
 ) -> float:
     """PSNR of a scene rendered along a trajectory, against noisy views, each scaled to the view's brightness.
 
     A view without a pose counts as rendered black.
     """
-    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, COMPARED_VIEWS).round().astype(int))]
     rate = sensor.frame_rate_hz
     rows = trajectory.nearest(np.array([view.time / rate for view in chosen]), NEAREST_FRAMES / rate)
     errors, whites = [], []

@@ -4,7 +4,7 @@ The cost of one adjustment while tracking is bounded; the last one grows with th
 interpolated between the views, see `SparseMap.waypoints`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -49,7 +49,7 @@ class KeyframeAdjuster:
     """Keyframes of a long path and their adjustment; a `PathAdjuster`."""
 
     map: SparseMap
-    pictures: dict[int, Picture]
+    pictures: Mapping[int, Picture]
     """Images by view id of the views among which loops are searched: the keyframes of the `Relocaliser`."""
     keyframes: list[TrackedView] = field(default_factory=list)
     interpolated: bool = True

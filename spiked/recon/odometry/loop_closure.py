@@ -1,5 +1,6 @@
 """Loop closure: views that see points of much earlier views again, and the correction of the path between them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,7 +65,7 @@ class LoopClosure:
         self.later.pixels = np.concatenate([self.later.pixels, self.pixels[new]])
 
 
-def find_closures(sparse_map: SparseMap, pictures: dict[int, Picture]) -> list[LoopClosure]:
+def find_closures(sparse_map: SparseMap, pictures: Mapping[int, Picture]) -> list[LoopClosure]:
     """Loops among the views whose images are in `pictures` (by view id), one for each later view."""
     travelled_px = _travelled_px(sparse_map)
     numbers = _spaced([n for n in sorted(pictures) if sparse_map.views[n].pose is not None], travelled_px)
@@ -178,7 +179,7 @@ def _spaced(numbers: list[int], travelled_px: Array) -> NDArray[np.int64]:
 
 
 def _match(
-    sparse_map: SparseMap, earlier: TrackedView, later: TrackedView, pictures: dict[int, Picture]
+    sparse_map: SparseMap, earlier: TrackedView, later: TrackedView, pictures: Mapping[int, Picture]
 ) -> LoopClosure | None:
     """The loop of two views if enough points of the earlier one are found in the later one and agree with one pose."""
     before = later.pose

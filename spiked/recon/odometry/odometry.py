@@ -15,6 +15,7 @@ from spiked.recon.frontend.track_timestamps import TrackTimestamps
 from spiked.recon.odometry.global_adjuster import GlobalAdjuster
 from spiked.recon.odometry.initialiser import Initialiser
 from spiked.recon.odometry.keyframe_adjuster import LEAST_MOTION_PX, LONG_FRAMES, LONG_VIEWS, KeyframeAdjuster
+from spiked.recon.odometry.keyframe_pictures import KeyframePictures
 from spiked.recon.odometry.path_adjuster import PathAdjuster
 from spiked.recon.odometry.pnp import fit_pose
 from spiked.recon.odometry.pose_tracker import LOCAL_BA_EVERY, PoseTracker
@@ -41,15 +42,23 @@ class Odometry:
     and `GlobalAdjuster`, which owns the spline; on long paths `KeyframeAdjuster` takes its place.
     """
 
-    def __init__(self, intrinsics: Intrinsics, seed: int = 0, focal: Focal | None = None, live: bool = False) -> None:
-        """focal: set where the focal length is to be estimated; live: reasons advise how to move the camera now."""
+    def __init__(
+        self,
+        intrinsics: Intrinsics,
+        seed: int = 0,
+        focal: Focal | None = None,
+        live: bool = False,
+        pictures: KeyframePictures | None = None,
+    ) -> None:
+        """focal: set where the focal length is to be estimated; live: reasons advise how to move the camera now;
+        pictures: where images of keyframes are held."""
         self._map = SparseMap(intrinsics, focal)
         self._status = TrackingState()
         self._tracks = Tracks()
         self._timestamps = TrackTimestamps()
         self._initialiser = Initialiser(self._map, self._status, seed, live)
         self._adjuster: PathAdjuster = GlobalAdjuster(self._map)
-        self._relocaliser = Relocaliser(self._map)
+        self._relocaliser = Relocaliser(self._map, KeyframePictures() if pictures is None else pictures)
         self._tracker = PoseTracker(self._map, self._status, self._tracks, self._relocaliser, self._adjuster)
         self.path_error: float | None = None
         """Predicted error of the finished path relative to its RMS radius; None before the end."""
@@ -60,7 +69,7 @@ class Odometry:
         return self._map
 
     @property
-    def keyframe_images(self) -> dict[int, Picture]:
+    def keyframe_images(self) -> KeyframePictures:
         """Images of the keyframes by view id."""
         return self._relocaliser.keyframes
 

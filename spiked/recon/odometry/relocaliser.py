@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from spiked.pose import Array
 from spiked.recon.frontend.feature_tracks import Picture, Pyramid, follow, pyramid, search
 from spiked.recon.odometry.initialisation import INLIER_PX
+from spiked.recon.odometry.keyframe_pictures import KeyframePictures
 from spiked.recon.odometry.pnp import MIN_POINTS, PnPResult, fit_pose
 from spiked.recon.odometry.sparse_map import Pose, SparseMap, TrackedView
 
@@ -34,7 +35,7 @@ class Relocaliser:
     """Keyframes of a map, and the search for their points in a view."""
 
     map: SparseMap
-    keyframes: dict[int, Picture] = field(default_factory=dict)
+    keyframes: KeyframePictures = field(default_factory=KeyframePictures)
     """Images of the keyframes by view id."""
     least_motion_px: float = 0.0
     """Image motion from one keyframe to the next, at least: with more than 0 a camera at rest adds none."""

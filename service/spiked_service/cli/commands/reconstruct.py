@@ -70,6 +70,7 @@ def reconstruct(
     window_frames: Annotated[int | None, _option("window_frames")] = _DEFAULTS.window_frames,
     threads: Annotated[int | None, _option("threads")] = _DEFAULTS.threads,
     max_views: Annotated[int, _option("max_views")] = _DEFAULTS.max_views,
+    memory_mb: Annotated[int, _option("memory_mb")] = _DEFAULTS.memory_mb,
     refine_poses: Annotated[bool, _option("refine_poses")] = _DEFAULTS.refine_poses,
     watch: Annotated[bool, typer.Option("--watch", help="Serve a progress page.")] = False,
     watch_port: Annotated[int, typer.Option(help="Port of the progress page; 0: any free port.", min=0)] = 8660,
@@ -115,11 +116,14 @@ def reconstruct(
         window_frames=window_frames,
         threads=threads,
         max_views=max_views,
+        memory_mb=memory_mb,
         refine_poses=refine_poses,
     )
     known = None if poses is None else Trajectory.read_tum(poses)
     measured = None if calibration is None else Calibration.read(calibration)
-    reconstructor = Reconstructor(sensor, replace(chosen.options(), poses=known, calibration=measured))
+    reconstructor = Reconstructor(
+        sensor, replace(chosen.options(), poses=known, calibration=measured), recording=recording
+    )
     page = _watched(file.name, watch_port) if watch else None
     interrupted, curve = _run(recording, reconstructor, page, seconds)
     _write(reconstructor, out, file.name, curve)

@@ -14,7 +14,7 @@ from spiked.pose import quaternion
 from spiked.poses import PoseFile
 from spiked.recon import Reconstructor, State, Status, Tracked
 from spiked.recon.frontend.windowing import SEARCH_FRAMES
-from spiked.recording import open_recording
+from spiked.recording import Recording, open_recording
 from spiked.ring import End, Frames, Gap, Policy, RingReader
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
@@ -84,7 +84,7 @@ def run_reconstruction(command: ReconstructionCommand, channel: WorkerChannel) -
         assert command.recording is not None, "a command has a ring or a recording"
         os.nice(_OFFLINE_NICE)  # live captures have priority
         recording = open_recording(command.recording)
-        work = _begin(command, recording.sensor, channel)
+        work = _begin(command, recording.sensor, channel, recording)
         work.reporter.expect(recording.capture_index(recording.frames - 1) + 1)
         _read(command, work)
     work.finish()
@@ -121,10 +121,13 @@ class _Work:
         self.reporter.lost(first, count, cause)
 
 
-def _begin(command: ReconstructionCommand, sensor: Sensor, channel: WorkerChannel) -> _Work:
+def _begin(
+    command: ReconstructionCommand, sensor: Sensor, channel: WorkerChannel, recording: Recording | None = None
+) -> _Work:
     intrinsics: Intrinsics | None = command.intrinsics or sensor.intrinsics
     live = command.ring is not None and not command.can_block
-    reconstructor = Reconstructor(replace(sensor, intrinsics=intrinsics), command.options.options(), live=live)
+    options = command.options.options()
+    reconstructor = Reconstructor(replace(sensor, intrinsics=intrinsics), options, live=live, recording=recording)
     return _Work(reconstructor, ProgressReporter(reconstructor, command, channel), channel)
 
 

@@ -1804,6 +1804,12 @@ export interface components {
              */
             max_views?: number;
             /**
+             * Memory Mb
+             * @description MiB of images held in memory; the others are built anew from the recording.
+             * @default 512
+             */
+            memory_mb?: number;
+            /**
              * Refine Poses
              * @description Whether the map corrects the trajectory.
              * @default true

@@ -1,6 +1,14 @@
 """The exceptions of spiked. Each message says what is wrong, where, and what to do."""
 
-__all__ = ["CalibrationError", "ConfigurationError", "RecordingError", "SceneError", "SourceError", "SpikedError"]
+__all__ = [
+    "CalibrationError",
+    "CheckpointError",
+    "ConfigurationError",
+    "RecordingError",
+    "SceneError",
+    "SourceError",
+    "SpikedError",
+]
 
 
 class SpikedError(Exception):
@@ -25,3 +33,7 @@ class ConfigurationError(SpikedError):
 
 class CalibrationError(SpikedError):
     """A calibration, or a recording to make one from, cannot be used."""
+
+
+class CheckpointError(SpikedError):
+    """The checkpoint of an interrupted reconstruction cannot be used."""

@@ -97,8 +97,40 @@ class Reconstructor:
         self._unit = 1.0
         """Length of the map's unit in the trajectory's unit."""
         self._log = WorkLog()
+        self.tracking_ended = False
+        """All frames are tracked, and the path is final up to its alignment with the map."""
         # The matrices are small: on busy cores several BLAS threads track three times slower than one.
         self._blas = ThreadpoolController()
+
+    def __getstate__(self) -> dict[str, object]:
+        """For a checkpoint: without what is made anew."""
+        return {name: value for name, value in vars(self).items() if name not in ("_blas", "_preview")}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        vars(self).update(state)
+        self._preview = np.empty((self.sensor.height, self.sensor.width), np.float32)
+        self._blas = ThreadpoolController()
+        self.odometry.keyframe_images.builder = _Pictures(self)
+
+    @property
+    def frames(self) -> int:
+        """Frames so far, lost ones included: the index at which the next ones begin."""
+        return self._frames
+
+    @property
+    def waiting_frames(self) -> tuple[int, NDArray[np.uint8]]:
+        """Index of the first of the fed frames that later views still need, and these, uint8 [n, frame_bytes]."""
+        return self._windows.waiting
+
+    @property
+    def losses(self) -> list[tuple[float, float]]:
+        """(seconds of work, loss of the map) over the reconstruction."""
+        return self._log.losses
+
+    @property
+    def work_s(self) -> float:
+        """Seconds of work so far."""
+        return self._log.total_s
 
     @property
     def sensor(self) -> Sensor:
@@ -171,7 +203,7 @@ class Reconstructor:
             self._trainer.forget_views()
 
     def picture(self, view: View) -> Picture:
-        """The image of a view that tracks are followed in."""
+        """The image [H, W] of a view that tracks are followed in, uint8."""
         sharp = view.sharp
         grey = luminance(view.preview_rate(self._preview), self.sensor.mosaic) if sharp is None else sharp
         return picture(grey, white_of(grey))
@@ -221,20 +253,32 @@ class Reconstructor:
         progress: Callable[[Status], None] | None = None,
         cancelled: Callable[[], bool] = lambda: False,
         budget_s: float | None = None,
+        save: Callable[[], None] = lambda: None,
     ) -> None:
         """Track the buffered frames and refine path and map together.
 
         If the steps of the options take longer than `budget_s`, the schedule is compressed to fewer steps. Stops when
         `cancelled` returns true, with the map of that moment; the loops of a long path may then be open. If there is a
-        live map, the first `progress` call of the refinement precedes any change of it.
+        live map, the first `progress` call of the refinement precedes any change of it. `save` is called wherever a
+        checkpoint can be taken: `finish` of its reconstructor goes on from there.
         """
         deadline = np.inf if budget_s is None else time.perf_counter() + budget_s
         progress = progress or (lambda status: None)
-        with self._log.measure("tracking"):
-            self._end_tracking(lambda: cancelled() or time.perf_counter() > deadline)
+        if not self.tracking_ended:
+
+            def stop() -> bool:
+                return cancelled() or time.perf_counter() > deadline
+
+            with self._log.measure("tracking"):
+                self._end_tracking(stop)
+            if not stop():  # otherwise loops may be open
+                self.tracking_ended = True
+                save()
         with self._log.measure("refining"):
-            if (path := self._mappable_path()) is not None:
-                self._refine(path, progress, cancelled, deadline)
+            if self._refiner is not None:
+                self._continue_refining(self._refiner, progress, cancelled, deadline, save)
+            elif (path := self._mappable_path()) is not None:
+                self._refine(path, progress, cancelled, deadline, save)
         self._stage = "done"
         progress(self.status())
 
@@ -250,7 +294,12 @@ class Reconstructor:
         self._warn(report.path_warning(self.odometry.path_error))
 
     def _refine(
-        self, path: Path, progress: Callable[[Status], None], cancelled: Callable[[], bool], deadline: float
+        self,
+        path: Path,
+        progress: Callable[[Status], None],
+        cancelled: Callable[[], bool],
+        deadline: float,
+        save: Callable[[], None],
     ) -> None:
         self._stage = "refining"
         if self.focal is not None:
@@ -264,7 +313,17 @@ class Reconstructor:
         align = self.options.refine_poses and self._given is None
         prior = self._prior() if align else None
         self._refiner = Refiner(self._trainer, path, self._points(), prior, align)
-        for share in self._refiner.run(self.options.steps, deadline, cancelled):
+        self._continue_refining(self._refiner, progress, cancelled, deadline, save)
+
+    def _continue_refining(
+        self,
+        refiner: Refiner,
+        progress: Callable[[Status], None],
+        cancelled: Callable[[], bool],
+        deadline: float,
+        save: Callable[[], None],
+    ) -> None:
+        for share in refiner.run(self.options.steps, deadline, cancelled, save):
             self._progress = share
             self._log.note(self._trainer.mapper.loss)
             progress(self.status())

@@ -35,12 +35,42 @@ class Refiner:
         self._points = points
         self._prior = prior
         self._align = align
+        self._steps: int | None = None
+        """Steps of the whole refinement; None before it has begun."""
+        self._done = 0
+        self._spent_s = 0.0
+        """Time since the first step, without the time between a kill and the next start."""
 
-    def run(self, most_steps: int, deadline: float, cancelled: Callable[[], bool]) -> Iterator[float]:
+    def run(
+        self,
+        most_steps: int,
+        deadline: float,
+        cancelled: Callable[[], bool],
+        save: Callable[[], None] = lambda: None,
+    ) -> Iterator[float]:
         """Refine in at most `most_steps` steps for small images; yields the share that is done, every 50 steps.
 
         If the steps would end after `deadline`, a time of `time.perf_counter`, the schedule is compressed to fewer.
+        `save` is called before each step: a refiner saved there goes on with that step.
         """
+        if self._steps is None:
+            self._steps = self._begin(most_steps)
+        steps, begin = self._steps, time.perf_counter() - self._spent_s
+        available_s = max(deadline - begin, 1e-9)
+        while self._done < steps:
+            self._spent_s = time.perf_counter() - begin
+            share = max(self._done / steps, self._spent_s / available_s)
+            save()
+            if share >= 1 or cancelled():
+                break
+            self._trainer.step(self.path, self._schedule.rate(share), self._schedule.coarseness(share), share)
+            self._align_if_due(share)
+            self._done += 1
+            if self._done % PROGRESS_STEPS == 0:
+                yield max(share, self._done / steps)
+
+    def _begin(self, most_steps: int) -> int:
+        """Seed the map; returns the number of steps."""
         trainer, schedule = self._trainer, self._schedule
         if trainer.stale(self.path):
             trainer.restart()
@@ -49,17 +79,7 @@ class Refiner:
         trainer.seed(self.path, self._points, trainer.options.seeding.order(ids, trainer.extent))
         fast = float(np.mean([trainer.views[i].frames.warped is not None for i in ids]))
         pixels = trainer.camera.width * trainer.camera.height
-        steps = schedule.steps(most_steps, pixels, fast, trainer.extent)
-        begin = time.perf_counter()
-        available_s = max(deadline - begin, 1e-9)
-        for done in range(steps):
-            share = max(done / steps, (time.perf_counter() - begin) / available_s)
-            if share >= 1 or cancelled():
-                break
-            trainer.step(self.path, schedule.rate(share), schedule.coarseness(share), share)
-            self._align_if_due(share)
-            if done % PROGRESS_STEPS == PROGRESS_STEPS - 1:
-                yield max(share, (done + 1) / steps)
+        return schedule.steps(most_steps, pixels, fast, trainer.extent)
 
     def _align_if_due(self, share: float) -> None:
         due = self._schedule.alignments_due(share)

@@ -106,33 +106,49 @@ class WorkLog:
     """Seconds of work in each stage, and the quality of the map over them."""
 
     seconds: dict[str, float] = field(default_factory=lambda: {"tracking": 0.0, "mapping": 0.0, "refining": 0.0})
-    psnr_db: list[tuple[float, float]] = field(default_factory=list)
-    """(seconds of work, PSNR of the views)."""
+    losses: list[tuple[float, float]] = field(default_factory=list)
+    """(seconds of work, mean squared error of the views in units of white squared)."""
+    _stage: str = ""
     _begin: float | None = None
+    """Since when the stage is measured; None while none is."""
+
+    def __getstate__(self) -> dict[str, object]:
+        """For a checkpoint: with the work of the stage that is being measured."""
+        return vars(self) | {"seconds": self._seconds(), "_begin": None}
 
     @contextmanager
     def measure(self, stage: str) -> Iterator[None]:
         """Count the time within as work of a stage."""
-        self._begin = time.perf_counter()
+        self._stage, self._begin = stage, time.perf_counter()
         try:
             yield
         finally:
-            self.seconds[stage] += self._running_s()
-            self._begin = None
+            self.seconds, self._begin = self._seconds(), None
 
-    def _running_s(self) -> float:
-        return 0.0 if self._begin is None else time.perf_counter() - self._begin
+    def _seconds(self) -> dict[str, float]:
+        """With the stage that is being measured."""
+        if self._begin is None:
+            return self.seconds
+        running_s = time.perf_counter() - self._begin
+        return self.seconds | {self._stage: self.seconds[self._stage] + running_s}
+
+    @property
+    def total_s(self) -> float:
+        """Seconds of work so far."""
+        return sum(self._seconds().values())
 
     def note(self, loss: float | None) -> None:
-        """Append the PSNR of a mean squared error in units of white squared, if there is one."""
+        """Append a loss, if there is one."""
         if loss is not None:
-            self.psnr_db.append((sum(self.seconds.values()) + self._running_s(), float(-10 * np.log10(loss))))
+            self.losses.append((self.total_s, loss))
 
     def report(self) -> dict[str, object]:
         """The section of the report."""
-        seconds = self.seconds | {"total": sum(self.seconds.values())}
+        seconds = self.seconds | {"total": self.total_s}
         return {
-            "psnr_of_views_over_seconds": [[round(s, 2), round(p, 2)] for s, p in self.psnr_db],
+            "psnr_of_views_over_seconds": [
+                [round(s, 2), round(float(-10 * np.log10(loss)), 2)] for s, loss in self.losses
+            ],
             "seconds": {stage: round(s, 3) for stage, s in seconds.items()},
         }
 

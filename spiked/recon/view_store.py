@@ -72,6 +72,10 @@ class ViewStore:
         """Images in memory, those used last at the end."""
         self._held_bytes = 0
 
+    def __getstate__(self) -> dict[str, object]:
+        """For a checkpoint: without images, which are built anew."""
+        return vars(self) | {"_held": {}, "_held_bytes": 0}
+
     def __len__(self) -> int:
         return len(self._records)
 

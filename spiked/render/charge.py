@@ -56,6 +56,7 @@ class ChargeLoss:
         if not 1 <= threads <= MAX_THREADS:
             raise ConfigurationError(f"cannot work with {threads} threads: use 1 to {MAX_THREADS}")
         self.sensor = sensor
+        self._threads = threads
         self._native = _ChargeLoss(threads)
         mosaic = None if sensor.mosaic is None else sensor.mosaic.channels(2, 2).ravel()
         self._layout: _Layout = {
@@ -66,6 +67,13 @@ class ChargeLoss:
             "msb": sensor.bit_order is BitOrder.MSB,
             "tile": np.zeros(4, np.uint8) if mosaic is None else np.ascontiguousarray(mosaic),
         }
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in vars(self).items() if name != "_native"}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        vars(self).update(state)
+        self._native = _ChargeLoss(self._threads)
 
     def __call__(
         self,

@@ -31,11 +31,19 @@ class Adam:
     ) -> None:
         """arrays: float32 [N] or [N, K], K at most 4, as they will be given to step(). Threads default to the cores
         this process may use; their number changes no bit."""
-        self._steps = AdamSteps(usable_cores() if threads is None else threads)
+        self._threads = usable_cores() if threads is None else threads
+        self._steps = AdamSteps(self._threads)
         self._betas = (beta1, beta2)
         self._epsilon = epsilon
         self._moments = [(np.zeros_like(array), np.zeros_like(array)) for array in arrays]
         self._taken = np.zeros(len(arrays[0]), np.uint32)
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in vars(self).items() if name != "_steps"}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        vars(self).update(state)
+        self._steps = AdamSteps(self._threads)
 
     @property
     def taken(self) -> NDArray[np.uint32]:

@@ -15,6 +15,7 @@ MISSING = "missing"
 """Of an input. That it is not there is noticed later than an output that cannot be written."""
 WRITERS: dict[tuple[str, str], list[str]] = {
     ("reconstruct", "--out"): [MISSING],
+    ("reconstruct", "--resume"): [],
     ("render", "--out"): [MISSING, "--poses", MISSING],
     ("simulate", "--out"): ["--scene", MISSING, "--poses", MISSING],
     ("calibrate", "--out"): [MISSING],
@@ -30,6 +31,7 @@ WRITERS: dict[tuple[str, str], list[str]] = {
 }
 FOLDERS = {
     ("reconstruct", "--out"),
+    ("reconstruct", "--resume"),
     ("render", "--out"),
     ("simulate", "--out"),
     ("localise", "--out"),

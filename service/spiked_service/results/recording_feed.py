@@ -21,14 +21,18 @@ class Piece:
     index: int
 
 
-def pieces(recording: Recording, chunk: int = CHUNK_FRAMES) -> Iterator[Piece]:
-    """The stored frames in pieces of at most `chunk` frames without gaps."""
+def pieces(recording: Recording, chunk: int = CHUNK_FRAMES, begin: int = 0) -> Iterator[Piece]:
+    """The stored frames in pieces of at most `chunk` frames without gaps.
+
+    `begin` leaves out those captured before: the index after one of the pieces.
+    """
     first = 0
     while first < recording.frames:
         index = recording.capture_index(first)
         later = (gap.first - index for gap in recording.gaps if gap.first > index)
         count = min(chunk, recording.frames - first, *later)
-        yield Piece(first, count, index)
+        if index >= begin:
+            yield Piece(first, count, index)
         first += count
 
 
@@ -39,14 +43,17 @@ def reconstruct_recording(
     progress: Callable[[Status], None],
     cancelled: Callable[[], bool],
     budget_s: float | None = None,
+    save: Callable[[], None] = lambda: None,
 ) -> None:
     """Feed every frame and gap, then refine, within `budget_s` seconds if given; stops early when cancelled.
 
-    After an early stop the reconstructor holds the result so far.
+    After an early stop the reconstructor holds the result so far. One from a checkpoint goes on. `save` is called
+    wherever a checkpoint can be taken.
     """
     deadline = math.inf if budget_s is None else time.monotonic() + budget_s
-    expected = 0
-    for piece in pieces(recording):
+    expected = reconstructor.frames
+    for piece in pieces(recording, begin=expected):
+        save()
         if cancelled() or time.monotonic() > deadline:
             break
         if piece.index > expected:
@@ -54,4 +61,4 @@ def reconstruct_recording(
         reconstructor.feed(piece.index, recording.read(piece.first, piece.count))
         expected = piece.index + piece.count
         progress(reconstructor.status())
-    reconstructor.finish(progress, cancelled, deadline - time.monotonic())
+    reconstructor.finish(progress, cancelled, deadline - time.monotonic(), save)

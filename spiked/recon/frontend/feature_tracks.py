@@ -4,6 +4,7 @@ Each track is aligned with the window of its first view, so that errors do not a
 """
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
@@ -85,6 +86,16 @@ class Tracks:
     newest: int = -1
     _spare: list[Pyramid] = field(default_factory=list)
     """Buffers for the next image."""
+
+    def __getstate__(self) -> dict[str, object]:
+        """For a checkpoint: the pictures without their pyramids, without buffers."""
+        margin = slice(_tracking.MARGIN_PX, -_tracking.MARGIN_PX)
+        pictures = {window: levels[0][margin, margin].astype(np.uint8) for window, levels in self.pictures.items()}
+        return vars(self) | {"pictures": pictures, "_spare": []}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        pictures = {window: pyramid(image, LEVELS) for window, image in state["pictures"].items()}
+        vars(self).update(state | {"pictures": pictures})
 
     def add(self, window: int, image: Picture, after_gap: bool = False, warps: NDArray[np.float32] = NO_WARPS) -> float:
         """Track into a window and start new tracks; returns the median motion in px, 0 without tracks.

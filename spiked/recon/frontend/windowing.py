@@ -155,6 +155,15 @@ class Windows:
         self._compensator: MotionCompensator | None = None
         self._window: Window | None = None
 
+    def __getstate__(self) -> dict[str, object]:
+        """For a checkpoint: of the buffer only what waits."""
+        return vars(self) | {"_store": self._frames, "_filled": len(self._frames), "_shared": True, "_window": None}
+
+    @property
+    def waiting(self) -> tuple[int, NDArray[np.uint8]]:
+        """The frames that later views still need, uint8 [n, frame_bytes], and the index of the first."""
+        return self._first, self._frames
+
     def feed(self, first_frame: int, frames: NDArray[np.uint8]) -> Iterator[View]:
         """Add frames uint8 [n, frame_bytes] in stored layout and yield the completed views."""
         expected = self._first + len(self._frames)

@@ -17,7 +17,7 @@ from spiked.recon.mapping.pyramid import Level, levels
 from spiked.recon.mapping.render_requests import RenderRequest
 from spiked.recon.mapping.seeding import SweptView, isotropic_splats
 from spiked.recon.statistics import WHITE_PERCENTILE
-from spiked.render import Camera
+from spiked.render import AnyRasteriser, Camera
 from spiked.render.charge import ChargeLoss
 from spiked.render.optimiser import Adam
 from spiked.scene import Scene
@@ -59,7 +59,6 @@ class Mapper:
         """The radiance (spikes a frame) that is shown as white: `WHITE_PERCENTILE` of the first seeded view."""
         self.depth = 1.0
         """Typical depth of the scene; the learning rate of the means is relative to it."""
-        self.rasteriser = self.levels[0].rasteriser
         self.adam = Adam(self.scene.arrays(), *BETAS, threads=threads)
         self.nuisances = Nuisances(sensor.height, sensor.width)
         self.rate_loss = RateLoss(options.ssim, options.floor)
@@ -71,6 +70,11 @@ class Mapper:
         self._charge_error: Image = np.zeros((1, 1), np.float32)
         self._rng = np.random.default_rng(seed)
         self._losses: dict[int, float] = {}
+
+    @property
+    def rasteriser(self) -> AnyRasteriser:
+        """Of the sensor's size."""
+        return self.levels[0].rasteriser
 
     @property
     def cap(self) -> int:

@@ -32,12 +32,20 @@ class Level:
 
     def __init__(self, sensor: Sensor, camera: Camera, factor: int, threads: int | None) -> None:
         self.factor = factor
+        self._threads = threads
         self._mosaic = sensor.mosaic
         self.camera = Camera(camera.intrinsics.scaled(1 / factor), camera.width // factor, camera.height // factor)
         self.rasteriser = rasteriser_for(self.camera, threads)
         self.channels: NDArray[np.uint8] | None = None
         if sensor.mosaic is not None and factor == 1:
             self.channels = sensor.mosaic.channels(sensor.height, sensor.width)
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in vars(self).items() if name != "rasteriser"}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        vars(self).update(state)
+        self.rasteriser = rasteriser_for(self.camera, self._threads)
 
     @property
     def mosaic(self) -> Mosaic | None:

@@ -30,12 +30,20 @@ class KeyframePictures(MutableMapping[int, Picture]):
 
     def __init__(self, most_bytes: float = np.inf, builder: PictureBuilder | None = None) -> None:
         self._most_bytes = most_bytes
-        self._builder = builder
+        self.builder = builder
         self._held: dict[int, Picture | None] = {}
         """None: to be built anew."""
         self._used: dict[int, None] = {}
         """Ids of the images in memory, those used last at the end."""
         self._bytes = 0
+
+    def __getstate__(self) -> dict[str, object]:
+        """For a checkpoint: its owner sets the builder again."""
+        return vars(self) | {"builder": None}
+
+    def held(self) -> Iterator[Picture]:
+        """The images in memory."""
+        return (picture for picture in self._held.values() if picture is not None)
 
     @property
     def held_bytes(self) -> int:
@@ -51,7 +59,7 @@ class KeyframePictures(MutableMapping[int, Picture]):
     def __getitem__(self, view_id: int) -> Picture:
         picture = self._held[view_id]
         if picture is None:
-            picture = None if self._builder is None else self._builder.build(view_id)
+            picture = None if self.builder is None else self.builder.build(view_id)
             assert picture is not None, f"the image of view {view_id} was dropped"
             self._keep(view_id, picture)
         else:
@@ -79,9 +87,9 @@ class KeyframePictures(MutableMapping[int, Picture]):
         """Forget images that can be built anew; otherwise drop every second of the older keyframes."""
         newest = set(list(self._held)[-NEWEST_PICTURES:])
         for other in [one for one in self._used if one not in newest]:
-            if self._builder is None or self._bytes <= self._most_bytes:
+            if self.builder is None or self._bytes <= self._most_bytes:
                 break
-            if self._builder.holds(other):
+            if self.builder.holds(other):
                 self._forget(other)
         if self._bytes > self._most_bytes:
             for other in list(self._held)[1:-NEWEST_PICTURES:2]:

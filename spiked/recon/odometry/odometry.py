@@ -3,10 +3,12 @@
 It needs no map of Gaussians: a trajectory exists within a second or two, and mapping then refines it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spiked.pose import Array
 from spiked.recon.frontend.feature_tracks import Picture, Tracks
@@ -72,6 +74,13 @@ class Odometry:
     def keyframe_images(self) -> KeyframePictures:
         """Images of the keyframes by view id."""
         return self._relocaliser.keyframes
+
+    def fixed_arrays(self) -> Iterator[NDArray[Any]]:
+        """Arrays that are replaced and never changed in place: a checkpoint writes each of them once."""
+        for view in self.views:
+            yield view.ids
+            yield view.pixels
+        yield from self.keyframe_images.held()
 
     @property
     def closures(self) -> list[tuple[float, float]]:

@@ -25,7 +25,7 @@ from rich.progress import (
 from rich.text import Text
 
 from spiked.calibration import Calibration
-from spiked.errors import SpikedError
+from spiked.errors import ConfigurationError, SpikedError
 from spiked.recon import Reconstructor, State, Status
 from spiked.recon.frontend.mosaic_check import detect
 from spiked.recon.frontend.windowing import Windows
@@ -35,6 +35,7 @@ from spiked.trajectory import Trajectory
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import messages, output, report_error, report_warning
+from spiked_service.cli.reconstruction_run import RESULTS, ReconstructionRun, parameters_of
 from spiked_service.results.recording_feed import reconstruct_recording
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 
@@ -61,8 +62,13 @@ def _option(name: str) -> Any:
 
 # Longer than 60 lines, because each option is a parameter.
 def reconstruct(
-    file: Annotated[Path, typer.Argument(help="A recording.", readable=False)],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; created if missing.")],
+    context: typer.Context,
+    file: Annotated[Path | None, typer.Argument(help="A recording.", readable=False)] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the results; created if missing.")] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the results of an interrupted run: it goes on, with that run's options."),
+    ] = None,
     poses: Annotated[Path | None, typer.Option(help="TUM file of known camera-to-world poses.")] = None,
     seconds: Annotated[float | None, typer.Option(help="Time budget; reduces the number of steps.", min=0.0)] = None,
     steps: Annotated[int, _option("steps")] = _DEFAULTS.steps,
@@ -93,6 +99,9 @@ def reconstruct(
     OUT. Ctrl-C writes the current state and exits with code 130. If no path is found, the exit code is 1, report.json
     gives the reason, and overview.png shows the observed views.
 
+    Every few seconds OUT/checkpoint takes what was done; it is removed at the end. After a kill, a power cut or Ctrl-C
+    `--resume OUT` goes on from there, with the options of the interrupted run and the same result.
+
     Examples:
 
     - `spiked reconstruct rec.dat -o out`
@@ -100,8 +109,16 @@ def reconstruct(
     - `spiked reconstruct rec.dat -o out --fov 60 --seconds 120`
 
     - `spiked reconstruct rec.dat -o out --poses known.tum`
+
+    - `spiked reconstruct --resume out`
     """
-    outputs.try_folder("--out", out, ("scene.ply", "trajectory.tum", "report.json", "overview.png"))
+    if resume is not None:
+        run = ReconstructionRun.resumed(context, resume, file, out)
+        _carry_out(run, _watched(run.recording.path.name, watch_port) if watch else None)
+        return
+    if file is None or out is None:
+        raise ConfigurationError("name a recording and a folder for the results (-o OUT), or --resume OUT")
+    outputs.try_folder("--out", out, RESULTS)
     colours = None if mosaic in (None, g.MosaicChoice.AUTO) else Mosaic(mosaic)
     geometry = RecordingGeometry(width, height, rate, layout, bit_order, flipped, colours)
     recording = open_recording(file, **geometry.stated())
@@ -124,32 +141,48 @@ def reconstruct(
     reconstructor = Reconstructor(
         sensor, replace(chosen.options(), poses=known, calibration=measured), recording=recording
     )
-    page = _watched(file.name, watch_port) if watch else None
-    interrupted, curve = _run(recording, reconstructor, page, seconds)
-    _write(reconstructor, out, file.name, curve)
-    _report(reconstructor, out)
+    run = ReconstructionRun.begun(recording, reconstructor, out, parameters_of(context, geometry))
+    _carry_out(run, _watched(file.name, watch_port) if watch else None)
+
+
+def _carry_out(run: ReconstructionRun, page: "Watch | None") -> None:
+    """Reconstruct, write the results and report the outcome. Raises typer.Exit."""
+    reconstructor = run.reconstructor
+    interrupted = _run_through(run, page)
+    _write(reconstructor, run.out, run.recording.path.name)
+    _report(reconstructor, run.out)
     if interrupted:
+        run.checkpoints.close()
         raise typer.Exit(INTERRUPTED)
+    run.checkpoints.remove()
     if reconstructor.failure is not None:
         raise typer.Exit(1)
 
 
-def _run(
-    recording: Recording, reconstructor: Reconstructor, page: "Watch | None", budget_s: float | None
-) -> tuple[bool, list[tuple[float, float]]]:
-    """Feed and refine with a progress display. Return whether it was interrupted, and the curve of the loss."""
+def _run_through(run: ReconstructionRun, page: "Watch | None") -> bool:
+    """Feed and refine with a progress display. Return whether it was interrupted."""
+    recording, reconstructor = run.recording, run.reconstructor
     total = recording.capture_index(recording.frames - 1) + 1
     with _interruptible() as interrupt, ProgressDisplay(total) as display:
+        saved = False
 
         def show(status: Status) -> None:
             display.show(status)
             if page is not None:
                 page.show(reconstructor, status)
 
-        reconstruct_recording(recording, reconstructor, progress=show, cancelled=interrupt.is_set, budget_s=budget_s)
+        def save() -> None:
+            nonlocal saved
+            if not saved:  # after Ctrl-C the rest is cut short
+                saved = interrupt.is_set()
+                run.checkpoints.save(reconstructor, now=saved)
+
+        reconstruct_recording(
+            recording, reconstructor, progress=show, cancelled=interrupt.is_set, budget_s=run.budget_s, save=save
+        )
     if page is not None:
         page.close()
-    return interrupt.is_set(), display.curve
+    return interrupt.is_set()
 
 
 def _report(reconstructor: Reconstructor, out: Path) -> None:
@@ -235,10 +268,8 @@ class ProgressDisplay:
         self._task = self._bar.add_task("waiting", total=1.0)
         self._figures = Text()
         self._live = Live(Group(self._bar, self._figures), console=console)
-        self._begin = self._last = time.monotonic()
+        self._last = time.monotonic()
         self._stage = ""
-        self.curve: list[tuple[float, float]] = []
-        """Seconds since the start and loss, in the order of the updates."""
 
     def __enter__(self) -> "ProgressDisplay":
         if self._console.is_terminal:
@@ -250,8 +281,6 @@ class ProgressDisplay:
 
     def show(self, status: Status) -> None:
         """Show the status."""
-        if status.loss is not None:
-            self.curve.append((time.monotonic() - self._begin, status.loss))
         loss = "" if status.loss is None else f"  loss {status.loss:.2e}"
         figures = f"{status.frames}/{self._frames} frames  {status.state}{loss}  {status.splats} splats"
         fed = min(1.0, status.frames / max(self._frames, 1))
@@ -263,7 +292,7 @@ class ProgressDisplay:
             self._console.print(f"{status.stage}: {figures}  {100 * status.progress:.0f} % refined", markup=False)
 
 
-def _write(reconstructor: Reconstructor, out: Path, title: str, curve: list[tuple[float, float]]) -> None:
+def _write(reconstructor: Reconstructor, out: Path, title: str) -> None:
     from spiked_service.cli.overview import draw_overview  # matplotlib takes longer to load than most commands run
 
     with outputs.writing("--out", out):
@@ -271,4 +300,4 @@ def _write(reconstructor: Reconstructor, out: Path, title: str, curve: list[tupl
         reconstructor.scene().write_ply(out / "scene.ply", reconstructor.white)
         reconstructor.trajectory().write_tum(out / "trajectory.tum")
         (out / "report.json").write_text(json.dumps(reconstructor.report(), indent=1), encoding="utf-8")
-        draw_overview(reconstructor, title, curve, out / "overview.png")
+        draw_overview(reconstructor, title, reconstructor.losses, out / "overview.png")

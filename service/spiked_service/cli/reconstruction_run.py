@@ -1,0 +1,97 @@
+"""A run of `spiked reconstruct` that can be resumed: its checkpoints, and the options it was begun with."""
+
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import typer
+from pydantic import TypeAdapter
+
+from spiked.errors import ConfigurationError
+from spiked.recon import Reconstructor
+from spiked.recon.checkpoint import CHECKPOINT, CheckpointSaver, Interrupted, exists
+from spiked.recording import Recording, RecordingGeometry, open_recording
+from spiked_service.cli import outputs
+from spiked_service.cli.console import messages, report_warning
+
+RESULTS = "scene.ply", "trajectory.tum", "report.json", "overview.png"
+"""Files in OUT."""
+_NOT_STORED = "file", "out", "resume", "watch", "watch_port"
+"""Parameters that a resumed run may have otherwise."""
+_GEOMETRY = TypeAdapter(RecordingGeometry)
+
+
+@dataclass(frozen=True)
+class ReconstructionRun:
+    """A reconstruction of a recording, begun or resumed."""
+
+    recording: Recording
+    reconstructor: Reconstructor
+    out: Path
+    checkpoints: CheckpointSaver
+    budget_s: float | None
+
+    @classmethod
+    def begun(
+        cls, recording: Recording, reconstructor: Reconstructor, out: Path, parameters: dict[str, Any]
+    ) -> "ReconstructionRun":
+        """A new run: a checkpoint of an earlier one in `out` is removed."""
+        folder = out / CHECKPOINT
+        saver = CheckpointSaver(folder, recording, parameters, report_warning)
+        if exists(folder):
+            report_warning(f"{out} held the checkpoint of an interrupted run; this run begins anew and replaces it")
+            saver.remove()
+        return cls(recording, reconstructor, out, saver, parameters["seconds"])
+
+    @classmethod
+    def resumed(cls, context: typer.Context, folder: Path, file: Path | None, out: Path | None) -> "ReconstructionRun":
+        """The run that was interrupted in a folder. Raises CheckpointError, RecordingError and ConfigurationError."""
+        if out is not None and out.absolute() != folder.absolute():
+            raise ConfigurationError(f"--resume {folder} writes its results there: leave out --out {out}")
+        if not exists(folder / CHECKPOINT):
+            complete = (folder / "report.json").exists()
+            why = "the run there is complete" if complete else "no run was interrupted there after its first seconds"
+            raise ConfigurationError(
+                f"--resume {folder} has no checkpoint: {why}; to reconstruct anew leave out --resume"
+            )
+        interrupted = Interrupted.read(folder / CHECKPOINT)
+        parameters = interrupted.parameters
+        _check_options(context, parameters)
+        geometry = _GEOMETRY.validate_python(parameters["geometry"])
+        recording = open_recording(file or interrupted.recording, **geometry.stated())
+        saver = CheckpointSaver(folder / CHECKPOINT, recording, parameters, report_warning)
+        reconstructor = interrupted.resume(recording)
+        outputs.try_folder("--resume", folder, RESULTS)
+        messages.print(f"resumed: {interrupted.stage}", markup=False)
+        budget_s = parameters["seconds"]
+        left_s = None if budget_s is None else max(0.0, budget_s - reconstructor.work_s)
+        return cls(recording, reconstructor, folder, saver, left_s)
+
+
+def parameters_of(context: typer.Context, geometry: RecordingGeometry) -> dict[str, Any]:
+    """All options of this run, ready for JSON."""
+    options = {name: _plain(value) for name, value in context.params.items() if name not in _NOT_STORED}
+    return options | {"geometry": _GEOMETRY.dump_python(geometry, mode="json")}
+
+
+def _check_options(context: typer.Context, parameters: dict[str, Any]) -> None:
+    """Raises ConfigurationError where an option on the command line differs from that of the interrupted run."""
+    for name in context.params.keys() & parameters.keys():
+        source = context.get_parameter_source(name)
+        given = source is not None and source.name == "COMMANDLINE"
+        value, before = _plain(context.params[name]), parameters[name]
+        if given and value != before:
+            option = f"--{name.replace('_', '-')}"
+            said = f"with {before}" if before is not None else "without it"
+            raise ConfigurationError(
+                f"{option} {value}: the interrupted run was begun {said}; leave {option} out, or begin anew without "
+                "--resume"
+            )
+
+
+def _plain(value: Any) -> Any:
+    """An option's value as JSON has it."""
+    if isinstance(value, Path):
+        return str(value.absolute())
+    return value.value if isinstance(value, Enum) else value

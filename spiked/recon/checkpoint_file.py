@@ -1,0 +1,215 @@
+"""The files of a checkpoint: one state that is replaced as a whole, and arrays that are written once.
+
+`state` is replaced atomically: a magic, the length of a JSON header, the header, the payload, and a digest of all
+that. `arrays-N` grows; the header says how much of it belongs to the state, with a digest. A kill at any moment leaves
+the state before or the new one, and at most some bytes at the end of `arrays-N` that no state knows.
+"""
+
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.errors import CheckpointError
+
+FORMAT = 1
+"""Number of the layout described above; a program reads its own only."""
+_MAGIC = b"spiked checkpoint\n"
+_DIGEST_BYTES = 16
+"""Of BLAKE2b: it tells damage, not malice."""
+_LENGTH_BYTES = 4
+"""Of the header's length, little-endian."""
+_STATE, _PART, _ARRAYS = "state", "state.part", "arrays-"
+_LOCK = "lock"
+_ALIGNED_BYTES = 64
+"""Arrays begin at multiples of it, for the compiled code."""
+
+
+def _blake(*contents: Any) -> Any:
+    digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
+    for content in contents:
+        digest.update(content)
+    return digest
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an array lies in `arrays-N`."""
+
+    begin: int
+    dtype: str
+    shape: tuple[int, ...]
+
+    @property
+    def bytes(self) -> int:
+        """Its size."""
+        return int(np.dtype(self.dtype).itemsize * np.prod(self.shape, dtype=np.int64))
+
+    @property
+    def end(self) -> int:
+        """Where the next array begins."""
+        return self.begin + -(-self.bytes // _ALIGNED_BYTES) * _ALIGNED_BYTES
+
+
+@dataclass
+class State:
+    """What was read: header, payload and the arrays."""
+
+    header: dict[str, Any]
+    payload: bytes
+    arrays: NDArray[np.uint8]
+    """[bytes], its content."""
+
+    def array(self, place: Place) -> NDArray[Any]:
+        """The read-only array at a place. Raises CheckpointError."""
+        if not 0 <= place.begin <= place.begin + place.bytes <= len(self.arrays):
+            raise CheckpointError("an array lies outside of its file")
+        content = self.arrays[place.begin : place.begin + place.bytes]
+        return content.view(np.dtype(place.dtype)).reshape(place.shape)
+
+
+@dataclass
+class CheckpointFolder:
+    """Writes the states of one run into a folder. One process at a time."""
+
+    path: Path
+    _lock: BinaryIO | None = None
+    _number: int = 0
+    _size: int = 0
+    _digest: Any = field(default_factory=_blake)
+
+    @property
+    def arrays_bytes(self) -> int:
+        """Size of the current `arrays-N`: where the next array is going to begin."""
+        return self._size
+
+    def lock(self) -> None:
+        """Make the folder and keep other processes out of it; called again it does nothing.
+
+        Raises OSError, and CheckpointError if another process writes there.
+        """
+        if self._lock is not None:
+            return
+        self.path.mkdir(parents=True, exist_ok=True)
+        lock = (self.path / _LOCK).open("ab")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            lock.close()
+            raise CheckpointError(f"{self.path}: another process works there; wait for its end, or end it") from error
+        self._lock = lock
+        found = [path.name.removeprefix(_ARRAYS) for path in self.path.glob(f"{_ARRAYS}*")]
+        self._number = 1 + max((int(number) for number in found if number.isdecimal()), default=0)
+
+    def begin_arrays(self) -> None:
+        """Let the next `write` begin a new file of arrays."""
+        self._number, self._size, self._digest = self._number + 1, 0, _blake()
+
+    def write(self, header: Mapping[str, Any], payload: bytes, arrays: list[NDArray[Any]]) -> None:
+        """Append arrays, sync them, and replace the state. Raises OSError; the state before is whole then.
+
+        The arrays lie one after another from `arrays_bytes` on, as `Place.end` says.
+        """
+        self.lock()
+        size, digest = self._size, self._digest.copy()
+        name = self.path / f"{_ARRAYS}{self._number}"
+        with os.fdopen(os.open(name, os.O_WRONLY | os.O_CREAT, 0o666), "wb") as file:
+            file.truncate(size)
+            file.seek(size)
+            for array in arrays:
+                place = Place(size, array.dtype.str, array.shape)
+                padded = np.zeros(place.end - size, np.uint8)
+                padded[: place.bytes] = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+                file.write(padded.data)
+                digest.update(padded.data)
+                size = place.end
+            file.flush()
+            os.fdatasync(file.fileno())
+        described = {
+            **header,
+            "format": FORMAT,
+            "arrays": {"number": self._number, "bytes": size, "digest": digest.hexdigest()},
+        }
+        head = json.dumps(described).encode()
+        whole = [_MAGIC, len(head).to_bytes(_LENGTH_BYTES, "little"), head, payload]
+        part = self.path / _PART
+        with part.open("wb") as file:
+            for content in whole:
+                file.write(content)
+            file.write(_blake(*whole).digest())
+            file.flush()
+            os.fdatasync(file.fileno())
+        part.replace(self.path / _STATE)
+        _sync_folder(self.path)
+        self._size, self._digest = size, digest
+        for other in self.path.glob(f"{_ARRAYS}*"):
+            if other != name:
+                other.unlink()
+
+    def remove(self) -> None:
+        """Delete the folder."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+        if self.path.exists():
+            (self.path / _STATE).unlink(missing_ok=True)  # first: without it there is no checkpoint
+            shutil.rmtree(self.path)
+
+    def close(self) -> None:
+        """Let others into the folder."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+
+def exists(path: Path) -> bool:
+    """Whether there is a checkpoint in a folder, of whatever quality."""
+    return (path / _STATE).exists()
+
+
+def read(path: Path) -> State:
+    """The state in a folder. Raises CheckpointError, also for one of another format."""
+    try:
+        content = (path / _STATE).read_bytes()
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{path}: there is no checkpoint") from error
+    except OSError as error:
+        raise CheckpointError(f"{path}: its checkpoint cannot be read: {error.strerror}") from error
+    begin = len(_MAGIC) + _LENGTH_BYTES
+    if not content.startswith(_MAGIC) or len(content) < begin + _DIGEST_BYTES:
+        raise CheckpointError(f"{path}: its checkpoint is damaged: it does not begin as one")
+    if _blake(content[:-_DIGEST_BYTES]).digest() != content[-_DIGEST_BYTES:]:
+        raise CheckpointError(f"{path}: its checkpoint is damaged: its digest does not fit its {len(content)} bytes")
+    end = begin + int.from_bytes(content[len(_MAGIC) : begin], "little")
+    try:
+        header = json.loads(content[begin:end])
+        layout, arrays = header["format"], header["arrays"] if header["format"] == FORMAT else {}
+    except (ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(f"{path}: its checkpoint is damaged: its header cannot be read") from error
+    if layout != FORMAT:
+        raise CheckpointError(f"{path}: its checkpoint has format {layout}, and this program reads {FORMAT}")
+    name = path / f"{_ARRAYS}{arrays['number']}"
+    try:
+        stored = np.fromfile(name, np.uint8, arrays["bytes"])
+    except OSError as error:
+        raise CheckpointError(f"{name} cannot be read: {error.strerror}") from error
+    if len(stored) != arrays["bytes"] or _blake(stored).hexdigest() != arrays["digest"]:
+        raise CheckpointError(f"{name} is damaged: its first {arrays['bytes']} bytes are not those of the checkpoint")
+    stored.flags.writeable = False
+    return State(header, content[end:-_DIGEST_BYTES], stored)
+
+
+def _sync_folder(path: Path) -> None:
+    folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

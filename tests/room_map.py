@@ -40,13 +40,13 @@ class RoomMap:
         return folder
 
 
-def room_map(seed: int) -> RoomMap:
-    """The room of a seed as a splat for each pixel of three views, at its exact depth."""
+def room_map(seed: int, turns_rad: tuple[float, ...] = TURNS_RAD) -> RoomMap:
+    """The room of a seed as a splat for each pixel of some views, at its exact depth."""
     room = Room(seed=seed)
     x, y = np.meshgrid(np.arange(SENSOR.width) + 0.5, np.arange(SENSOR.height) + 0.5)
     rays = OPTICS.unproject(np.stack([x, y], -1).reshape(-1, 2))
     scene = Scene.empty(1)
-    for turn in TURNS_RAD:
+    for turn in turns_rad:
         rotation, centre = _pose(room, turn)
         view = room.render(OPTICS, SENSOR.width, SENSOR.height, rotation, centre)
         depth = view.depth.reshape(-1, 1)
@@ -61,7 +61,7 @@ def room_map(seed: int) -> RoomMap:
                 np.ascontiguousarray(GAIN * view.intensity.reshape(-1, 1), np.float32),
             )
         )
-    poses = [_pose(room, turn) for turn in np.linspace(0, TURNS_RAD[-1], 60)]
+    poses = [_pose(room, turn) for turn in np.linspace(turns_rad[0], turns_rad[-1], 60)]
     times = (np.arange(len(poses)) + 0.5) / SENSOR.frame_rate_hz
     return RoomMap(scene, Trajectory(times, np.stack([r for r, _ in poses]), np.stack([c for _, c in poses])))
 

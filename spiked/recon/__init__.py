@@ -1,25 +1,33 @@
 """Spikes to trajectory and scene: views, sparse odometry, depth, mapping and refinement behind one `Reconstructor`.
 
-`MapIndex` and `Localiser` find a camera in a scene that is known.
+`MapIndex` and `Localiser` find a camera in a scene that is known; `merge` makes one map of two.
 """
 
 from spiked.recon.localisation.localiser import Localisation, LocalisedView, Localiser
 from spiked.recon.localisation.map_index import MapIndex
+from spiked.recon.merging.known_map import KnownMap
+from spiked.recon.merging.merger import Merged, merge
+from spiked.recon.merging.registration import NotOnePlaceError, Registration
 from spiked.recon.odometry.tracking_state import State
 from spiked.recon.options import MapOptions, Options
 from spiked.recon.reconstructor import Reconstructor
 from spiked.recon.report import Sample, Status, Tracked
 
 __all__ = [
+    "KnownMap",
     "Localisation",
     "LocalisedView",
     "Localiser",
     "MapIndex",
     "MapOptions",
+    "Merged",
+    "NotOnePlaceError",
     "Options",
     "Reconstructor",
+    "Registration",
     "Sample",
     "State",
     "Status",
     "Tracked",
+    "merge",
 ]

@@ -212,6 +212,7 @@ def focal_section(mapper: Mapper, focal: Focal | None) -> dict[str, object]:
     sigma = None if focal is None or not np.isfinite(focal.relative_sigma) else focal.relative_sigma
     return {
         "focal_px": [mapper.camera.intrinsics.fx, mapper.camera.intrinsics.fy],
+        "principal_point_px": [mapper.camera.intrinsics.cx, mapper.camera.intrinsics.cy],
         "focal_estimated": focal is not None,
         "focal_relative_sigma": sigma,
     }

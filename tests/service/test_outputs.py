@@ -23,6 +23,7 @@ WRITERS: dict[tuple[str, str], list[str]] = {
     ("evaluate", "--json"): [MISSING, "--recording", MISSING],
     ("localise", "--out"): [MISSING, MISSING],
     ("localise", "--json"): [MISSING, MISSING],
+    ("merge", "--out"): [MISSING, MISSING],
     ("noise-report", "--json"): [MISSING],
     ("bench", "--json"): ["--stream", MISSING],
     ("bench", "--folder"): ["--stream", MISSING],
@@ -35,6 +36,7 @@ FOLDERS = {
     ("render", "--out"),
     ("simulate", "--out"),
     ("localise", "--out"),
+    ("merge", "--out"),
     ("bench", "--folder"),
 }
 READS = {
@@ -51,6 +53,8 @@ READS = {
     "stream",
     "token_file",
     "map_folder",
+    "first",
+    "second",
 }
 """Parameters that are paths to read."""
 OF_THE_SERVICE = {"data", "runtime", "config"}

@@ -1,33 +1,50 @@
-"""The output folder of `spiked reconstruct`, read back as a map."""
+"""Output folders of `spiked reconstruct` and `spiked merge`, read back as maps, and those of several recordings."""
 
-from dataclasses import dataclass
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import chain, count
 from pathlib import Path
 
-from pydantic import BaseModel
+import numpy as np
+from pydantic import BaseModel, Field
 
 from spiked.errors import SceneError
+from spiked.recon import KnownMap
+from spiked.render import Camera
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics
 from spiked.trajectory import Trajectory
 
+MAP_FILES = ("report.json", "scene.ply", "trajectory.tum")
+"""Files of a map."""
+PATHS = "paths"
+"""Folder with the path of each recording, in the folder of a map of several."""
+
 
 @dataclass(frozen=True)
 class MapFolder:
-    """A scene, the path through it, and the camera that made them."""
+    """A scene, the paths through it, and the camera that made them."""
 
     scene: Scene
     trajectory: Trajectory
+    """Of the recording that gave the frame of reference, or of the newest one."""
     width: int
     """Of the camera's images, in pixels."""
     height: int
     intrinsics: Intrinsics
+    paths: dict[str, Trajectory] = field(default_factory=dict)
+    """The path of each recording by its name; of one recording by the folder's."""
+    versions: dict[str, str] = field(default_factory=dict)
+    """Of the programs that made the map."""
 
     @classmethod
     def read(cls, folder: Path) -> "MapFolder":
-        """Read scene.ply, trajectory.tum and report.json. Raises SceneError."""
+        """Read scene.ply, trajectory.tum, the paths of several recordings, and report.json. Raises SceneError."""
         if not folder.is_dir():
             raise SceneError(f"the map {folder} is not a folder; name the output folder of `spiked reconstruct`")
-        for name in ("report.json", "scene.ply", "trajectory.tum"):
+        for name in MAP_FILES:
             if not (folder / name).is_file():
                 raise SceneError(f"{folder} has no {name}; name the output folder of `spiked reconstruct`")
         try:
@@ -37,17 +54,80 @@ class MapFolder:
         if report.outcome != "complete":
             raise SceneError(f"{folder} holds a reconstruction that has {report.outcome}: it is no map")
         sensor, (fx, fy) = report.sensor, report.focal_px
-        intrinsics = Intrinsics(fx, fy, sensor.width / 2, sensor.height / 2)
+        cx, cy = report.principal_point_px or (sensor.width / 2, sensor.height / 2)
         scene, path = Scene.read_ply(folder / "scene.ply"), Trajectory.read_tum(folder / "trajectory.tum")
-        return cls(scene, path, sensor.width, sensor.height, intrinsics)
+        paths = {one.name: Trajectory.read_tum(folder / PATHS / f"{one.name}.tum") for one in report.paths}
+        intrinsics = Intrinsics(fx, fy, cx, cy)
+        paths = paths or {file_name(folder.resolve().name): path}
+        return cls(scene, path, sensor.width, sensor.height, intrinsics, paths, report.versions)
+
+    @property
+    def known(self) -> KnownMap:
+        """The scene with all paths."""
+        return KnownMap.of(self.scene, list(self.paths.values()), self.camera)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the first recording."""
+        return Camera(self.intrinsics, self.width, self.height)
+
+
+def names_of_both(first: Sequence[str], second: Sequence[str]) -> list[str]:
+    """Names of the paths of two maps: those of the second get a number where the first has them too."""
+    names = [file_name(name) for name in first]
+    for wanted in map(file_name, second):
+        others = (f"{wanted}-{number}" for number in count(2))
+        names.append(next(name for name in chain([wanted], others) if name not in names))
+    return names
+
+
+def file_name(name: str) -> str:
+    """A name as that of a file: letters, digits, `_`, `.` and `-`, and none that is hidden."""
+    return re.sub(r"[^\w.-]", "_", name).lstrip(".")[:100] or "path"
+
+
+def write_map(
+    folder: Path, scene: Scene, trajectory: Trajectory, paths: Mapping[str, Trajectory], report: Mapping[str, object]
+) -> None:
+    """Write a map of several recordings; the report comes last, so that half a map is none. Raises OSError."""
+    (folder / PATHS).mkdir(parents=True, exist_ok=True)
+    (folder / "report.json").unlink(missing_ok=True)
+    scene.write_ply(folder / "scene.ply")
+    trajectory.write_tum(folder / "trajectory.tum")
+    for name, path in paths.items():
+        path.write_tum(folder / PATHS / f"{name}.tum")
+    listed = {"paths": [{"name": name, "poses": len(path)} for name, path in paths.items()]}
+    part = folder / "report.json.part"
+    part.write_text(json.dumps({**report, **listed}, indent=1), encoding="utf-8")
+    part.replace(folder / "report.json")
+
+
+def joint_paths(
+    first: Mapping[str, Trajectory], second: Mapping[str, Trajectory], moved: Trajectory
+) -> dict[str, Trajectory]:
+    """The paths of two maps in the first map's frame of reference, in which `moved` has those of the second."""
+    names = names_of_both(list(first), list(second))
+    begins = np.cumsum([0, *(len(path) for path in second.values())])
+    there = [
+        Trajectory(path.times_s, moved.rotations[begin : begin + len(path)], moved.centres[begin : begin + len(path)])
+        for path, begin in zip(second.values(), begins, strict=False)
+    ]
+    return dict(zip(names, [*first.values(), *there], strict=True))
 
 
 class _Sensor(BaseModel):
-    width: int
-    height: int
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+
+
+class _Path(BaseModel):
+    name: str = Field(pattern=r"^\w[\w.-]*$")
 
 
 class _Report(BaseModel):
     outcome: str
     sensor: _Sensor
     focal_px: tuple[float, float]
+    principal_point_px: tuple[float, float] | None = None
+    paths: list[_Path] = []
+    versions: dict[str, str] = {}

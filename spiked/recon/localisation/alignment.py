@@ -65,6 +65,18 @@ def fit(points: Array, pixels: Array, sought: int, start: Pose, intrinsics: Intr
 
 
 @dataclass(frozen=True)
+class Found:
+    """Points of a map that were found in an image."""
+
+    points: Array
+    """[n, 3]"""
+    pixels: Array
+    """[n, 2] px in the image."""
+    sought: int
+    """Number of points searched."""
+
+
+@dataclass(frozen=True)
 class Anchor:
     """A render and its corners, which are tracked into images taken near it."""
 
@@ -92,16 +104,18 @@ class Anchor:
         """Median motion of the corners from the render to a pose."""
         return median(np.linalg.norm(self.expected(pose)[0] - self.corners, axis=1)) if len(self.corners) else np.inf
 
-    def locate(self, levels: Pyramid, guess: Pose, few: int | None) -> Fit | None:
-        """The pose of an image from the corners found near where `guess` sees them.
-
-        `few` limits the pyramid's levels.
-        """
+    def find(self, levels: Pyramid, guess: Pose, few: int | None) -> Found:
+        """The corners found in an image near where `guess` sees them; `few` limits the pyramid's levels."""
         at, inside = self.expected(guess)
-        if inside.sum() < LEAST_POINTS:
-            return None
         found, good = follow(self.view.levels, levels, self.corners[inside], at[inside], REACH_PX, few)
-        return fit(self.points[inside][good], found[good], int(inside.sum()), guess, self.view.intrinsics)
+        return Found(self.points[inside][good], found[good], int(inside.sum()))
+
+    def locate(self, levels: Pyramid, guess: Pose, few: int | None) -> Fit | None:
+        """The pose of an image from the corners found near where `guess` sees them."""
+        if self.expected(guess)[1].sum() < LEAST_POINTS:
+            return None
+        found = self.find(levels, guess, few)
+        return fit(found.points, found.pixels, found.sought, guess, self.view.intrinsics)
 
 
 def align(renderer: MapRenderer, levels: Pyramid, start: Pose, rounds: int = ROUNDS) -> tuple[Fit, Anchor] | None:
@@ -119,7 +133,7 @@ def align(renderer: MapRenderer, levels: Pyramid, start: Pose, rounds: int = ROU
 
 def correlation(view: MapView, image: Picture) -> float:
     """Normalised cross-correlation of a render and an image [H, W] where the map has surfaces, of details only."""
-    a, b = (_details(one) for one in (view.picture, image))
+    a, b = (details(one) for one in (view.picture, image))
     mask = view.sound
     if mask.sum() < LEAST_POINTS:
         return 0.0
@@ -127,7 +141,8 @@ def correlation(view: MapView, image: Picture) -> float:
     return float((a * b).sum() / max(float(np.sqrt((a * a).sum() * (b * b).sum())), 1e-9))
 
 
-def _details(image: Picture) -> NDArray[np.float32]:
+def details(image: NDArray[np.generic]) -> NDArray[np.float32]:
+    """What is left of an image [H, W] without noise, and without light and shade."""
     values = image.astype(np.float32)
     fine, coarse = (cv2.GaussianBlur(values, (0, 0), sigma) for sigma in (BLUR_PX, BAND_PX))
     return np.asarray(fine - coarse, np.float32)

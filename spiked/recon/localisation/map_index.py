@@ -45,7 +45,13 @@ class Reference:
 class MapIndex:
     """Where a camera can be recognised in a map: its reference views and their features."""
 
-    def __init__(self, scene: Scene, trajectory: Trajectory, camera: Camera, threads: int | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        trajectory: Trajectory,
+        camera: Camera,
+        threads: int | None = None,
+    ) -> None:
         """Render references along `trajectory`, whose poses are in the frame of reference of `scene`, for `camera`.
 
         That is the camera that will be localised; it may differ from the one that made the map.
@@ -71,13 +77,7 @@ class MapIndex:
 
     def _places(self) -> list[Pose]:
         """Poses along the path, `STRIDE_PX` of image motion apart."""
-        path = self.trajectory
-        first = self.renderer.render(Pose(path.rotations[0], path.centres[0]))
-        seen = first.depth[first.sound]
-        depth = median(seen.astype(float)) if len(seen) else 1.0
-        turn = np.linalg.norm(log_so3(path.rotations[:-1].swapaxes(1, 2) @ path.rotations[1:]), axis=1)
-        move = np.linalg.norm(np.diff(path.centres, axis=0), axis=1)
-        travelled = np.r_[0, np.cumsum(self.camera.intrinsics.fx * (turn + move / depth))]
+        path, travelled = self.trajectory, travelled_px(self.renderer, self.trajectory)
         stride = STRIDE_PX * self.camera.width / NOMINAL_WIDTH_PX
         rows = np.unique(np.searchsorted(travelled, np.arange(0, travelled[-1] + 1e-9, stride)))
         return [Pose(path.rotations[row], path.centres[row]) for row in rows]
@@ -125,6 +125,16 @@ class MapIndex:
         best = np.maximum.reduceat(likeness, self._starts, axis=1)
         usual = np.partition(best, -min(10, best.shape[1]), axis=1)[:, -min(10, best.shape[1]), None]
         return np.asarray(np.maximum(best - usual, 0).sum(0), np.float64)
+
+
+def travelled_px(renderer: MapRenderer, path: Trajectory) -> Array:
+    """Image motion [n] from the begin of a path to each of its poses, at the median depth of its first view."""
+    first = renderer.render(Pose(path.rotations[0], path.centres[0]))
+    seen = first.depth[first.sound]
+    depth = median(seen.astype(float)) if len(seen) else 1.0
+    turn = np.linalg.norm(log_so3(path.rotations[:-1].swapaxes(1, 2) @ path.rotations[1:]), axis=1)
+    move = np.linalg.norm(np.diff(path.centres, axis=0), axis=1)
+    return np.asarray(np.r_[0, np.cumsum(renderer.camera.intrinsics.fx * (turn + move / depth))])
 
 
 def _grid(camera: Camera) -> Array:

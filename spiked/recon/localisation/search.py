@@ -70,14 +70,15 @@ def search(index: MapIndex, image: Picture, aligned: int = 3) -> Search:
         if any(same_place(one.anchor, pose) for one in out):
             continue
         tried.append(pose)
-        place = _candidate(index, image, levels, number, pose)
+        place = candidate_at(index, image, levels, number, pose)
         if place is not None and not any(same_place(one.anchor, place.fit.pose) for one in out):
             out.append(place)
     out.sort(key=lambda one: -one.score)
     return Search(out, len(features))
 
 
-def _candidate(index: MapIndex, image: Picture, levels: Pyramid, number: int, pose: Pose) -> Candidate | None:
+def candidate_at(index: MapIndex, image: Picture, levels: Pyramid, number: int, pose: Pose) -> Candidate | None:
+    """The place near a pose, found from reference `number`, that an image may show; None if it is lost on the way."""
     found = align(index.renderer, levels, pose)
     if found is None:
         return None

@@ -15,11 +15,13 @@ from spiked.recon.mapping.options import MapOptions
 from spiked.recon.mapping.photometric import Nuisances
 from spiked.recon.mapping.pyramid import Level, levels
 from spiked.recon.mapping.render_requests import RenderRequest
+from spiked.recon.mapping.replay import Replay
 from spiked.recon.mapping.seeding import SweptView, isotropic_splats
 from spiked.recon.statistics import WHITE_PERCENTILE
 from spiked.render import AnyRasteriser, Camera
 from spiked.render.charge import ChargeLoss
 from spiked.render.optimiser import Adam
+from spiked.render.splats import Gradients
 from spiked.scene import Scene
 from spiked.sensor import Image, Sensor
 
@@ -59,6 +61,7 @@ class Mapper:
         """The radiance (spikes a frame) that is shown as white: `WHITE_PERCENTILE` of the first seeded view."""
         self.depth = 1.0
         """Typical depth of the scene; the learning rate of the means is relative to it."""
+        self._threads = threads
         self.adam = Adam(self.scene.arrays(), *BETAS, threads=threads)
         self.nuisances = Nuisances(sensor.height, sensor.width)
         self.rate_loss = RateLoss(options.ssim, options.floor)
@@ -119,6 +122,11 @@ class Mapper:
         self.scene = self.scene.join(isotropic_splats(intrinsics, at, depth, colours, deviation_px, rotation, centre))
         self.adam.grow(len(at))
 
+    def adopt(self, scene: Scene) -> None:
+        """Go on with another scene."""
+        self.scene = scene
+        self.adam = Adam(scene.arrays(), *BETAS, threads=self._threads)
+
     def level(self, coarse: float) -> Level:
         """The pyramid level for a coarseness from 0 (full size) to 1 (smallest)."""
         return self.levels[int(np.ceil(coarse * (len(self.levels) - 1)))]
@@ -131,7 +139,16 @@ class Mapper:
             slope = self._compare_rates(key, view, request, level, background)
         else:
             slope = self._compare_charge(key, request, level, background)
-        gradients = level.rasteriser.backward(slope)
+        self._descend(level.rasteriser.backward(slope), decay)
+
+    def replay(self, replay: Replay, decay: float) -> None:
+        """One gradient step towards what another map shows."""
+        background = float(self._rng.uniform(0, self.options.background)) * self.white
+        image = replay.render(self.scene, background)
+        slope = self.rate_loss(image.values, replay.target(image.values), self.white)[1]
+        self._descend(replay.rasteriser.backward(slope), decay)
+
+    def _descend(self, gradients: Gradients, decay: float) -> None:
         self.steps += 1
         o = self.options
         others = (o.rate_quats, o.rate_scales, o.rate_opacities, o.rate_colours * self.white)
@@ -188,7 +205,7 @@ class Mapper:
 
     def densify(self, key: int, view: View, request: RenderRequest) -> None:
         """Add splats at the largest errors of a view, as `options.densification` says."""
-        strategy, middle = self.options.densification, len(request.centres) // 2
+        middle = len(request.centres) // 2
         rotation, centre = request.rotations[middle], request.centres[middle]
         if request.warp is None:
             level = self.levels[0]
@@ -200,6 +217,18 @@ class Mapper:
             image = self.rasteriser.forward(self.scene, rotation[None], centre[None])
             size = (self.camera.width, self.camera.height)
             error = cv2.resize(self._charge_error, size, interpolation=cv2.INTER_LINEAR)
+        seen = fill_mosaic(view.rate, self.channels) if request.warp is None else image.values
+        self._replace(error, seen, image.depth, rotation, centre)
+
+    def densify_replay(self, replay: Replay) -> None:
+        """Add splats where the map differs most from what another map shows."""
+        shown = replay.render(self.scene).values
+        error = replay.target(shown).values - shown
+        self._replace(error, replay.values, replay.depth, replay.rotation, replay.centre)
+
+    def _replace(self, error: Image, seen: Image, depth: Image, rotation: Array, centre: Array) -> None:
+        """Remove dead splats and add others where `error` is large, of the colours and depths of images [H, W]."""
+        strategy = self.options.densification
         dead = strategy.dead(self.scene)
         if dead.any():
             self.scene = self.scene.select(~dead)
@@ -208,10 +237,8 @@ class Mapper:
         if chosen is None:
             return
         v, u = chosen
-        depth = np.where(image.depth > 0, image.depth, 1.0)[v, u]
-        seen = fill_mosaic(view.rate, self.channels) if request.warp is None else image.values
-        colours = seen.reshape(*seen.shape[:2], self.colours)[v, u]
-        self._add(chosen, depth, colours, 1.0, rotation, centre)
+        colours = seen.reshape(*seen.shape[:2], -1)[v, u]
+        self._add(chosen, np.where(depth > 0, depth, 1.0)[v, u], colours, 1.0, rotation, centre)
 
     def render(self, rotation: Array, centre: Array) -> Image:
         """Render the map from a pose: radiance [H, W, C]."""

@@ -65,7 +65,7 @@ def localise(
         report_warning(warning)
     end = _end(recording, start, frames)
     sensor = g.with_optics(recording.sensor, fov, intrinsics)
-    index = MapIndex(known.scene, known.trajectory, Camera(_optics(sensor, known), sensor.width, sensor.height))
+    index = MapIndex(known.scene, known.known.trajectory, Camera(_optics(sensor, known), sensor.width, sensor.height))
     localiser = Localiser(index, sensor)
     for first_frame, part in track(
         list(_parts(recording, start, end)), "localising", console=messages, transient=True,

@@ -2,17 +2,15 @@
 
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import ThreadpoolController
 
 from spiked.errors import ConfigurationError
 from spiked.pose import Array
 from spiked.recon import report
+from spiked.recon.blas import one_blas_thread
 from spiked.recon.frontend.feature_tracks import Picture, picture, white_of
 from spiked.recon.frontend.mosaic_check import mosaic_warning
 from spiked.recon.frontend.recorded_views import RecordedFrames, RecordedViews
@@ -99,17 +97,14 @@ class Reconstructor:
         self._log = WorkLog()
         self.tracking_ended = False
         """All frames are tracked, and the path is final up to its alignment with the map."""
-        # The matrices are small: on busy cores several BLAS threads track three times slower than one.
-        self._blas = ThreadpoolController()
 
     def __getstate__(self) -> dict[str, object]:
         """For a checkpoint: without what is made anew."""
-        return {name: value for name, value in vars(self).items() if name not in ("_blas", "_preview")}
+        return {name: value for name, value in vars(self).items() if name != "_preview"}
 
     def __setstate__(self, state: dict[str, object]) -> None:
         vars(self).update(state)
         self._preview = np.empty((self.sensor.height, self.sensor.width), np.float32)
-        self._blas = ThreadpoolController()
         self.odometry.keyframe_images.builder = _Pictures(self)
 
     @property
@@ -149,13 +144,10 @@ class Reconstructor:
 
     def feed(self, first_frame: int, frames: NDArray[np.uint8]) -> None:
         """Add stored frames uint8 [n, frame_bytes] that begin at absolute index `first_frame`."""
-        with self._log.measure("tracking"), self._one_blas_thread():
+        with self._log.measure("tracking"), one_blas_thread():
             for view in self._windows.feed(first_frame, frames):
                 self._track(view)
             self._frames = first_frame + len(frames)
-
-    def _one_blas_thread(self) -> AbstractContextManager[object]:
-        return cast(AbstractContextManager[object], self._blas.limit(limits=1, user_api="blas"))
 
     @property
     def latest_frames(self) -> int:
@@ -174,7 +166,7 @@ class Reconstructor:
 
         For tracking that cannot keep up with the camera. Over up to `BRIDGED_S` the path is interpolated.
         """
-        with self._log.measure("tracking"), self._one_blas_thread():
+        with self._log.measure("tracking"), one_blas_thread():
             self.odometry.skip()
             self._track(self._windows.latest_view(first_frame, frames), skipped=True)
             self._frames = first_frame + len(frames)
@@ -283,7 +275,7 @@ class Reconstructor:
         progress(self.status())
 
     def _end_tracking(self, stop: Callable[[], bool]) -> None:
-        with self._one_blas_thread():
+        with one_blas_thread():
             for view in self._windows.flush():
                 self._track(view)
             if self._given is None:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from spiked.errors import ConfigurationError, RecordingError, SceneError
 from spiked.pose import log_so3
 from spiked.recon import Localisation, Localiser, MapIndex
-from spiked.recon.localisation.features import Features, match
+from spiked.recon.frontend.features import Features, match
 from spiked.recon.localisation.recognition import LEAST_CORRELATION, LEAST_INLIERS, LEAST_SHARE
 from spiked.render import Camera
 from spiked.scene import Scene

@@ -1,16 +1,14 @@
 """Where the camera of a recording was in a known map: searched for, followed, and searched for again."""
 
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import ThreadpoolController
 
 from spiked.calibration import Calibration
 from spiked.errors import ConfigurationError, RecordingError
 from spiked.pose import exp_so3, log_so3
+from spiked.recon.blas import one_blas_thread
 from spiked.recon.frontend.feature_tracks import LEVELS, Picture, Pyramid, Tracks, picture, pyramid, white_of
 from spiked.recon.frontend.windowing import WINDOWS, View, Windows, luminance
 from spiked.recon.localisation.alignment import NEAR_LEVELS, Anchor, Fit, align, correlation
@@ -102,17 +100,16 @@ class Localiser:
         self._wait_s, self._next_search = 0.5 * SEARCH_EVERY_S[0], 0.0
         self._searched = -np.inf
         self._last: tuple[View, Picture] | None = None
-        self._blas = ThreadpoolController()
 
     def feed(self, first_frame: int, frames: NDArray[np.uint8]) -> None:
         """Add stored frames uint8 [n, frame_bytes] that begin at absolute index `first_frame`."""
-        with self._one_blas_thread():
+        with one_blas_thread():
             for view in self._windows.feed(first_frame, frames):
                 self._add(view)
 
     def finish(self) -> Localisation:
         """The result. Raises RecordingError for a recording that is too short, too dark or without texture."""
-        with self._one_blas_thread():
+        with one_blas_thread():
             for view in self._windows.flush():
                 self._add(view)
             if self._last is not None and not self._recognition.decided:
@@ -128,10 +125,6 @@ class Localiser:
         return Localisation(
             found.decided, found.reason(), views, found.searches, found.agreeing, len(self.index), inliers
         )
-
-    def _one_blas_thread(self) -> AbstractContextManager[object]:
-        # The matrices are small: on busy cores several BLAS threads are slower than one.
-        return cast(AbstractContextManager[object], self._blas.limit(limits=1, user_api="blas"))
 
     def _add(self, view: View) -> None:
         grey = luminance(view.rate, self.sensor.mosaic) if view.sharp is None else view.sharp

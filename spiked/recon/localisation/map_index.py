@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spiked.errors import SceneError
 from spiked.pose import Array, log_so3
-from spiked.recon.localisation.features import Features, find_features
+from spiked.recon.frontend.features import Features, find_features
+from spiked.recon.frontend.retrieval import Retrieval
 from spiked.recon.localisation.map_views import MapRenderer, MapView
 from spiked.recon.odometry.sparse_map import Pose
 from spiked.recon.statistics import median
@@ -28,8 +28,6 @@ LEAST_FEATURES = 30
 """Features that a reference needs: with fewer it can never be recognised."""
 GRID = (6, 4)
 """Columns and rows of the pixels by which the shift between two views is measured."""
-REDUCED = 32
-"""Length of the descriptors that references are retrieved by: principal components of those of the map."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ class MapIndex:
                 self._add(self.renderer.render(pose))
         if not self.references:
             raise SceneError("nothing in the map can be recognised: its renders have no texture")
-        self._reduce()
+        self._retrieval = Retrieval([one.features for one in self.references])
 
     def __len__(self) -> int:
         return len(self.references)
@@ -105,26 +103,9 @@ class MapIndex:
         self._grids.append(np.where(sound[:, None], points, plain))
         self.references.append(Reference(view.pose, features.select(good), places[good]))
 
-    def _reduce(self) -> None:
-        """Short descriptors of all features, for the retrieval."""
-        pool = np.concatenate([one.features.descriptors for one in self.references])
-        self._mean = pool.mean(0)
-        _, axes = np.linalg.eigh(np.cov((pool - self._mean).T))
-        self._axes = np.ascontiguousarray(axes[:, -REDUCED:], np.float32)
-        self._pool = self._short(pool)
-        sizes = [len(one.points) for one in self.references]
-        self._starts = np.r_[0, np.cumsum(sizes)[:-1]]
-
-    def _short(self, descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-        short = (descriptors - self._mean) @ self._axes
-        return np.asarray(short / np.maximum(np.linalg.norm(short, axis=1, keepdims=True), 1e-9), np.float32)
-
     def votes(self, features: Features) -> Array:
         """How much the features of a query speak for each reference, [R]."""
-        likeness = self._short(features.descriptors) @ self._pool.T
-        best = np.maximum.reduceat(likeness, self._starts, axis=1)
-        usual = np.partition(best, -min(10, best.shape[1]), axis=1)[:, -min(10, best.shape[1]), None]
-        return np.asarray(np.maximum(best - usual, 0).sum(0), np.float64)
+        return self._retrieval.votes(features)
 
 
 def travelled_px(renderer: MapRenderer, path: Trajectory) -> Array:

@@ -2,14 +2,14 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from spiked.pose import Array
 from spiked.recon.frontend.feature_tracks import LEVELS, Picture, Pyramid, pyramid
+from spiked.recon.frontend.features import Features, find_features, match
 from spiked.recon.localisation.alignment import Anchor, Fit, align, correlation
-from spiked.recon.localisation.features import Features, find_features, match
 from spiked.recon.localisation.map_index import MapIndex
+from spiked.recon.odometry.pnp import draw_pose
 from spiked.recon.odometry.sparse_map import Pose
 
 QUERY_FEATURES = 500
@@ -20,10 +20,6 @@ OTHER_PLACE_PX = 150.0
 """Image shift from one place to another, in px."""
 LEAST_MATCHES = 10
 """Matches with a reference from which a pose is drawn."""
-DRAWN_PX, DRAWS = 4.0, 200
-"""Largest residual of a match that agrees with a drawn pose, and poses drawn."""
-LEAST_DRAWN = 8
-"""Matches that agree with a drawn pose."""
 SAME_PX = 8.0
 """Two poses are the same if they shift the image by less."""
 
@@ -111,13 +107,4 @@ def _draw(index: MapIndex, features: Features, number: int) -> tuple[Pose, int] 
     rows, columns = match(features, reference.features)
     if len(rows) < LEAST_MATCHES:
         return None
-    points, pixels = reference.points[columns], features.pixels[rows]
-    good, turn, shift, inliers = cv2.solvePnPRansac(
-        points, pixels, index.camera.intrinsics.matrix(), None,
-        iterationsCount=DRAWS, reprojectionError=DRAWN_PX, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
-    )  # fmt: skip
-    if not good or inliers is None or len(inliers) < LEAST_DRAWN:
-        return None
-    rotation = cv2.Rodrigues(turn)[0].T
-    centre = -rotation @ shift[:, 0]
-    return (Pose(rotation, centre), len(inliers)) if np.isfinite(centre).all() else None
+    return draw_pose(reference.points[columns], features.pixels[rows], index.camera.intrinsics)

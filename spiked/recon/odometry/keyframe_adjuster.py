@@ -1,21 +1,25 @@
-"""Adjustment of long paths: bundle adjustment of keyframes, in a window while tracking and of all of them at the end.
+"""Adjustment of long paths: bundle adjustment of keyframes, in a window while tracking, and of all of them after loops
+and at the end.
 
-The cost of one adjustment while tracking is bounded; the last one grows with the number of keyframes. The path is
-interpolated between the views, see `SparseMap.waypoints`.
+The cost of an adjustment in the window is bounded. Those of all keyframes grow with their number: while tracking they
+run on another thread. The path is interpolated between the views, see `SparseMap.waypoints`.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spiked.pose import Array
 from spiked.recon.frontend.feature_tracks import Picture
 from spiked.recon.odometry import banded_bundle
+from spiked.recon.odometry.background import Background
 from spiked.recon.odometry.initialisation import SCALE_PX
-from spiked.recon.odometry.loop_closure import find_closures, spread_drift
+from spiked.recon.odometry.loop_closure import LoopClosure, LoopSearch, find_closures, spread_drift
 from spiked.recon.odometry.pnp import fit_pose
 from spiked.recon.odometry.sparse_map import MapBundle, Pose, SparseMap, TrackedView
+from spiked.sensor import LEAST_DEPTH
 from spiked.spline import Spline
 
 LONG_FRAMES, LONG_VIEWS = 12_000, 1000
@@ -34,12 +38,23 @@ REFERENCE_KEYFRAMES = 60
 REFITTED_VIEWS = 48
 """Newest views that are fitted again after an adjustment while tracking; those before move with their keyframe."""
 LOOP_ROUNDS = 4
-"""Searches for loops, at most: each closes the first loop of the path that is open (decision 15)."""
+"""Searches for loops at the end, at most: each closes the first loop of the path that is open (decision 15)."""
+SPREAD_PX = 2.0
+"""Correction by a closure, as image motion, from which on it is spread over the loop; smaller ones are left to the
+adjustments."""
+WHOLE_GROWTH = 1.5
+"""Growth of the number of keyframes from one adjustment of all of them while tracking to the next: their cost over a
+recording stays in proportion to its length."""
+TAKEN_AFTER = 8
+"""New keyframes, as a share of one over this number of all, after which the result is taken: it must not depend on the
+time that an adjustment takes, and tracking should not have to wait."""
 FINAL_SCALE_PX = 0.1
 """Scale of the Cauchy loss in the adjustment of all keyframes: tracks across a whole image are off by up to 0.3 px
 where their surroundings lie at several depths (decision 15)."""
 WINDOW_ITERATIONS, LOOP_ITERATIONS, FINAL_ITERATIONS = 4, 4, 12
 """Most iterations of an adjustment in the window, after a loop and at the end."""
+MOST_LOG_SCALE = 0.3
+"""Largest change of a point's depth, as a logarithm, that counts where the change of scale is measured."""
 TOLERANCE = 1e-3
 """Relative gain of an iteration below which an adjustment ends."""
 
@@ -51,6 +66,7 @@ class KeyframeAdjuster:
     map: SparseMap
     pictures: Mapping[int, Picture]
     """Images by view id of the views among which loops are searched: the keyframes of the `Relocaliser`."""
+    loops: LoopSearch
     keyframes: list[TrackedView] = field(default_factory=list)
     interpolated: bool = True
     """There is no spline: the path is interpolated between views."""
@@ -64,6 +80,14 @@ class KeyframeAdjuster:
     """First view that has not been considered as a keyframe."""
     _adjusted: int = 0
     """Number of keyframes at the last adjustment."""
+    _linked: dict[int, LoopClosure] = field(default_factory=dict)
+    """Closures by id of the later view."""
+    _whole: Background[MapBundle] | None = None
+    """Adjustment of all keyframes that runs."""
+    _whole_due: float = 0.0
+    """Number of keyframes at which its result is taken; without one, from which the next may begin."""
+    _open: bool = False
+    """Loops were closed since the last adjustment of all keyframes."""
 
     @property
     def reference_views(self) -> list[TrackedView]:
@@ -87,34 +111,94 @@ class KeyframeAdjuster:
         """Adjust the newest keyframes and their points; the views after them follow."""
         del final
         self._adjusted = len(self.keyframes)
-        keyframes = [view for view in self.keyframes[-WINDOW_KEYFRAMES - FIXED_KEYFRAMES :] if view.pose is not None]
-        if len(keyframes) <= FIXED_KEYFRAMES + 2 or (made := self.map.bundle(keyframes)) is None:
+        self._take_whole()
+        recent = [view for view in self.keyframes[-WINDOW_KEYFRAMES - FIXED_KEYFRAMES :] if view.pose is not None]
+        if len(recent) <= FIXED_KEYFRAMES + 2:
             return
-        fixed = np.arange(len(keyframes)) < FIXED_KEYFRAMES
+        first, first_free = recent[0].id, recent[FIXED_KEYFRAMES].id
+        chosen = {view.id: view for view in recent}
+        for closure in self._linked.values():
+            if closure.later.id >= first:
+                chosen |= {closure.earlier.id: closure.earlier, closure.later.id: closure.later}
+        if (made := self.map.bundle(_in_order(chosen))) is None:
+            return
+        fixed = np.array([view.id < first_free for view in made.views])
         made.bundle.optimise(WINDOW_ITERATIONS, SCALE_PX, fixed, TOLERANCE)
-        self._take(made, self.map.views[keyframes[0].id :], len(self.map.views) - REFITTED_VIEWS)
+        self._take(made, self.map.views[first:], len(self.map.views) - REFITTED_VIEWS)
+        self._adjust_whole_if_due()
+
+    def close_loops(self, view: TrackedView) -> list[LoopClosure]:
+        """Search the newest view, whose image is kept, for places seen before, and close the loops that are certain."""
+        closures = self.loops.search(view)
+        if not closures:
+            return []
+        self._link(closures)
+        self._open = True
+        if max(closure.correction_px(self.map.intrinsics) for closure in closures) > SPREAD_PX:
+            self._take_whole(now=True)
+            spread_drift(self.map, closures)
+            self.loops.closed()
+        self.adjust()
+        return closures
+
+    def _link(self, closures: list[LoopClosure]) -> None:
+        for closure in closures:
+            closure.add_tracks()
+            self._linked[closure.later.id] = closure
+            self.closures.append((closure.earlier.time, closure.later.time))
+
+    def _adjust_whole_if_due(self) -> None:
+        """Begin to adjust all keyframes if loops were closed, and the path has grown enough since the last time."""
+        if not self._open or self._whole is not None or len(self.keyframes) < self._whole_due:
+            return
+        if (made := self.map.bundle(self._all_chosen())) is None:
+            return
+        found = made  # for the function: not None
+        first = np.arange(len(made.views)) < 1
+
+        def work(stop: Callable[[], bool]) -> MapBundle:
+            banded_bundle.optimise(found.bundle, LOOP_ITERATIONS, FINAL_SCALE_PX, first, TOLERANCE, stop)
+            return found
+
+        self._open, self._whole = False, Background(work)
+        self._whole_due = len(self.keyframes) * (1 + 1 / TAKEN_AFTER)
+
+    def _take_whole(self, now: bool = False) -> None:
+        """Take the result of the adjustment of all keyframes if it is due, or `now`."""
+        if self._whole is None or (len(self.keyframes) < self._whole_due and not now):
+            return
+        made, self._whole = self._whole.result(), None
+        self._whole_due = WHOLE_GROWTH * len(self.keyframes)
+        self._take(made, self.map.views)
+
+    def _all_chosen(self) -> list[TrackedView]:
+        """All keyframes and the views of closed loops."""
+        chosen = {view.id: view for view in self.keyframes if view.pose is not None}
+        for closure in self._linked.values():
+            chosen |= {closure.earlier.id: closure.earlier, closure.later.id: closure.later}
+        return _in_order(chosen)
 
     def finish(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Close loops and adjust all keyframes; every view follows. See `PathAdjuster.finish` about `stop`."""
         self._choose()
-        chosen = {view.id: view for view in self.keyframes if view.pose is not None}
-        for _ in range(LOOP_ROUNDS):
+        if self._whole is not None and stop():
+            self._whole.stop()
+        self._take_whole(now=True)
+        for turn in range(LOOP_ROUNDS):
             if stop():
                 return
-            closures = spread_drift(self.map, find_closures(self.map, self.pictures))
-            if not closures:
+            found = find_closures(self.map, self.pictures, self.loops.index)
+            closures = spread_drift(self.map, found)
+            if not closures and not (turn == 0 and self._open):
                 break
-            for closure in closures:
-                closure.add_tracks()
-                chosen |= {closure.earlier.id: closure.earlier, closure.later.id: closure.later}
-            self.closures += [(closure.earlier.time, closure.later.time) for closure in closures]
-            self._adjust_all(chosen, LOOP_ITERATIONS, stop)
-        self._adjust_all(chosen, FINAL_ITERATIONS, stop)
+            self._link(closures)
+            self._adjust_all(LOOP_ITERATIONS, stop)
+        self._adjust_all(FINAL_ITERATIONS, stop)
         self.map.triangulate(self.keyframes)
 
-    def _adjust_all(self, chosen: dict[int, TrackedView], iterations: int, stop: Callable[[], bool]) -> None:
-        """Adjust these views, by id, and their points; all others follow."""
-        keyframes = [chosen[number] for number in sorted(chosen)]
+    def _adjust_all(self, iterations: int, stop: Callable[[], bool]) -> None:
+        """Adjust all keyframes and their points; all other views follow."""
+        keyframes = self._all_chosen()
         if len(keyframes) <= 2 or (made := self.map.bundle(keyframes)) is None:
             return
         made.bundle.focal_free = self.map.focal is not None
@@ -143,28 +227,81 @@ class KeyframeAdjuster:
         self._next_view = len(self.map.views)
 
     def _take(self, made: MapBundle, followers: list[TrackedView], refit_from: int = 0) -> None:
-        """Take over adjusted keyframes and points; `followers` move with them, see `_follow`."""
-        before = [view.pose for view in made.views]
+        """Take over adjusted keyframes and points.
+
+        `followers` and the other points in them move with the keyframe before them; those views are fitted to the
+        points again from id `refit_from` on.
+        """
+        motion = _Motion.of(made, self.map)
         self.map.noise_px = made.bundle.noise_px()
         self.map.apply(made)
-        self._follow(made, before, followers, refit_from)
-
-    def _follow(
-        self, made: MapBundle, before: list[Pose | None], followers: list[TrackedView], refit_from: int
-    ) -> None:
-        """Move other views with the keyframe before them, and fit those from id `refit_from` on to the points."""
-        key_ids = np.array([view.id for view in made.views])
-        moved = set(key_ids.tolist())
+        row_of = np.full(len(self.map.points), -1)
         for view in followers:
-            if view.pose is None or view.id in moved:
+            row_of[view.ids] = motion.row(view.id)
+        row_of[made.ids] = -1
+        moved = np.flatnonzero((row_of >= 0) & np.isfinite(self.map.points[:, 0]))
+        self.map.points[moved] = motion.points(row_of[moved], self.map.points[moved])
+        adjusted = {view.id for view in made.views}
+        for view in followers:
+            if view.pose is None or view.id in adjusted:
                 continue
-            at = max(int(np.searchsorted(key_ids, view.id)) - 1, 0)
-            old, new = before[at], made.views[at].pose
-            assert old is not None and new is not None
-            turn = new.rotation @ old.rotation.T
-            start = Pose(turn @ view.pose.rotation, new.centre + turn @ (view.pose.centre - old.centre))
-            view.pose = start
+            view.pose = motion.pose(motion.row(view.id), view.pose)
             if view.id >= refit_from:
-                fit = fit_pose(self.map, view, start)
+                fit = fit_pose(self.map, view, view.pose)
                 if fit.lost_reason() is None:
                     fit.store(view)
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """How the neighbourhood of each of C keyframes moves in an adjustment."""
+
+    ids: NDArray[np.int64]
+    """[C] of the keyframes, ascending."""
+    turns: Array
+    """[C, 3, 3]"""
+    scales: Array
+    """[C]"""
+    before: Array
+    """[C, 3] centres."""
+    after: Array
+    """[C, 3] centres."""
+
+    @classmethod
+    def of(cls, made: MapBundle, sparse_map: SparseMap) -> "_Motion":
+        """From a map to what a bundle of it has become."""
+        b = made.bundle
+        rotations, before = (np.stack(part) for part in zip(*(v.pose for v in made.views if v.pose), strict=True))
+        depths = [
+            np.einsum("mi,mi->m", (points[b.point] - centres[b.camera]), turns[b.camera][:, :, 2])
+            for points, centres, turns in (
+                (sparse_map.points[made.ids], before, rotations),
+                (b.points, b.centres, b.rotations),
+            )
+        ]
+        good = (depths[0] > LEAST_DEPTH) & (depths[1] > LEAST_DEPTH)
+        ratio = np.log(depths[1][good] / depths[0][good]).clip(-MOST_LOG_SCALE, MOST_LOG_SCALE)
+        count = len(before)
+        seen = np.maximum(np.bincount(b.camera[good], minlength=count), 1)
+        scales = np.exp(np.bincount(b.camera[good], ratio, count) / seen)
+        ids = np.array([view.id for view in made.views])
+        return cls(ids, b.rotations @ rotations.swapaxes(1, 2), scales, before, b.centres)
+
+    def row(self, number: int) -> int:
+        """The keyframe that a view moves with: the one before it."""
+        return max(int(np.searchsorted(self.ids, number, side="right")) - 1, 0)
+
+    def points(self, rows: NDArray[np.int64], points: Array) -> Array:
+        """Points [n, 3] moved with their keyframes [n]."""
+        turned = np.einsum("nij,nj->ni", self.turns[rows], points - self.before[rows])
+        return np.asarray(self.after[rows] + self.scales[rows, None] * turned)
+
+    def pose(self, row: int, pose: Pose) -> Pose:
+        """A pose moved with a keyframe."""
+        turn = self.turns[row]
+        return Pose(turn @ pose.rotation, self.after[row] + self.scales[row] * turn @ (pose.centre - self.before[row]))
+
+
+def _in_order(views: dict[int, TrackedView]) -> list[TrackedView]:
+    """Views with a pose, in order of their ids."""
+    return [views[number] for number in sorted(views) if views[number].pose is not None]

@@ -1,16 +1,20 @@
 """Loop closure: views that see points of much earlier views again, and the correction of the path between them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spiked.pose import Array, exp_so3, log_so3, mean_rotation
 from spiked.recon.frontend.feature_tracks import Picture, flow
+from spiked.recon.frontend.features import Features
 from spiked.recon.odometry.initialisation import INLIER_PX
+from spiked.recon.odometry.place_index import PLACE_PX, PlaceIndex, place_features, shifts_px
 from spiked.recon.odometry.pnp import fit_pose
 from spiked.recon.odometry.sparse_map import Pose, SparseMap, TrackedView
+from spiked.recon.statistics import median
+from spiked.sensor import LEAST_DEPTH, Intrinsics
 
 LEAST_APART_PX = 300.0
 """Image motion between two views of a loop, at least: nearer ones share tracks (decision 15)."""
@@ -21,12 +25,23 @@ LOOP_SPAN_PX = 500.0
 """Image motion over which the closures of one loop may lie: their drift is taken as one."""
 MOST_SHARED = 15
 """Tracks that two views of a loop share, at most (decision 15)."""
+COMPARED = 16
+"""Nearest earlier views of which the one is taken that most points are seen of again."""
 LEAST_INSIDE = 0.4
-"""Share of the points of the earlier view that project into the later one by the path so far."""
+"""Share of the points of the earlier view that project into the later one."""
 LEAST_MATCHES = 30
 """Points that are found again, and agree with one pose (decision 15)."""
 LEAST_AGREEING = 0.7
 """Share of the points found that agree with one pose (decision 15)."""
+AGREEING_VIEWS = 3
+"""Views in a row that have to find the same loop before it is closed."""
+AGREEING_PX, RUN_PX = 12.0, 60.0
+"""Largest difference of their corrections, as image motion, and largest image motion from one to the next."""
+MOST_DRIFT = 0.2
+"""Largest correction of a view, as image motion, over the image motion of the loop: two equal walls of a room are
+farther apart."""
+RIVAL = 0.6
+"""Points of another place that agree, over those of the best one, from which on the two cannot be told apart."""
 COARSE_LEVELS, FINE_LEVELS = 4, 2
 """Pyramid levels of the search around the projections, and around their common shift."""
 LOOP_REACH_PX = 0.6
@@ -58,6 +73,15 @@ class LoopClosure:
     pose: Pose
     """Of the later view, by the points of the earlier one."""
 
+    share: float
+    """Of the points found again, those that agree with the pose."""
+    depth: float
+    """Median depth of the points."""
+
+    def correction_px(self, intrinsics: Intrinsics) -> float:
+        """How far the closure moves the image of the later view."""
+        return shift_px(intrinsics, self.before, self.pose, self.depth)
+
     def add_tracks(self) -> None:
         """Let the later view observe the points of the earlier one."""
         new = ~np.isin(self.ids, self.later.ids)
@@ -65,29 +89,132 @@ class LoopClosure:
         self.later.pixels = np.concatenate([self.later.pixels, self.pixels[new]])
 
 
-def find_closures(sparse_map: SparseMap, pictures: Mapping[int, Picture]) -> list[LoopClosure]:
-    """Loops among the views whose images are in `pictures` (by view id), one for each later view."""
-    travelled_px = _travelled_px(sparse_map)
-    numbers = _spaced([n for n in sorted(pictures) if sparse_map.views[n].pose is not None], travelled_px)
-    views = [sparse_map.views[n] for n in numbers]
-    axes = np.stack([view.rotation[:, 2] for view in views if view.rotation is not None]) if views else np.zeros((0, 3))
-    known = [sparse_map.known_tracks(view)[0] for view in views]
-    found = []
-    for view, axis in zip(views, axes, strict=True):
+@dataclass
+class LoopSearch:
+    """Searches each kept view for places seen before, and believes them when several views in a row agree."""
+
+    map: SparseMap
+    pictures: Mapping[int, Picture]
+    """Images of the kept views by id."""
+    index: PlaceIndex
+    _searched_px: float = -np.inf
+    """Image motion up to the newest view that was searched, and up to the newest place with features."""
+    _place_px: float = -np.inf
+    _run: list[LoopClosure] = field(default_factory=list)
+    """Closures of views in a row that agree."""
+
+    @classmethod
+    def of(cls, sparse_map: SparseMap, pictures: Mapping[int, Picture]) -> "LoopSearch":
+        """On the kept views so far, among which there are no loops."""
+        made = cls(sparse_map, pictures, PlaceIndex(sparse_map))
+        for number in sorted(pictures):
+            made._add(sparse_map.views[number])
+        return made
+
+    def search(self, view: TrackedView) -> list[LoopClosure]:
+        """Closures to be applied: of a new kept view, and of those just before it that it confirms."""
+        travelled_px = self.index.travelled_px(view.id)
+        if self._run and travelled_px - self.index.travelled_px(self._run[-1].later.id) > RUN_PX:
+            self._run = []
+        undecided = 0 < len(self._run) < AGREEING_VIEWS
+        if view.pose is None or (not undecided and travelled_px - self._searched_px < EVERY_PX):
+            return []
+        found = find_by_path(self.map, self.pictures, self.index, view, self._expected(view))
+        if (features := self._add(view)) is not None and found is None:
+            found = self._find_by_features(view, features)
+        return [] if found is None else self._confirmed(found)
+
+    def closed(self) -> None:
+        """The path was corrected by the newest closures."""
+        self._run = [replace(one, before=one.pose) for one in self._run]
+
+    def _expected(self, view: TrackedView) -> Pose:
+        """Where a view should be, by the path, and by the undecided closures before it."""
         assert view.pose is not None
-        far = travelled_px[numbers] < travelled_px[view.id] - LEAST_APART_PX
-        best, most = None, LEAST_INSIDE
-        for row in np.flatnonzero(far & (axes @ axis > LEAST_COS)).tolist():
-            ids = known[row]
-            if len(ids) < LEAST_MATCHES or np.isin(ids, view.ids).sum() > MOST_SHARED:
-                continue
-            share = float(sparse_map.project_into(ids, view.pose, pictures[view.id].shape)[0].mean())
-            if share > most:
-                best, most = views[row], share
-        closure = None if best is None else _match(sparse_map, best, view, pictures)
-        if closure is not None:
-            found.append(closure)
-    return found
+        return view.pose.carried(self._run[-1].before, self._run[-1].pose) if self._run else view.pose
+
+    def _add(self, view: TrackedView) -> Features | None:
+        """Add a view to the index; its features, if its place is kept with them."""
+        travelled_px = self.index.travelled_px(view.id)
+        if travelled_px - self._searched_px < EVERY_PX:
+            return None
+        self._searched_px = travelled_px
+        self.index.add(view)
+        if travelled_px - self._place_px < PLACE_PX:
+            return None
+        self._place_px = travelled_px
+        features = place_features(self.pictures[view.id])
+        self.index.add_features(view, features)
+        return features
+
+    def _find_by_features(self, view: TrackedView, features: Features) -> LoopClosure | None:
+        """The loop of a view with a place that looks alike, wherever the path says that it is."""
+        assert view.pose is not None
+        before_px = self.index.travelled_px(view.id) - LEAST_APART_PX
+        found: list[LoopClosure] = []
+        for pose, _ in self.index.drawn_poses(features, before_px):
+            one = find_by_path(self.map, self.pictures, self.index, view, pose)
+            if one is not None and self._plausible(one):
+                found.append(one)
+        if not found:
+            return None
+        best = max(found, key=lambda one: len(one.ids))
+        for one in found:
+            elsewhere = shift_px(self.map.intrinsics, best.pose, one.pose, best.depth) > AGREEING_PX
+            if elsewhere and len(one.ids) > RIVAL * len(best.ids):
+                return None
+        return best
+
+    def _plausible(self, closure: LoopClosure) -> bool:
+        way_px = self.index.travelled_px(closure.later.id) - self.index.travelled_px(closure.earlier.id)
+        return closure.correction_px(self.map.intrinsics) < MOST_DRIFT * way_px
+
+    def _confirmed(self, found: LoopClosure) -> list[LoopClosure]:
+        """The closures to be applied after another one was found."""
+        if not self._plausible(found):
+            return []
+        expected = self._expected(found.later)
+        if self._run and shift_px(self.map.intrinsics, expected, found.pose, found.depth) > AGREEING_PX:
+            self._run = []
+        self._run.append(found)
+        if len(self._run) < AGREEING_VIEWS:
+            return []
+        new = self._run if len(self._run) == AGREEING_VIEWS else self._run[-1:]
+        self._run = self._run[-AGREEING_VIEWS - 1 :]
+        return list(new)
+
+
+def find_closures(sparse_map: SparseMap, pictures: Mapping[int, Picture], index: PlaceIndex) -> list[LoopClosure]:
+    """Loops of the whole path, where the path says that a place is seen again: at most one for each kept view."""
+    found = (
+        find_by_path(sparse_map, pictures, index, view, view.pose)
+        for view in map(sparse_map.views.__getitem__, index.numbers)
+        if view.pose is not None and view.id in pictures
+    )
+    return [one for one in found if one is not None]
+
+
+def find_by_path(
+    sparse_map: SparseMap, pictures: Mapping[int, Picture], index: PlaceIndex, view: TrackedView, expected: Pose
+) -> LoopClosure | None:
+    """The loop of a view, taken to be at `expected`, with the earlier one of which it should see most points again."""
+    known = sparse_map.known_tracks(view)[0]
+    depth = median((sparse_map.points[known] - expected.centre) @ expected.rotation[:, 2]) if len(known) else 1.0
+    before_px = index.travelled_px(view.id) - LEAST_APART_PX
+    best, most = None, LEAST_INSIDE
+    for other in index.near(expected, max(depth, LEAST_DEPTH), before_px, COMPARED):
+        assert other.rotation is not None
+        if other.id not in pictures:
+            continue
+        ids = sparse_map.known_tracks(other)[0]
+        if len(ids) < LEAST_MATCHES or other.rotation[:, 2] @ expected.rotation[:, 2] < LEAST_COS:
+            continue
+        if np.isin(ids, view.ids).sum() > MOST_SHARED:
+            continue
+        share = float(sparse_map.project_into(ids, expected, pictures[view.id].shape)[0].mean())
+        if share > most:
+            best, most = other, share
+    return None if best is None else _match(sparse_map, best, view, expected, pictures)
 
 
 def spread_drift(sparse_map: SparseMap, found: list[LoopClosure]) -> list[LoopClosure]:
@@ -164,30 +291,25 @@ def _poses(closures: list[LoopClosure]) -> list[tuple[Pose, Pose]]:
     return [(closure.before, closure.pose) for closure in closures]
 
 
+def shift_px(intrinsics: Intrinsics, a: Pose, b: Pose, depth: float) -> float:
+    """How far the image moves from one pose to another, at most, for points at `depth`."""
+    return float(shifts_px(intrinsics, a.rotation, a.centre, b, depth))
+
+
 def _travelled_px(sparse_map: SparseMap) -> Array:
     """Image motion up to each view."""
     return np.cumsum([view.moved_px for view in sparse_map.views])
 
 
-def _spaced(numbers: list[int], travelled_px: Array) -> NDArray[np.int64]:
-    """Those of the ascending view ids that are `EVERY_PX` of image motion apart."""
-    out: list[int] = []
-    for number in numbers:
-        if not out or travelled_px[number] - travelled_px[out[-1]] >= EVERY_PX:
-            out.append(number)
-    return np.array(out, np.int64)
-
-
 def _match(
-    sparse_map: SparseMap, earlier: TrackedView, later: TrackedView, pictures: Mapping[int, Picture]
+    sparse_map: SparseMap, earlier: TrackedView, later: TrackedView, expected: Pose, pictures: Mapping[int, Picture]
 ) -> LoopClosure | None:
-    """The loop of two views if enough points of the earlier one are found in the later one and agree with one pose."""
-    before = later.pose
-    assert before is not None
+    """The loop of two views if enough points of the earlier one are found in the later one, taken to be at `expected`,
+    and agree with one pose."""
     ids, pixels = sparse_map.known_tracks(earlier)
-    inside, guess = sparse_map.project_into(ids, before, pictures[later.id].shape)
-    ids, pixels, guess = ids[inside], pixels[inside], guess[inside]
     images = pictures[earlier.id], pictures[later.id]
+    inside, guess = sparse_map.project_into(ids, expected, images[1].shape)
+    ids, pixels, guess = ids[inside], pixels[inside], guess[inside]
     at, good = flow(*images, pixels, guess, LOOP_REACH_PX, levels=COARSE_LEVELS)
     if good.sum() < LEAST_MATCHES:
         return None
@@ -196,8 +318,11 @@ def _match(
     if good.sum() < LEAST_MATCHES:
         return None
     seen = replace(later, ids=ids[good], pixels=at[good])
-    fit = fit_pose(sparse_map, seen, before)
+    fit = fit_pose(sparse_map, seen, expected)
     agree = sparse_map.errors_px(seen, fit.pose) < CLOSURE_INLIER_PX
     if agree.sum() < LEAST_MATCHES or agree.mean() < LEAST_AGREEING:
         return None
-    return LoopClosure(earlier, later, seen.ids[agree], seen.pixels[agree], before, fit.pose)
+    depth = median((sparse_map.points[seen.ids[agree]] - fit.pose.centre) @ fit.pose.rotation[:, 2])
+    share = float(agree.mean())
+    before = later.pose or expected
+    return LoopClosure(earlier, later, seen.ids[agree], seen.pixels[agree], before, fit.pose, share, depth)

@@ -18,6 +18,7 @@ from spiked.recon.odometry.global_adjuster import GlobalAdjuster
 from spiked.recon.odometry.initialiser import Initialiser
 from spiked.recon.odometry.keyframe_adjuster import LEAST_MOTION_PX, LONG_FRAMES, LONG_VIEWS, KeyframeAdjuster
 from spiked.recon.odometry.keyframe_pictures import KeyframePictures
+from spiked.recon.odometry.loop_closure import LoopSearch
 from spiked.recon.odometry.path_adjuster import PathAdjuster
 from spiked.recon.odometry.pnp import fit_pose
 from spiked.recon.odometry.pose_tracker import LOCAL_BA_EVERY, PoseTracker
@@ -60,6 +61,8 @@ class Odometry:
         self._timestamps = TrackTimestamps()
         self._initialiser = Initialiser(self._map, self._status, seed, live)
         self._adjuster: PathAdjuster = GlobalAdjuster(self._map)
+        self._keyframes: KeyframeAdjuster | None = None
+        """The adjuster of a long path."""
         self._relocaliser = Relocaliser(self._map, KeyframePictures() if pictures is None else pictures)
         self._tracker = PoseTracker(self._map, self._status, self._tracks, self._relocaliser, self._adjuster)
         self.path_error: float | None = None
@@ -169,9 +172,18 @@ class Odometry:
             self._tracker.track(picture)
         elif self._initialiser.attempt():
             self._adjuster.adjust()
-        self._relocaliser.remember(view, picture)
+        if self._relocaliser.remember(view, picture):
+            self._close_loops(view)
         view.state = self.state
         return view
+
+    def _close_loops(self, view: TrackedView) -> None:
+        """On a long path, search the newest view for places seen before; their points become its tracks."""
+        if self._keyframes is None:
+            return
+        for closure in self._keyframes.close_loops(view):
+            if closure.later is view:
+                self._tracks.resume(view.id, closure.ids, closure.pixels)
 
     def _adjust_keyframes_if_long(self) -> None:
         """From `LONG_FRAMES` or `LONG_VIEWS` on, adjust keyframes in a window instead of the whole path."""
@@ -180,7 +192,9 @@ class Odometry:
         posed = self._map.posed()
         if posed and (len(posed) >= LONG_VIEWS or posed[-1].time - posed[0].time >= LONG_FRAMES):
             self._relocaliser.least_motion_px = LEAST_MOTION_PX
-            self._adjuster = self._tracker.adjuster = KeyframeAdjuster(self._map, self._relocaliser.keyframes)
+            pictures = self._relocaliser.keyframes
+            self._keyframes = KeyframeAdjuster(self._map, pictures, LoopSearch.of(self._map, pictures))
+            self._adjuster = self._tracker.adjuster = self._keyframes
 
     def _track(
         self, time: float, length: int, picture: Picture, intervals: SpikeIntervals | None, after_gap: bool

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 import spiked.native._bundle as _bundle
@@ -35,6 +36,10 @@ WORST_INLIERS = 0.5
 """Least share of its known points that agree with it."""
 WORST_OVERLAP = 0.25
 """Least share of its tracks whose points are known."""
+DRAWN_PX, DRAWS = 4.0, 200
+"""Largest residual of a match that agrees with a drawn pose, and poses drawn."""
+LEAST_DRAWN = 8
+"""Matches that agree with a drawn pose."""
 LOST_CHI2, LOST_INLIERS = 25.0, 0.35
 """A pose is rejected if points lie 5 times as far off as noise explains, or if a smaller share of them agrees (decision
 10)."""
@@ -122,6 +127,22 @@ def solve_pose(
     depth = max(median((points - centre) @ rotation[:, 2]), LEAST_DEPTH_SCALE)
     seen_px = _bundle.displacement(hessian, rotation, k.fx, k.fy, k.cx, k.cy, depth)
     return SolvedPose(Pose(rotation, centre), errors, hessian, seen_px)
+
+
+def draw_pose(points: Array, pixels: Array, intrinsics: Intrinsics) -> tuple[Pose, int] | None:
+    """The pose that most of the matches agree with, by three points at a time (AP3P), and how many do.
+
+    points [n, 3] are seen at pixels [n, 2], many of them wrongly. None if fewer than `LEAST_DRAWN` agree.
+    """
+    good, turn, shift, inliers = cv2.solvePnPRansac(
+        points, pixels, intrinsics.matrix(), None,
+        iterationsCount=DRAWS, reprojectionError=DRAWN_PX, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
+    )  # fmt: skip
+    if not good or inliers is None or len(inliers) < LEAST_DRAWN:
+        return None
+    rotation = cv2.Rodrigues(turn)[0].T
+    centre = -rotation @ shift[:, 0]
+    return (Pose(rotation, centre), len(inliers)) if np.isfinite(centre).all() else None
 
 
 def fit_pose(sparse_map: SparseMap, view: TrackedView, start: Pose, move: bool = True) -> PnPResult:

@@ -42,12 +42,14 @@ class Relocaliser:
     _moved_px: float = 0.0
     """Image motion since the newest keyframe."""
 
-    def remember(self, view: TrackedView, picture: Picture) -> None:
-        """Keep the image of a view with a pose if it is a keyframe."""
+    def remember(self, view: TrackedView, picture: Picture) -> bool:
+        """Keep the image of a view with a pose if it is a keyframe; returns whether it is."""
         self._moved_px += view.moved_px
         if view.pose is not None and view.id % KEYFRAME_EVERY == 0 and self._moved_px >= self.least_motion_px:
             self.keyframes[view.id] = picture
             self._moved_px = 0.0
+            return True
+        return False
 
     def recover(self, view: TrackedView, picture: Picture) -> tuple[NDArray[np.int64], Array]:
         """Ids [n] and places [n, 2] px, in a view with a pose, of points of recent keyframes without a track in it."""

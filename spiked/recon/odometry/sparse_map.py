@@ -42,6 +42,11 @@ class Pose(NamedTuple):
     centre: Array
     """[3]"""
 
+    def carried(self, old: "Pose", new: "Pose") -> "Pose":
+        """This pose after its neighbourhood moved as from `old` to `new`."""
+        turn = new.rotation @ old.rotation.T
+        return Pose(turn @ self.rotation, new.centre + turn @ (self.centre - old.centre))
+
 
 @dataclass(eq=False)
 class TrackedView:

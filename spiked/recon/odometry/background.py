@@ -1,0 +1,61 @@
+"""Work on another thread whose result is taken later, at a point that does not depend on how long it took."""
+
+import threading
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from spiked.recon.blas import one_blas_thread
+
+Result = TypeVar("Result")
+
+
+class Background(Generic[Result]):
+    """A function that runs on a thread of its own."""
+
+    def __init__(self, work: Callable[[Callable[[], bool]], Result]) -> None:
+        """`work` gets a function that tells whether it is to end early."""
+        self._work = work
+        self._stop = threading.Event()
+        self._outcome: list[Result | BaseException] = []
+        self._thread = threading.Thread(target=self._run, name="path adjustment", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            with one_blas_thread():
+                self._outcome.append(self._work(self._stop.is_set))
+        except BaseException as error:  # raised again by `result`, on the thread that waits for it
+            self._outcome.append(error)
+
+    def stop(self) -> None:
+        """Let the work end early."""
+        self._stop.set()
+
+    def result(self) -> Result:
+        """Wait for the end, and return the result of the work or raise its error."""
+        self._thread.join()
+        (outcome,) = self._outcome
+        if isinstance(outcome, BaseException):
+            raise outcome
+        return outcome
+
+    def __reduce__(self) -> tuple[type, tuple[Result]]:
+        """A copy has the result and no thread."""
+        return _Done, (self.result(),)
+
+
+class _Done(Background[Result]):
+    """Work that was done before it was copied."""
+
+    def __init__(self, result: Result) -> None:
+        self._result = result
+
+    def stop(self) -> None:
+        """Nothing is left to be ended."""
+
+    def result(self) -> Result:
+        """See `Background`."""
+        return self._result
+
+    def __reduce__(self) -> tuple[type, tuple[Result]]:
+        return _Done, (self._result,)

@@ -1,0 +1,43 @@
+"""Work on another thread ends with its result or its error, when it is told to, and in copies."""
+
+import pickle
+import threading
+from collections.abc import Callable
+from copy import deepcopy
+
+import pytest
+
+from spiked.recon.odometry.background import Background
+
+
+def test_the_result_is_waited_for() -> None:
+    go = threading.Event()
+    work = Background(lambda stop: go.wait() and 7)
+    go.set()
+    assert work.result() == 7 and work.result() == 7
+
+
+def test_an_error_reaches_the_thread_that_waits() -> None:
+    def fail(stop: Callable[[], bool]) -> None:
+        raise ValueError("the path is torn")
+
+    with pytest.raises(ValueError, match="torn"):
+        Background(fail).result()
+
+
+def test_it_ends_when_it_is_told() -> None:
+    def until(stop: Callable[[], bool]) -> str:
+        while not stop():
+            pass
+        return "ended"
+
+    work = Background(until)
+    work.stop()
+    assert work.result() == "ended"
+
+
+def test_copies_have_the_result_and_no_thread() -> None:
+    work = Background(lambda stop: [1, 2])
+    copy, stored = deepcopy(work), pickle.loads(pickle.dumps(work))
+    assert copy.result() == stored.result() == [1, 2]
+    assert deepcopy(copy).result() == [1, 2]

@@ -1,8 +1,10 @@
 """Spikes to trajectory and scene: views, sparse odometry, depth, mapping and refinement behind one `Reconstructor`.
 
-`MapIndex` and `Localiser` find a camera in a scene that is known; `merge` makes one map of two.
+`MapIndex` and `Localiser` find a camera in a scene that is known; `merge` makes one map of two, and `extend` one of a
+map and a reconstruction.
 """
 
+from spiked.recon.extension import extend
 from spiked.recon.localisation.localiser import Localisation, LocalisedView, Localiser
 from spiked.recon.localisation.map_index import MapIndex
 from spiked.recon.merging.known_map import KnownMap
@@ -29,5 +31,6 @@ __all__ = [
     "State",
     "Status",
     "Tracked",
+    "extend",
     "merge",
 ]

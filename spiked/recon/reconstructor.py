@@ -133,6 +133,16 @@ class Reconstructor:
         return self._trainer.sensor
 
     @property
+    def trainer(self) -> MapTrainer:
+        """The training of the map."""
+        return self._trainer
+
+    @property
+    def unit(self) -> float:
+        """Length of the map's unit in the trajectory's unit: 1 unless poses were given."""
+        return self._unit
+
+    @property
     def camera(self) -> Camera:
         """The camera of the map."""
         return self._trainer.camera

@@ -52,6 +52,7 @@ READS = {
     "calibration",
     "stream",
     "token_file",
+    "map",
     "map_folder",
     "first",
     "second",

@@ -31,6 +31,8 @@ class ReconstructionRun:
     out: Path
     checkpoints: CheckpointSaver
     budget_s: float | None
+    map: Path | None = None
+    """Folder of the map that is extended."""
 
     @classmethod
     def begun(
@@ -42,7 +44,7 @@ class ReconstructionRun:
         if exists(folder):
             report_warning(f"{out} held the checkpoint of an interrupted run; this run begins anew and replaces it")
             saver.remove()
-        return cls(recording, reconstructor, out, saver, parameters["seconds"])
+        return cls(recording, reconstructor, out, saver, parameters["seconds"], _map_of(parameters))
 
     @classmethod
     def resumed(cls, context: typer.Context, folder: Path, file: Path | None, out: Path | None) -> "ReconstructionRun":
@@ -66,13 +68,17 @@ class ReconstructionRun:
         messages.print(f"resumed: {interrupted.stage}", markup=False)
         budget_s = parameters["seconds"]
         left_s = None if budget_s is None else max(0.0, budget_s - reconstructor.work_s)
-        return cls(recording, reconstructor, folder, saver, left_s)
+        return cls(recording, reconstructor, folder, saver, left_s, _map_of(parameters))
 
 
 def parameters_of(context: typer.Context, geometry: RecordingGeometry) -> dict[str, Any]:
     """All options of this run, ready for JSON."""
     options = {name: _plain(value) for name, value in context.params.items() if name not in _NOT_STORED}
     return options | {"geometry": _GEOMETRY.dump_python(geometry, mode="json")}
+
+
+def _map_of(parameters: dict[str, Any]) -> Path | None:
+    return None if parameters.get("map") is None else Path(parameters["map"])
 
 
 def _check_options(context: typer.Context, parameters: dict[str, Any]) -> None:

@@ -40,6 +40,10 @@ class Replay:
         """The same without the other pixels [H, W]."""
         return replace(self, opacity=np.where(pixels, self.opacity, np.float32(0)))
 
+    def brightened(self, brightness: float) -> "Replay":
+        """The same with its radiance multiplied by `brightness`."""
+        return replace(self, values=self.values * np.float32(brightness))
+
     @cached_property
     def known(self) -> Image:
         """[H, W], 1 where the map has surfaces, else 0."""

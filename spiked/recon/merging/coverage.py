@@ -19,7 +19,7 @@ from spiked.sensor import Image
 
 SAME_SURFACE = 0.15
 """Largest relative difference of depths of one surface: rendered depths of splats are noisy by 10 %."""
-LEAST_COMMON = 0.1
+LEAST_COMMON = 0.25
 """Share of a view's pixels that both maps must cover for the view to be compared."""
 
 

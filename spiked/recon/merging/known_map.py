@@ -48,6 +48,12 @@ class KnownMap:
         return replace(self, scene=replace(scene, colours=colours))
 
 
+def brightened(scene: Scene, brightness: float) -> Scene:
+    """A scene with its radiance multiplied by `brightness`."""
+    white = None if scene.white is None else scene.white * brightness
+    return replace(scene, colours=scene.colours * np.float32(brightness), white=white)
+
+
 def moved_path(path: Trajectory, similarity: Similarity) -> Trajectory:
     """A trajectory in another frame of reference."""
     return Trajectory(path.times_s, *similarity.poses(path.rotations, path.centres))

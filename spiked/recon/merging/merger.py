@@ -85,6 +85,11 @@ def merge(
     joint = join(first, second, threads)
     kept = joint.kept()
     scene = _trained(joint, kept, seed, threads, progress, cancelled)
+    return merged(scene, joint, kept)
+
+
+def merged(scene: Scene, joint: Joint, kept: tuple[NDArray[np.bool_], NDArray[np.bool_]]) -> Merged:
+    """A trained scene with the figures of how it came about."""
     white = scene.colour_of_white
     psnr_db = _psnr_db(scene, joint.first_views, white), _psnr_db(scene, joint.second_views, white)
     return Merged(scene, joint, (int(kept[0].sum()), int(kept[1].sum())), psnr_db)

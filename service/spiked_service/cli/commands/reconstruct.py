@@ -25,8 +25,8 @@ from rich.progress import (
 from rich.text import Text
 
 from spiked.calibration import Calibration
-from spiked.errors import ConfigurationError, SpikedError
-from spiked.recon import Reconstructor, State, Status
+from spiked.errors import ConfigurationError, SceneError, SpikedError
+from spiked.recon import NotOnePlaceError, Reconstructor, State, Status, extend
 from spiked.recon.frontend.mosaic_check import detect
 from spiked.recon.frontend.windowing import Windows
 from spiked.recording import Recording, RecordingGeometry, open_recording
@@ -36,6 +36,7 @@ from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import messages, output, report_error, report_warning
 from spiked_service.cli.reconstruction_run import RESULTS, ReconstructionRun, parameters_of
+from spiked_service.results.map_folder import MapFolder, file_name, joint_paths, write_map
 from spiked_service.results.recording_feed import reconstruct_recording
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 
@@ -68,6 +69,9 @@ def reconstruct(
     resume: Annotated[
         Path | None,
         typer.Option(help="Folder of the results of an interrupted run: it goes on, with that run's options."),
+    ] = None,
+    map: Annotated[
+        Path | None, typer.Option(help="Output folder of an earlier run, of the same place: its map is extended.")
     ] = None,
     poses: Annotated[Path | None, typer.Option(help="TUM file of known camera-to-world poses.")] = None,
     seconds: Annotated[float | None, typer.Option(help="Time budget; reduces the number of steps.", min=0.0)] = None,
@@ -102,9 +106,15 @@ def reconstruct(
     Every few seconds OUT/checkpoint takes what was done; it is removed at the end. After a kill, a power cut or Ctrl-C
     `--resume OUT` goes on from there, with the options of the interrupted run and the same result.
 
+    With `--map` the recording is reconstructed and brought into the frame of reference of that map, and OUT has one map
+    of both, with the path of each recording in OUT/paths. If the map does not show the same place, OUT has the
+    reconstruction alone, and the exit code is 1.
+
     Examples:
 
     - `spiked reconstruct rec.dat -o out`
+
+    - `spiked reconstruct tuesday.dat --map monday -o both`
 
     - `spiked reconstruct rec.dat -o out --fov 60 --seconds 120`
 
@@ -119,6 +129,8 @@ def reconstruct(
     if file is None or out is None:
         raise ConfigurationError("name a recording and a folder for the results (-o OUT), or --resume OUT")
     outputs.try_folder("--out", out, RESULTS)
+    if map is not None:
+        _check_map(map, out)
     colours = None if mosaic in (None, g.MosaicChoice.AUTO) else Mosaic(mosaic)
     geometry = RecordingGeometry(width, height, rate, layout, bit_order, flipped, colours)
     recording = open_recording(file, **geometry.stated())
@@ -148,15 +160,56 @@ def reconstruct(
 def _carry_out(run: ReconstructionRun, page: "Watch | None") -> None:
     """Reconstruct, write the results and report the outcome. Raises typer.Exit."""
     reconstructor = run.reconstructor
+    known = None if run.map is None else MapFolder.read(run.map)
     interrupted = _run_through(run, page)
     _write(reconstructor, run.out, run.recording.path.name)
     _report(reconstructor, run.out)
     if interrupted:
         run.checkpoints.close()
         raise typer.Exit(INTERRUPTED)
+    found = reconstructor.failure is None
+    if found and known is not None:
+        found = _extended(run, known)
     run.checkpoints.remove()
-    if reconstructor.failure is not None:
+    if not found:
         raise typer.Exit(1)
+
+
+def _check_map(folder: Path, out: Path) -> None:
+    """Raises SceneError and ConfigurationError for a map that cannot be extended, before hours of work."""
+    MapFolder.read(folder)
+    if out.resolve() == folder.resolve():
+        raise ConfigurationError(f"--out {out} is the map that is to be extended; name another folder")
+
+
+def _extended(run: ReconstructionRun, known: MapFolder) -> bool:
+    """Write the map extended by the reconstruction, in place of the reconstruction alone; false if that cannot be."""
+    reconstructor, folder = run.reconstructor, str(run.map)
+    with Progress(console=messages, transient=True, disable=not messages.is_terminal) as bar:
+        task = bar.add_task("extending", total=1.0)
+        try:
+            made = extend(known.known, reconstructor, lambda share: bar.update(task, completed=share))
+        except (NotOnePlaceError, SceneError) as error:
+            report_error(SpikedError(f"{folder} was not extended: {error}; {run.out} has the reconstruction alone"))
+            about = {"map": folder, "joined": False, "reason": str(error)}
+            report = {**reconstructor.report(), "extended": about}
+            with outputs.writing("--out", run.out):
+                (run.out / "report.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
+            return False
+    own = {file_name(run.out.resolve().name): reconstructor.trajectory()}
+    moved = made.joint.second.trajectory
+    paths = joint_paths(known.paths, own, moved)
+    figures = {"map": folder, "joined": True, "versions": known.versions, **made.report()}
+    report = {**reconstructor.report(), "splats": len(made.scene), "extended": figures}
+    with outputs.writing("--out", run.out):
+        write_map(run.out, made.scene, moved, paths, report)
+    found = made.joint.registration
+    output.print(
+        f"{run.out}: {len(made.scene)} splats with those of {folder}, paths {', '.join(paths)}; "
+        f"{len(found.sightings)} views agree with it",
+        markup=False,
+    )
+    return True
 
 
 def _run_through(run: ReconstructionRun, page: "Watch | None") -> bool:

@@ -66,6 +66,25 @@ def test_reading_is_a_view_of_a_memory_map(tmp_path: Path) -> None:
         recording.read(3, 3)
 
 
+def test_what_was_read_does_not_stay_in_memory(tmp_path: Path) -> None:
+    path, frames = tmp_path / "long.dat", 16_000
+    with path.open("wb") as file:
+        file.truncate(frames * 12_500)  # 200 MB without blocks on the disk
+    recording = open_recording(path, width=400, height=250)
+    kept = recording.read(0, 64)
+    before = resident_file_bytes()
+    for first in range(0, frames, 64):
+        assert not recording.read(first, 64)[:, ::4096].any()
+    assert resident_file_bytes() - before < 100e6
+    assert not kept.any()
+
+
+def resident_file_bytes() -> int:
+    """Bytes of mapped files in the memory of this process."""
+    status = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(1024 * int(line.split()[1]) for line in status if line.startswith("RssFile"))
+
+
 def test_the_sidecar_has_the_fields_of_the_streams(tmp_path: Path) -> None:
     path = tmp_path / "a.dat"
     with RecordingWriter(path, SENSORS["A"], device={"serial": "7"}) as writer:

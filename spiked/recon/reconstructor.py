@@ -25,11 +25,12 @@ from spiked.recon.odometry.self_calibration import FIRST_DEG, FOCAL_TOLERANCE, F
 from spiked.recon.options import Options
 from spiked.recon.refiner import Refiner
 from spiked.recon.report import Sample, Status, Tracked, WorkLog
+from spiked.recon.view_choice import choose
 from spiked.recon.view_store import ViewStore
 from spiked.render import Camera, rasteriser_for
 from spiked.scene import Scene
 from spiked.sensor import Image, Intrinsics, Sensor
-from spiked.spline import Path
+from spiked.spline import Path, Waypoints
 from spiked.trajectory import Trajectory
 
 BRIDGED_S = 0.03
@@ -293,6 +294,8 @@ class Reconstructor:
                 self._waypoints = -1, None  # the views have moved
             else:
                 self._unit = self._given.end(self.odometry, self._frames)
+        if isinstance(path := self.path, Waypoints):
+            self._choose_views(path)
         self._warn(report.path_warning(self.odometry.path_error))
 
     def _refine(
@@ -330,6 +333,14 @@ class Reconstructor:
             self._log.note(self._trainer.mapper.loss)
             progress(self.status())
         self._path_version += 1
+
+    def _choose_views(self, path: Path) -> None:
+        """Fit the map to the views of a long path that add something."""
+        views, focal_px = self.views.candidates(path), self.camera.intrinsics.fx
+        chosen = choose(views, self.odometry.points, focal_px, self.options.max_views)
+        if len(chosen) >= LEAST_VIEWS:
+            self.views.keep(chosen)
+            self._trainer.forget_views()
 
     def _prior(self) -> TrajectoryPrior | None:
         """The tracked path with its information, as the prior of the alignment."""

@@ -123,6 +123,17 @@ class ViewStore:
             self._drop(self._kept.pop(least))
         return True
 
+    def candidates(self, path: Path) -> list[TrackedView]:
+        """All views with a pose inside the path whose image is held or can be built anew."""
+        posed = (record for record in self._records if record.posed and path.begin <= record.time <= path.end)
+        return [record.tracked for record in posed if record.id in self._held or self.rebuildable(record.id)]
+
+    def keep(self, ids: Sequence[int]) -> None:
+        """Keep these views, some of `candidates`, and no others."""
+        self._kept = list(ids)
+        for view_id in set(self._held) - set(ids):
+            self._drop(view_id)
+
     def image(self, view_id: int, sharp: bool = False) -> View:
         """The image of a kept view; `sharp`: with its motion-compensated image, if it has one.
 

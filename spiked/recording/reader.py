@@ -1,8 +1,9 @@
 """Reading recordings by memory map."""
 
+import mmap
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,9 @@ _MAGICS = {
     b"\x89HDF\r\n\x1a\n": "an HDF5 file",
 }
 
+RELEASED_BYTES = 64 << 20
+"""Bytes read after which the pages of the file are given back: otherwise all that was read counts as memory of the
+process. They stay in the page cache."""
 TAGS_CHECKED = 512
 """Frames whose row numbers are checked when a file is opened, spread evenly; `verify` checks all."""
 
@@ -64,6 +68,8 @@ class Recording:
     """SpikeCV's ids of the label types, from a config.yaml."""
     data: NDArray[np.uint8]
     """The whole frames as stored, uint8 [frames, frame_bytes], a read-only memory map."""
+    _unreleased: list[int] = field(default_factory=lambda: [0], repr=False)
+    """Bytes read since pages were given back, see `RELEASED_BYTES`."""
 
     @property
     def seconds(self) -> float:
@@ -76,6 +82,14 @@ class Recording:
             raise RecordingError(
                 f"{self.path}: frames {first} to {first + count - 1} are not within its {self.frames} frames"
             )
+        return self._rows(first, count)
+
+    def _rows(self, first: int, count: int) -> NDArray[np.uint8]:
+        """Stored frames; now and then pages of earlier ones are given back, which remain valid."""
+        self._unreleased[0] += count * self.sensor.frame_bytes
+        if self._unreleased[0] > RELEASED_BYTES:
+            self._unreleased[0] = 0
+            _release(self.data)
         return self.data[first : first + count]
 
     def compact(self, first: int, count: int) -> NDArray[np.uint8]:
@@ -128,7 +142,7 @@ class Recording:
             if gap.first < first + count and first < gap.first + gap.count:
                 return None
             row -= gap.count if gap.first < first else 0
-        return self.data[row : row + count] if row >= 0 and row + count <= self.frames else None
+        return self._rows(row, count) if row >= 0 and row + count <= self.frames else None
 
 
 def open_recording(
@@ -217,6 +231,15 @@ def _map(path: Path) -> NDArray[np.uint8]:
             return np.asarray(np.memmap(file, np.uint8, "r"))
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def _release(data: NDArray[np.uint8]) -> None:
+    """Give the pages of a memory map that were read back to the kernel; they are read again when they are accessed."""
+    base: object = data
+    while isinstance(base, np.ndarray):
+        base = base.base
+    if isinstance(base, mmap.mmap):
+        base.madvise(mmap.MADV_DONTNEED)
 
 
 @dataclass(frozen=True)

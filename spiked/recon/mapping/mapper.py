@@ -1,5 +1,6 @@
 """The map: Gaussian splats fitted to views by gradient descent."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import cv2
@@ -70,6 +71,7 @@ class Mapper:
         self.extent = 1.0
         """Size of the map in units of that of a short path, see `MapOptions.extent_px`."""
         self.steps = 0
+        self._most_log_scale = np.float32(np.inf)
         self._charge_error: Image = np.zeros((1, 1), np.float32)
         self._rng = np.random.default_rng(seed)
         self._losses: dict[int, float] = {}
@@ -156,6 +158,7 @@ class Mapper:
         self.adam.step(self.scene.arrays(), gradients.arrays(), rates, gradients.radius_px > 0)
         # Viewers show splats of negative colour as black.
         np.maximum(self.scene.colours, 0, out=self.scene.colours)
+        np.minimum(self.scene.log_scales, self._most_log_scale, out=self.scene.log_scales)
 
     def _compare_rates(self, key: int, view: View, request: RenderRequest, level: Level, background: float) -> Image:
         """Gradient of the loss by the image, from a view's rates over its pixels' windows."""
@@ -230,15 +233,28 @@ class Mapper:
         """Remove dead splats and add others where `error` is large, of the colours and depths of images [H, W]."""
         strategy = self.options.densification
         dead = strategy.dead(self.scene)
-        if dead.any():
-            self.scene = self.scene.select(~dead)
-            self.adam.keep(~dead)
+        self._remove(dead)
         chosen = strategy.choose(error, int(dead.sum()), self.cap, self.cap - len(self.scene), self._rng)
         if chosen is None:
             return
         v, u = chosen
         colours = seen.reshape(*seen.shape[:2], -1)[v, u]
         self._add(chosen, np.where(depth > 0, depth, 1.0)[v, u], colours, 1.0, rotation, centre)
+
+    def limit_sizes(self) -> None:
+        """Let no splat grow beyond what `options.pruning` allows in a scene of the present size."""
+        self._most_log_scale = np.float32(np.log(self.options.pruning.largest(self.scene)))
+
+    def prune(self, poses: Iterable[tuple[Array, Array, float]]) -> None:
+        """Remove splats that no view needs: rotation, centre and depth of the nearest points of each."""
+        level = self.alignment_level
+        self._remove(self.options.pruning.needless(self.scene, level.rasteriser, poses, level.factor))
+
+    def _remove(self, chosen: NDArray[np.bool_]) -> None:
+        """Remove splats, [N]."""
+        if chosen.any():
+            self.scene = self.scene.select(~chosen)
+            self.adam.keep(~chosen)
 
     def render(self, rotation: Array, centre: Array) -> Image:
         """Render the map from a pose: radiance [H, W, C]."""

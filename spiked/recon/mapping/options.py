@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 from spiked.recon.mapping.densification import DensifyStrategy
 from spiked.recon.mapping.loss import RateLoss, WarpedChargeLoss
+from spiked.recon.mapping.pruning import Pruning
 from spiked.recon.mapping.schedule import Schedule
 from spiked.recon.mapping.seeding import Seeding
 
@@ -47,5 +48,7 @@ class MapOptions:
     """How the first splats are made."""
     densification: DensifyStrategy = field(default_factory=DensifyStrategy)
     """Where splats are added later."""
+    pruning: Pruning = field(default_factory=Pruning)
+    """Which splats are removed."""
     schedule: Schedule = field(default_factory=Schedule)
     """What happens when in a refinement."""

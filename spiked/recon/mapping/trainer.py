@@ -15,7 +15,7 @@ from spiked.recon.mapping.render_requests import RenderPlanner
 from spiked.recon.mapping.seeding import SweptView
 from spiked.recon.view_store import ViewStore
 from spiked.render import Camera
-from spiked.sensor import Intrinsics, Sensor
+from spiked.sensor import LEAST_DEPTH, Intrinsics, Sensor
 from spiked.spline import Path, Waypoints
 
 QUICK_SWEEP = 4
@@ -139,6 +139,25 @@ class MapTrainer:
             self.mapper.densify(view_id, view, request)
         self._fitted_path = path
         self.version += self.mapper.steps % VERSION_STEPS == 0
+
+    def prune(self, path: Path, points: Array) -> None:
+        """Remove splats that no view of the path needs; points [N, 3] are landmarks."""
+        pruning = self.options.pruning
+        ids = self.views.spread(self.views.mappable(path), pruning.views)
+        rotations, centres = path.poses([self.views[i].time for i in ids])
+        self.mapper.prune(
+            (rotation, centre, self._nearest(points, rotation, centre))
+            for rotation, centre in zip(rotations, centres, strict=True)
+        )
+        self.version += 1
+
+    def _nearest(self, points: Array, rotation: Array, centre: Array) -> float:
+        """Depth of the nearest landmarks in an image; 0 without any."""
+        local = (points - centre) @ rotation
+        at = self.camera.intrinsics.project(local)
+        inside = (local[:, 2] > LEAST_DEPTH) & (at > 0).all(1) & (at < [self.camera.width, self.camera.height]).all(1)
+        depths = local[inside, 2]
+        return float(np.percentile(depths, self.options.pruning.near_percentile)) if len(depths) else 0.0
 
     def train_live(self, path: Path, points: Array, until: float) -> None:
         """Seed recent views if needed, then take steps until that time of `time.perf_counter`."""

@@ -5,11 +5,13 @@ that. `arrays-N` grows; the header says how much of it belongs to the state, wit
 the state before or the new one, and at most some bytes at the end of `arrays-N` that no state knows.
 """
 
+import errno
 import fcntl
 import hashlib
 import json
 import os
 import shutil
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +24,8 @@ from spiked.errors import CheckpointError
 
 FORMAT = 1
 """Number of the layout described above; a program reads its own only."""
+RESERVE_BYTES = 256 << 20
+"""Free space, or a twentieth of a smaller disk, that checkpoints leave for recordings and results."""
 _MAGIC = b"spiked checkpoint\n"
 _DIGEST_BYTES = 16
 """Of BLAKE2b: it tells damage, not malice."""
@@ -29,6 +33,8 @@ _LENGTH_BYTES = 4
 """Of the header's length, little-endian."""
 _STATE, _PART, _ARRAYS = "state", "state.part", "arrays-"
 _LOCK = "lock"
+LOCK_S = 3.0
+"""Time for another process to end: a worker outlives a killed service by less than a second."""
 _ALIGNED_BYTES = 64
 """Arrays begin at multiples of it, for the compiled code."""
 
@@ -94,17 +100,18 @@ class CheckpointFolder:
     def lock(self) -> None:
         """Make the folder and keep other processes out of it; called again it does nothing.
 
-        Raises OSError, and CheckpointError if another process writes there.
+        Raises OSError, and CheckpointError if another process still writes there after `LOCK_S`.
         """
         if self._lock is not None:
             return
         self.path.mkdir(parents=True, exist_ok=True)
         lock = (self.path / _LOCK).open("ab")
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            lock.close()
-            raise CheckpointError(f"{self.path}: another process works there; wait for its end, or end it") from error
+        deadline = time.monotonic() + LOCK_S
+        while not _locked(lock):
+            if time.monotonic() > deadline:
+                lock.close()
+                raise CheckpointError(f"{self.path}: another process works there; wait for its end, or end it")
+            time.sleep(LOCK_S / 100)
         self._lock = lock
         found = [path.name.removeprefix(_ARRAYS) for path in self.path.glob(f"{_ARRAYS}*")]
         self._number = 1 + max((int(number) for number in found if number.isdecimal()), default=0)
@@ -119,6 +126,7 @@ class CheckpointFolder:
         The arrays lie one after another from `arrays_bytes` on, as `Place.end` says.
         """
         self.lock()
+        self._check_space(len(payload) + sum(array.nbytes for array in arrays))
         size, digest = self._size, self._digest.copy()
         name = self.path / f"{_ARRAYS}{self._number}"
         with os.fdopen(os.open(name, os.O_WRONLY | os.O_CREAT, 0o666), "wb") as file:
@@ -153,6 +161,12 @@ class CheckpointFolder:
         for other in self.path.glob(f"{_ARRAYS}*"):
             if other != name:
                 other.unlink()
+
+    def _check_space(self, wanted: int) -> None:
+        """Raises OSError ENOSPC if less than the reserve would be left."""
+        disk = os.statvfs(self.path)
+        if disk.f_bavail * disk.f_frsize - wanted < min(RESERVE_BYTES, disk.f_blocks * disk.f_frsize // 20):
+            raise OSError(errno.ENOSPC, f"less than {RESERVE_BYTES >> 20} MiB would be left on the disk")
 
     def remove(self) -> None:
         """Delete the folder."""
@@ -205,6 +219,15 @@ def read(path: Path) -> State:
         raise CheckpointError(f"{name} is damaged: its first {arrays['bytes']} bytes are not those of the checkpoint")
     stored.flags.writeable = False
     return State(header, content[end:-_DIGEST_BYTES], stored)
+
+
+def _locked(file: BinaryIO) -> bool:
+    """Lock a file, unless another process has it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _sync_folder(path: Path) -> None:

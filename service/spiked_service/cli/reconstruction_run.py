@@ -63,6 +63,7 @@ class ReconstructionRun:
         geometry = _GEOMETRY.validate_python(parameters["geometry"])
         recording = open_recording(file or interrupted.recording, **geometry.stated())
         saver = CheckpointSaver(folder / CHECKPOINT, recording, parameters, report_warning)
+        interrupted = Interrupted.read(folder / CHECKPOINT)  # again: nobody writes it now
         reconstructor = interrupted.resume(recording)
         outputs.try_folder("--resume", folder, RESULTS)
         messages.print(f"resumed: {interrupted.stage}", markup=False)

@@ -123,6 +123,7 @@ class Reconstructions:
             if row.state is JobState.QUEUED:
                 self.policy.reset_retries(row.id)
                 ended = replace(row, state=JobState.CANCELLED, reason="", eta_s=None, ended_at=datetime.now(UTC))
+                self.rows.drop_checkpoint(row.id)
                 row = self.rows.save(ended)
             return row
 
@@ -141,6 +142,7 @@ class Reconstructions:
                 raise BusyError(f"reconstruction {row.id} is {row.state}: cancel it, or wait for its end")
             _check(self._catalogue.captures.get(row.capture_id))
             self.policy.reset_retries(row.id)
+            self.rows.drop_checkpoint(row.id)
             begun = ReconstructionRow(
                 row.id,
                 row.capture_id,
@@ -195,16 +197,20 @@ class Reconstructions:
             thread.join()
 
     def _requeue_interrupted(self) -> None:
-        """Queue the jobs that an earlier service left running; they restart from the recording."""
+        """Queue the jobs that an earlier service left running; they go on from their checkpoints or begin anew."""
         for row in self.rows.interrupted():
             if row.attempts >= QueuePolicy.MOST_ATTEMPTS:
                 reason = (
                     f"failed after {row.attempts} attempts, the last of which was interrupted by the end of the service"
                 )
+                self.rows.drop_checkpoint(row.id)
                 self.rows.save(replace(row, state=JobState.FAILED, reason=reason, ended_at=datetime.now(UTC)))
                 continue
-            reason = "restarted from the recording, because the service ended while it ran"
-            self.rows.save(queued_again(row, reason))
+            self.rows.save(queued_again(row, f"{self._next_start(row)}, because the service ended while it ran"))
+
+    def _next_start(self, row: ReconstructionRow) -> str:
+        """How an interrupted job goes on, for users."""
+        return "resumed from its checkpoint" if self.rows.has_checkpoint(row.id) else "restarted from the recording"
 
     def _run_queue(self) -> None:
         while True:
@@ -305,7 +311,8 @@ class Reconstructions:
         row = replace(row, ended_at=datetime.now(UTC), eta_s=None)
         capture = self._catalogue.captures.find(row.capture_id)
         if capture is not None and capture.plan.record and self.policy.retry(row.id):
-            return queued_again(row, f"{trouble}; restarted from the recording (attempt {row.attempts + 1})")
+            return queued_again(row, f"{trouble}; {self._next_start(row)} (attempt {row.attempts + 1})")
+        self.rows.drop_checkpoint(row.id)
         tried = f", the last of {row.attempts} attempts" if row.attempts > 1 else ""
         return replace(row, state=JobState.FAILED, reason=f"{trouble}{tried}")
 

@@ -1,10 +1,12 @@
 """Rows, versions and files of reconstructions."""
 
+import shutil
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from spiked.recon.checkpoint import exists
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue_estimates import NEXT, QueueEstimates
 from spiked_service.reconstructions.queue_policy import QueuePolicy
@@ -119,6 +121,14 @@ class ReconstructionRepository:
         with self._lock:
             for row in list(self._unsaved.values()):
                 self.save(self._running.get(row.id, row))
+
+    def has_checkpoint(self, reconstruction_id: str) -> bool:
+        """Whether an interrupted reconstruction can go on from where it was."""
+        return exists(self._folder.checkpoint(reconstruction_id))
+
+    def drop_checkpoint(self, reconstruction_id: str) -> None:
+        """Let the next start of a reconstruction begin anew."""
+        shutil.rmtree(self._folder.checkpoint(reconstruction_id), ignore_errors=True)
 
     def add_version(self, row: ReconstructionRow, published: Published, kept: set[int]) -> None:
         """Save a published version and forget those that are not in `kept`. Errors are logged."""

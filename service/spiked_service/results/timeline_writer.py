@@ -14,12 +14,34 @@ NAME = "timeline.jsonl"
 
 
 class TimelineWriter:
-    """Starts a new timeline; a kill leaves at most one incomplete line. Raises OSError if the disk is full."""
+    """Starts a timeline; a kill leaves at most one incomplete line. Raises OSError if the disk is full."""
 
-    def __init__(self, folder: Path) -> None:
-        self._file = (folder / NAME).open("w", buffering=1)
+    def __init__(self, folder: Path, views: int = 0, frames: int = 0) -> None:
+        """Of the timeline in the folder the first `views` moments stay, and gaps before frame `frames`."""
+        path = folder / NAME
+        lines = path.read_bytes().splitlines(keepends=True) if views and path.exists() else []
+        self._file = path.open("w", buffering=1)
         self._frames: list[int] = []
         self._states: list[State] = []
+        for line in lines:
+            self._keep(line, views, frames)
+
+    @property
+    def moments(self) -> int:
+        """Number of moments."""
+        return len(self._frames)
+
+    def _keep(self, line: bytes, views: int, frames: int) -> None:
+        try:
+            found = json.loads(line)
+        except ValueError:
+            return  # a kill left it incomplete
+        if "gap" in found and found["gap"]["first"] < frames:
+            self._add(found)
+        elif "gap" not in found and len(self._frames) < views:
+            self._frames.append(int(found["frame"]))
+            self._states.append(State(found["state"]))
+            self._add(found)
 
     def tracked(self, view: Tracked, status: Status, psnr_db: float | None) -> None:
         """Add a line for a tracked view, with the current figures of the map."""

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from spiked.errors import ConfigurationError
+from spiked.recon.checkpoint import CHECKPOINT
 from spiked.sensor import Sensor
 from spiked_service.base.ids import is_id
 
@@ -87,6 +88,10 @@ class DataFolder:
         """Copy of the catalogue's row of a reconstruction."""
         return self.reconstruction(reconstruction_id) / "reconstruction.json"
 
+    def checkpoint(self, reconstruction_id: str) -> Path:
+        """Folder of the checkpoint of a reconstruction that has not ended; it may not exist."""
+        return self.reconstruction(reconstruction_id) / CHECKPOINT
+
     def upload(self, upload_id: str) -> Path:
         """Received bytes of an upload."""
         return self._uploads / f"{_checked(upload_id)}.part"
@@ -147,7 +152,7 @@ class DataFolder:
             for leftover in base.glob(".*.removed"):
                 shutil.rmtree(leftover, ignore_errors=True)
                 removed += 1
-            for part in base.glob("*/*.part"):
+            for part in base.rglob("*.part"):
                 part.unlink(missing_ok=True)
                 removed += 1
         return removed

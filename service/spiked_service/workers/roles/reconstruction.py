@@ -5,14 +5,16 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.errors import SceneError
+from spiked.errors import CheckpointError, SceneError
 from spiked.pose import quaternion
 from spiked.poses import PoseFile
 from spiked.recon import Reconstructor, State, Status, Tracked
+from spiked.recon.checkpoint import CHECKPOINT, CheckpointSaver, Interrupted, exists
 from spiked.recon.frontend.windowing import SEARCH_FRAMES
 from spiked.recording import Recording, open_recording
 from spiked.ring import End, Frames, Gap, Policy, RingReader
@@ -84,9 +86,11 @@ def run_reconstruction(command: ReconstructionCommand, channel: WorkerChannel) -
         assert command.recording is not None, "a command has a ring or a recording"
         os.nice(_OFFLINE_NICE)  # live captures have priority
         recording = open_recording(command.recording)
-        work = _begin(command, recording.sensor, channel, recording)
+        saver = CheckpointSaver(command.folder / CHECKPOINT, recording, _parameters(command), _log.warning)
+        work = _resume(command, channel, recording) or _begin(command, recording.sensor, channel, recording)
+        work = replace(work, checkpoints=saver)
         work.reporter.expect(recording.capture_index(recording.frames - 1) + 1)
-        _read(command, work)
+        _read(recording, work)
     work.finish()
 
 
@@ -95,6 +99,13 @@ class _Work:
     reconstructor: Reconstructor
     reporter: "ProgressReporter"
     channel: WorkerChannel
+    checkpoints: CheckpointSaver | None = None
+    """Of a reconstruction from a recording."""
+
+    def save(self) -> None:
+        """Save a checkpoint if one is due, or if the worker is to exit."""
+        if self.checkpoints is not None:
+            self.checkpoints.save(self.reconstructor, now=self.channel.leave.is_set())
 
     def feed(self, first: int, frames: NDArray[np.uint8], newest: Callable[[], int] | None = None) -> None:
         """`newest` returns the number of frames captured so far; None if they are not from a camera."""
@@ -111,10 +122,14 @@ class _Work:
         progress = self.reporter.progress
         self.reporter.refine()
         self.reconstructor.finish(
-            lambda status: None if leave.is_set() else progress(status), lambda: leave.is_set() or stop.is_set()
+            lambda status: None if leave.is_set() else progress(status),
+            lambda: leave.is_set() or stop.is_set(),
+            save=self.save,
         )
         if not leave.is_set():
             self.reporter.last(cut_short=stop.is_set())
+            if self.checkpoints is not None:
+                self.checkpoints.remove()
 
     def lose(self, first: int, count: int, cause: str) -> None:
         self.reconstructor.gap(first, count)
@@ -129,6 +144,28 @@ def _begin(
     options = command.options.options()
     reconstructor = Reconstructor(replace(sensor, intrinsics=intrinsics), options, live=live, recording=recording)
     return _Work(reconstructor, ProgressReporter(reconstructor, command, channel), channel)
+
+
+def _parameters(command: ReconstructionCommand) -> dict[str, Any]:
+    """What a resumed reconstruction must have in common with the one before."""
+    return command.model_dump(mode="json", include={"options", "intrinsics"})
+
+
+def _resume(command: ReconstructionCommand, channel: WorkerChannel, recording: Recording) -> _Work | None:
+    """The work of an earlier worker as its last checkpoint has it; None without one that can be used."""
+    folder = command.folder / CHECKPOINT
+    if not exists(folder):
+        return None
+    try:
+        interrupted = Interrupted.read(folder)
+        if interrupted.parameters != _parameters(command):
+            raise CheckpointError(f"{folder}: it was begun with other options")
+        reconstructor = interrupted.resume(recording)
+    except CheckpointError as error:
+        _log.warning("the reconstruction begins anew: %s", error)
+        return None
+    _log.info("resumed from its checkpoint: %s", interrupted.stage)
+    return _Work(reconstructor, ProgressReporter(reconstructor, command, channel, resumed=True), channel)
 
 
 def _follow(reader: RingReader, work: _Work, command: ReconstructionCommand, may_skip: bool = True) -> int:
@@ -212,13 +249,13 @@ def _within(first: int, last: int, begin: int, stop: int | None) -> tuple[int, i
     return max(first, begin), last if stop is None else min(last, stop)
 
 
-def _read(command: ReconstructionCommand, work: _Work) -> None:
-    """Process a whole recording with its gaps."""
-    assert command.recording is not None
-    recording = open_recording(command.recording)
+def _read(recording: Recording, work: _Work) -> None:
+    """Process a whole recording with its gaps, or what a checkpoint leaves of it."""
     causes = {gap.first: gap.cause for gap in recording.gaps}
-    expected = 0
-    for piece in pieces(recording):
+    expected = work.reconstructor.frames
+    for piece in pieces(recording, begin=expected):
+        if work.reconstructor.frames:
+            work.save()
         if work.channel.stop.is_set():
             return
         if piece.index > expected:
@@ -232,18 +269,26 @@ def _read(command: ReconstructionCommand, work: _Work) -> None:
 class ProgressReporter:
     """Sends progress to the service, publishes versions at limited rates, and writes the timeline."""
 
-    def __init__(self, reconstructor: Reconstructor, command: ReconstructionCommand, channel: WorkerChannel) -> None:
+    def __init__(
+        self,
+        reconstructor: Reconstructor,
+        command: ReconstructionCommand,
+        channel: WorkerChannel,
+        resumed: bool = False,
+    ) -> None:
         self._reconstructor = reconstructor
         self._publisher = Publisher(command.folder)
-        self._timeline = TimelineWriter(command.folder)
+        views = len(reconstructor.views)
+        self._timeline = TimelineWriter(command.folder, views, reconstructor.frames)
         self._channel = channel
         self._sent_s = self._published_s = -np.inf
         self._seen = 0
-        self._tracked = 0
-        self._poses = 0
+        self._tracked = self._timeline.moments
+        versions = self._publisher.versions if resumed else []
+        self._poses = versions[-1].poses if versions else 0
         self._pause_s = _PUBLISH_S
         self._least_poses = command.least_poses
-        self._continues = command.least_poses > 0
+        self._continues = resumed or command.least_poses > 0
         """Versions of earlier workers belong to this run of the reconstruction."""
         self._own = self._publisher.version + 1
         """First version of this worker."""

@@ -55,6 +55,9 @@ WINDOW_ITERATIONS, LOOP_ITERATIONS, FINAL_ITERATIONS = 4, 4, 12
 """Most iterations of an adjustment in the window, after a loop and at the end."""
 MOST_LOG_SCALE = 0.3
 """Largest change of a point's depth, as a logarithm, that counts where the change of scale is measured."""
+FINAL_ROUNDS = 3
+"""Final adjustments, each with the points that the one before dropped or that the closed loops tell anew (decision
+15)."""
 TOLERANCE = 1e-3
 """Relative gain of an iteration below which an adjustment ends."""
 
@@ -193,8 +196,11 @@ class KeyframeAdjuster:
                 break
             self._link(closures)
             self._adjust_all(LOOP_ITERATIONS, stop)
-        self._adjust_all(FINAL_ITERATIONS, stop)
-        self.map.triangulate(self.keyframes)
+        for _ in range(FINAL_ROUNDS):
+            self._adjust_all(FINAL_ITERATIONS, stop)
+            self.map.triangulate(self._all_chosen())
+            if stop():
+                return
 
     def _adjust_all(self, iterations: int, stop: Callable[[], bool]) -> None:
         """Adjust all keyframes and their points; all other views follow."""

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from browsing import PHONE, Studied, address, choose, decoded, keep, picture, psnr_db, shown_version, still, until
+from spiked_service.results.shown_scene import ShownScene
 
 from spiked.scene import Scene
 
@@ -53,10 +54,13 @@ def test_the_scene_grows_while_the_camera_moves(
             look();
         }"""
     )
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url) if "/scene/changes" in request.url else None)
     first, before = shown_version(page), picture(page)
     view = page.evaluate("() => location.search")
     until(lambda: shown_version(page) >= first + 2, "two newer versions")
     until(lambda: np.abs(picture(page) - before).mean() > 1e-4, "the picture has changed")
+    assert asked and all("since=" in url for url in asked), "a version was fetched whole"
     lit = page.evaluate("() => window.lit")
     assert len(lit) > 3
     assert min(lit) > 0.4 * np.median(lit), "the canvas went dark between two versions"
@@ -159,11 +163,11 @@ def test_states_are_told_without_colours(studied: Studied, visit: Callable[..., 
 
 
 @pytest.mark.slow
-def test_spz_previews_lie_where_the_whole_scene_lies(studied: Studied, visit: Callable[..., Any]) -> None:
+def test_a_quarter_of_the_splats_looks_like_all(studied: Studied, visit: Callable[..., Any]) -> None:
     whole = open_scene(visit, f"{studied.address}?page=scene&ride=1&frame=320")
     choose(whole, "Rendered")
     page = visit("about:blank")
-    # The page is told of a scene too large to be shown at once, and shows a sample of it: here all of it, as SPZ.
+    # The page is told of a scene too large to be shown at once: a sixteenth of it first, then a quarter.
     page.route(
         re.compile(r"/reconstructions\?|/reconstructions/[^/]+$"),
         lambda route: route.fulfill(
@@ -171,13 +175,17 @@ def test_spz_previews_lie_where_the_whole_scene_lies(studied: Studied, visit: Ca
             body=re.sub(r'"splats":\s*\d+', '"splats": 999999', answer.text()),
         ),
     )
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url) if "/scene/changes" in request.url else None)
     page.goto(f"{studied.address}?page=scene&ride=1&frame=320")
-    until(lambda: shown_version(page) > 0, "a preview is on the canvas")
+    button = page.get_by_role("button", name="Show all")
+    button.wait_for()
     choose(page, "Rendered")
-    assert page.get_by_role("button", name="Show all").count() == 1
-    until(lambda: psnr_db(picture(page), picture(whole)) > 30, "the preview looks like the whole", 20)
-    page.get_by_role("button", name="Show all").click()
-    page.get_by_role("button", name="all splats").wait_for(state="detached")
+    until(lambda: psnr_db(picture(page), picture(whole)) > 18, "a quarter looks like the whole", 20)
+    assert [url.split("level=")[1][0] for url in asked] == ["0", "1"]
+    button.click()
+    button.wait_for(state="detached")
+    until(lambda: psnr_db(picture(page), picture(whole)) > 50, "all of it is the whole", 20)
 
 
 @pytest.mark.slow
@@ -279,9 +287,9 @@ def test_half_a_million_splats(studied: Studied, visit: Callable[..., Any]) -> N
         np.full(MANY, 2.0, np.float32),
         random.uniform(0, 1, (MANY, 1)).astype(np.float32),
     )
-    content = scene.ply()
+    content = ShownScene.of(scene, 1.0, 1).since(None).write()
     page = visit("about:blank")
-    page.route(re.compile(r"/scene\?"), lambda route: route.fulfill(body=content))
+    page.route(re.compile(r"/scene/changes"), lambda route: route.fulfill(body=content))
     page.goto(f"{studied.address}?page=scene")
     canvas = page.locator(".stage canvas")
     until(lambda: canvas.count() and canvas.get_attribute("data-splats") == str(MANY), "all of them are on the canvas")

@@ -1,6 +1,7 @@
 """Writes the timeline of a reconstruction while it runs: `timeline.jsonl`, which `timeline` reads."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ class TimelineWriter:
         self._file = path.open("w", buffering=1)
         self._frames: list[int] = []
         self._states: list[State] = []
+        self._closures: set[tuple[float, float]] = set()
         for line in lines:
             self._keep(line, views, frames)
 
@@ -36,6 +38,8 @@ class TimelineWriter:
             found = json.loads(line)
         except ValueError:
             return  # a kill left it incomplete
+        if "closure" in found:
+            return  # the reconstructor knows its closed loops, and `closed` adds them again
         if "gap" in found and found["gap"]["first"] < frames:
             self._add(found)
         elif "gap" not in found and len(self._frames) < views:
@@ -65,6 +69,13 @@ class TimelineWriter:
     def lost(self, first: int, count: int, cause: str) -> None:
         """Add a line for lost frames."""
         self._add({"gap": {"first": first, "count": count, "cause": cause}})
+
+    def closed(self, closures: Sequence[tuple[float, float]]) -> None:
+        """Add lines for the closed loops that have none yet: times of the earlier and the later view, in seconds."""
+        for earlier_s, later_s in closures:
+            if (earlier_s, later_s) not in self._closures:
+                self._closures.add((earlier_s, later_s))
+                self._add({"closure": {"earlier_s": earlier_s, "later_s": later_s}})
 
     def states_at(self, frames: NDArray[np.int64]) -> NDArray[np.bytes_]:
         """The tracking state at each of the frames [n]."""

@@ -12,6 +12,8 @@ Version = Annotated[
     Query(ge=1, le=LARGEST_INTEGER, description="Default: the newest; `GET versions` lists them."),
     IN_DIGITS,
 ]
+FromS = Annotated[float | None, Query(ge=0, le=1e9, description="First time, seconds since the start of the capture.")]
+ToS = Annotated[float | None, Query(ge=0, le=1e9, description="End time, not included, in seconds.")]
 WishedImage = Annotated[ImageFormat | None, Query(description="Takes precedence over Accept; the default is PNG.")]
 
 BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}

@@ -10,8 +10,10 @@ from fastapi.routing import APIRoute
 from spiked_service.api import files
 from spiked_service.api.idempotency import IdempotencyKey
 from spiked_service.api.problems import problems
-from spiked_service.api.schemas.base import Cursor, Limit
+from spiked_service.api.routes.parameters import FromS, ToS
+from spiked_service.api.schemas.base import IN_DIGITS, Cursor, Limit
 from spiked_service.api.schemas.reconstructions import (
+    ClosureOut,
     GapOut,
     ReconstructionOut,
     ReconstructionPage,
@@ -23,9 +25,14 @@ from spiked_service.api.schemas.reconstructions import (
 )
 from spiked_service.reconstructions.queue import Reconstructions
 from spiked_service.reconstructions.repository import ReconstructionRepository
-from spiked_service.results.timeline import Timeline
+from spiked_service.results.timeline import STATES, Timeline, Timelines, known
 from spiked_service.store.rows import JobState
 
+Points = Annotated[
+    int | None,
+    Query(ge=1, le=100_000, description="Most points: neighbours are joined. Default: every tracked view."),
+    IN_DIGITS,
+]
 _LOG_BYTES = 1 << 20
 """The log is shown from this many bytes before its end."""
 
@@ -84,6 +91,7 @@ def reconstruction_routes(reconstructions: Reconstructions, route_class: type[AP
 
 def reconstruction_record_routes(rows: ReconstructionRepository, route_class: type[APIRoute]) -> APIRouter:
     """Versions, timeline and log below `reconstructions/ID`."""
+    timelines = Timelines()
     router = APIRouter(
         prefix="/reconstructions/{reconstruction_id:id}", tags=["reconstructions"], route_class=route_class
     )
@@ -94,9 +102,12 @@ def reconstruction_record_routes(rows: ReconstructionRepository, route_class: ty
         return VersionsOut(items=[VersionOut.of(row) for row in rows.versions(reconstruction_id)])
 
     @router.get("/timeline", responses=problems(404))
-    def get_timeline(reconstruction_id: str) -> TimelineOut:
-        """Timeline: state, fit and loss over the frames."""
-        return _timeline(Timeline.read(rows.timeline(reconstruction_id)))
+    def get_timeline(
+        reconstruction_id: str, from_s: FromS = None, to_s: ToS = None, points: Points = None
+    ) -> TimelineOut:
+        """Timeline: state, fit and loss over the frames, and closed loops; a part of it, at most so many points."""
+        timeline = timelines.read(rows.timeline(reconstruction_id)).between(from_s, to_s)
+        return _timeline(timeline if points is None else timeline.reduced(points))
 
     @router.get("/log", responses=problems(404), response_class=PlainTextResponse)
     def get_log(reconstruction_id: str, request: Request) -> Response:
@@ -115,15 +126,13 @@ def reconstruction_record_routes(rows: ReconstructionRepository, route_class: ty
 
 def _timeline(timeline: Timeline) -> TimelineOut:
     moments = timeline.moments
+    values = {name: known(moments[name].tolist()) for name in ("chi2", "sigma_px", "rate", "loss", "psnr_db")}
     return TimelineOut(
-        time_s=[moment.time_s for moment in moments],
-        frame=[moment.frame for moment in moments],
-        state=[moment.state for moment in moments],
-        chi2=[moment.chi2 for moment in moments],
-        sigma_px=[moment.sigma_px for moment in moments],
-        rate=[moment.rate for moment in moments],
-        loss=[moment.loss for moment in moments],
-        psnr_db=[moment.psnr_db for moment in moments],
-        splats=[moment.splats for moment in moments],
+        time_s=moments["time_s"].tolist(),
+        frame=moments["frame"].tolist(),
+        state=[STATES[one] for one in moments["state"]],
+        splats=[None if one is None else int(one) for one in known(moments["splats"].tolist())],
         gaps=[GapOut(first=gap.first, count=gap.count, cause=gap.cause) for gap in timeline.gaps],
+        closures=[ClosureOut(earlier_s=one.earlier_s, later_s=one.later_s) for one in timeline.closures],
+        **values,
     )

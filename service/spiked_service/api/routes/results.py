@@ -10,7 +10,16 @@ from fastapi.routing import APIRoute
 from spiked_service.api.auth.scopes import needs
 from spiked_service.api.problems import problems
 from spiked_service.api.results import Results, SceneFormat
-from spiked_service.api.routes.parameters import BINARY, ETAG, NOT_MODIFIED, PICTURES, Version, WishedImage
+from spiked_service.api.routes.parameters import (
+    BINARY,
+    ETAG,
+    NOT_MODIFIED,
+    PICTURES,
+    FromS,
+    ToS,
+    Version,
+    WishedImage,
+)
 from spiked_service.api.schemas.base import IN_DIGITS
 from spiked_service.api.schemas.reconstructions import TrajectoryOut
 from spiked_service.api.schemas.views import ViewRequest
@@ -22,8 +31,6 @@ from spiked_service.results.view_renderer import ViewRenderer
 from spiked_service.settings.tokens import Scope
 from spiked_service.store.rows import ReconstructionRow
 
-FromS = Annotated[float | None, Query(ge=0, le=1e9, description="First time, seconds since the start of the capture.")]
-ToS = Annotated[float | None, Query(ge=0, le=1e9, description="End time, not included, in seconds.")]
 Step = Annotated[int, Query(ge=1, le=1_000_000, description="Every n-th pose."), IN_DIGITS]
 MaxSplats = Annotated[
     int | None,

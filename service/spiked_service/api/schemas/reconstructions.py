@@ -108,6 +108,13 @@ class GapOut(Out):
     cause: str
 
 
+class ClosureOut(Out):
+    """A closed loop: the camera sees at the later time what it saw at the earlier one; seconds since the start."""
+
+    earlier_s: float
+    later_s: float
+
+
 class TimelineOut(Out):
     """How a reconstruction went, arrays of the same length; null where a value is not known."""
 
@@ -121,3 +128,4 @@ class TimelineOut(Out):
     psnr_db: list[float | None]
     splats: list[int | None]
     gaps: list[GapOut]
+    closures: list[ClosureOut] = Field(description="In the order in which they were closed.")

@@ -335,6 +335,7 @@ class ProgressReporter:
             self._publish(status)
             self._pause_s = max(_PUBLISH_S, (time.monotonic() - now_s) / _PUBLISH_SHARE)
         if now_s - self._sent_s > _STATUS_S:
+            self._timeline.closed(self._reconstructor.closures())
             self._send_status(status)
 
     def frames_skipped(self, skipped: int) -> None:
@@ -358,6 +359,7 @@ class ProgressReporter:
     def last(self, cut_short: bool) -> None:
         """Publish the final state, or an earlier version again if that is better."""
         self.tracked(None)
+        self._timeline.closed(self._reconstructor.closures())
         self._least_poses = 0
         status = self._reconstructor.status()
         if len(self._reconstructor.trajectory()):

@@ -1,6 +1,6 @@
 /** The scene on a canvas: Gaussians by Spark, path, frustum, grid and axes by three.js. Draws only after changes. */
 
-import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
+import { ExtSplats, SparkRenderer, SplatMesh, utils } from "@sparkjsdev/spark";
 import {
   AxesHelper,
   Color,
@@ -22,6 +22,7 @@ import type { Sensor } from "../../shared/api/types";
 import { colour } from "../../shared/state/theme";
 import { type Placement, placementOf, pointOf, projectionOf } from "./axes";
 import { axisNames } from "./axisNames";
+import { type Changes, changed, NO_SLOTS, type Slots } from "./changes";
 import { type Colouring, type Path, quantile } from "./path";
 import { OVERLAY_ORDER, PathLines } from "./PathLines";
 
@@ -37,6 +38,8 @@ export interface Layers {
 
 const FRUSTUM_PX = 1.6;
 const SAMPLE = 20_000;
+/** Room for splats that come later, so that a growing scene does not get new textures with every version. */
+const HEADROOM = 1.25;
 
 /** Blur of the service's own renderer, px^2 added to the projected covariance, so that both show the same picture. */
 const DILATION_PX2 = 0.3;
@@ -69,6 +72,9 @@ export class Viewer {
   private fly: FlyControls | null = null;
   private steering: Steering = "orbit";
   private mesh: SplatMesh | null = null;
+  private slots: Slots = NO_SLOTS;
+  /** Splats for which the textures have room. */
+  private capacity = 0;
   private readonly path = new PathLines();
   private readonly frustum = new LineSegments2(new LineSegmentsGeometry(), new LineMaterial({ linewidth: FRUSTUM_PX }));
   private grid = new GridHelper(1, 1);
@@ -200,34 +206,47 @@ export class Viewer {
 
   /**
    * Show another version. The one before stays until the new one is decoded and sorted, so the canvas does not flash; the view
-   * stays as it is. A call followed by a later one does nothing.
+   * stays as it is. A call followed by a later one does nothing, and returns false.
    */
-  async setScene(bytes: Uint8Array, format: "ply" | "spz", version: number): Promise<void> {
+  async change(changes: Changes): Promise<boolean> {
     const ticket = ++this.loading;
-    const fileType = format === "ply" ? SplatFileType.PLY : SplatFileType.SPZ;
-    const mesh = new SplatMesh({ fileBytes: bytes, fileType, extSplats: true, raycastable: false });
-    try {
-      await mesh.initialized;
-    } catch (error) {
-      mesh.dispose();
-      throw error;
-    }
-    if (ticket !== this.loading) {
-      mesh.dispose();
-      return;
-    }
-    const before = this.mesh;
-    // PLY holds OpenCV's axes (right, down, forward), SPZ those of three.js (right, up, back).
-    (format === "ply" ? this.turned : this.world).add(mesh);
-    this.mesh = mesh;
-    this.version = version;
-    this.splats = mesh.splats?.getNumSplats() ?? 0;
-    if (before !== null) {
-      before.removeFromParent();
-      before.dispose();
-    }
-    if (this.extent === null && this.splats > 0) this.measure(mesh, format);
+    const grown = changes.slots <= this.capacity ? this.capacity : changes.slots * HEADROOM;
+    const capacity = utils.getTextureSize(grown).maxSplats;
+    const next = await changed(this.slots, changes, capacity);
+    if (ticket !== this.loading) return false;
+    this.slots = next;
+    if (this.mesh === null || capacity !== this.capacity) this.replaceMesh(capacity);
+    else this.refill(this.mesh);
+    this.capacity = capacity;
+    this.version = changes.version;
+    this.splats = next.splats;
+    if (this.extent === null && this.splats > 0) this.measure();
     this.show();
+    return true;
+  }
+
+  private replaceMesh(capacity: number): void {
+    const { arrays, slots } = this.slots;
+    const splats = new ExtSplats({ extArrays: arrays, numSplats: Math.min(slots, capacity) });
+    const mesh = new SplatMesh({ extSplats: splats, raycastable: false });
+    const before = this.mesh;
+    this.turned.add(mesh); // the service has OpenCV's axes
+    this.mesh = mesh;
+    before?.removeFromParent();
+    before?.dispose();
+  }
+
+  /** Give the mesh its new splats: into the textures that it has, and shown when they are sorted. */
+  private refill(mesh: SplatMesh): void {
+    const splats = mesh.extSplats;
+    if (splats === undefined) return;
+    splats.extArrays = this.slots.arrays;
+    splats.numSplats = this.slots.slots;
+    for (const i of [0, 1] as const) {
+      splats.textures[i].image.data = this.slots.arrays[i];
+      splats.textures[i].needsUpdate = true;
+    }
+    mesh.updateMappingVersion();
   }
 
   /** Remove the scene and reset the view. */
@@ -236,6 +255,8 @@ export class Viewer {
     this.mesh?.removeFromParent();
     this.mesh?.dispose();
     this.mesh = null;
+    this.slots = NO_SLOTS;
+    this.capacity = 0;
     this.version = 0;
     this.splats = 0;
     this.extent = null;
@@ -245,17 +266,18 @@ export class Viewer {
     this.show();
   }
 
-  private measure(mesh: SplatMesh, format: "ply" | "spz"): void {
-    const every = Math.max(1, Math.floor(this.splats / SAMPLE));
+  private measure(): void {
+    const { arrays, slots, held } = this.slots;
+    const places = new Float32Array(arrays[0].buffer);
     const heights: number[] = [];
     const distances: number[] = [];
     const eye = this.placement?.position ?? new Vector3();
-    mesh.forEachSplat((index, centre) => {
-      if (index % every !== 0) return;
-      const point = format === "ply" ? pointOf([centre.x, centre.y, centre.z]) : centre;
+    for (let slot = 0; slot < slots; slot += Math.max(1, Math.floor(slots / SAMPLE))) {
+      if (held[slot] === 0) continue;
+      const point = pointOf([...places.subarray(4 * slot, 4 * slot + 3)]);
       heights.push(point.y);
       distances.push(point.distanceTo(eye));
-    });
+    }
     this.extent = {
       depth: Math.max(quantile(Float32Array.from(distances), 0.5), 1e-6),
       floor: quantile(Float32Array.from(heights), 0.03),

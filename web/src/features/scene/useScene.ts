@@ -1,14 +1,19 @@
-/** Fetches a version of a scene, or the newest whenever there is one, one at a time, and gives it to the viewer. */
+/** Fetches a version of a scene, and then what changes with each newer one, one at a time, for the viewer. */
 
 import { useEffect, useRef, useState } from "react";
 
 import { address, fetched } from "../../shared/api/calls";
 import type { Reconstruction, Version } from "../../shared/api/types";
 import { useService, errorText } from "../../shared/state/store";
+import { readChanges } from "./changes";
 import type { Viewer } from "./Viewer";
 
-/** Splats of a preview: a phone can load this many every two seconds. */
-export const PREVIEW_SPLATS = 60_000;
+/** Most splats that are shown unless all are asked for; of more, a quarter is, twice as large. */
+const MOST_SPLATS = 250_000;
+/** Scenes of more splats are shown coarsely first. */
+const COARSE_FIRST = 30_000;
+/** Levels of detail: a sixteenth of the splats, a quarter, all. */
+const [COARSE, QUARTER, ALL] = [0, 1, 2];
 
 export interface Shown {
   version: number;
@@ -45,35 +50,38 @@ export function useScene(
   useEffect(() => {
     if (viewer === null || id === null) return;
     const ended = new AbortController();
-    let shown: Shown | null = null;
+    let shown: (Shown & { level: number }) | null = null;
+    let since: string | null = null;
     let busy = false;
     // A version takes the place of another of its reconstruction, and the view stays.
     if (cleared.current?.viewer !== viewer || cleared.current.id !== id) viewer.clear();
     cleared.current = { viewer, id };
     const step = async (): Promise<void> => {
       const want = wanted.current;
-      const whole = want.full || want.total <= PREVIEW_SPLATS;
-      if (busy || want.version === 0 || (shown !== null && shown.version >= want.version && (shown.whole || !whole)))
+      const finest = want.full || want.total <= MOST_SPLATS ? ALL : QUARTER;
+      if (busy || want.version === 0 || (shown !== null && shown.version >= want.version && shown.level >= finest))
         return;
       busy = true;
       setLoading(true);
       try {
+        const level = shown === null && viewer.splats === 0 && want.total > COARSE_FIRST ? COARSE : finest;
+        if (level !== shown?.level) since = null;
         // Of an older version only the newest files are kept, so the newest is fetched, whatever its number.
-        const format = whole ? "ply" : "spz";
-        const url = address.scene(
-          id,
-          format,
-          whole ? { version: only } : { version: only, max_splats: PREVIEW_SPLATS },
-        );
-        const bytes = new Uint8Array(await (await fetched(url, ended.signal)).arrayBuffer());
-        await viewer.setScene(bytes, format, want.version);
-        shown = { version: want.version, splats: viewer.splats, whole };
-        setState({ job: id, only, shown, problem: null });
+        const url = address.changes(id, { level, version: only, since: since ?? undefined });
+        const changes = readChanges(await (await fetched(url, ended.signal)).arrayBuffer());
+        if (!ended.signal.aborted && (await viewer.change(changes))) {
+          since = changes.state;
+          const version = Math.max(changes.version, want.version);
+          shown = { version, splats: viewer.splats, whole: level === ALL, level };
+          setState({ job: id, only, shown, problem: null });
+        }
       } catch (error) {
         if (!ended.signal.aborted) setState({ job: id, only, shown, problem: errorText(error) });
       }
       busy = false;
-      if (!ended.signal.aborted) setLoading(false);
+      if (ended.signal.aborted) return;
+      setLoading(false);
+      if (shown?.level === COARSE) void step();
     };
     void step();
     const timer = setInterval(() => void step(), 200);

@@ -100,11 +100,9 @@ export const address = {
   ): string => `${API}/captures/${id}/preview${query({ kind, ...extra })}`,
   recording: (id: string): string => `${API}/captures/${id}/recording`,
   sidecar: (id: string): string => `${API}/captures/${id}/recording/sidecar`,
-  scene: (
-    id: string,
-    format: "ply" | "spz",
-    extra: { max_splats?: number; version?: number | undefined } = {},
-  ): string => `${API}/reconstructions/${id}/scene${query({ format, ...extra })}`,
+  scene: (id: string, format: "ply" | "spz"): string => `${API}/reconstructions/${id}/scene${query({ format })}`,
+  changes: (id: string, asked: { level: number; version?: number | undefined; since?: string | undefined }): string =>
+    `${API}/reconstructions/${id}/scene/changes${query(asked)}`,
   trajectory: (id: string, format: string): string => `${API}/reconstructions/${id}/trajectory${query({ format })}`,
 };
 

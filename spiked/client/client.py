@@ -220,9 +220,17 @@ class Spiked:
         """The versions that are kept, oldest first."""
         return self._connection.get(f"reconstructions/{reconstruction_id}/versions", VersionsOut).items
 
-    def timeline(self, reconstruction_id: str) -> TimelineOut:
-        """How it went."""
-        return self._connection.get(f"reconstructions/{reconstruction_id}/timeline", TimelineOut)
+    def timeline(
+        self,
+        reconstruction_id: str,
+        *,
+        from_s: float | None = None,
+        to_s: float | None = None,
+        points: int | None = None,
+    ) -> TimelineOut:
+        """How it went, or a part of it; neighbouring views are joined to at most `points`."""
+        query = {"from_s": from_s, "to_s": to_s, "points": points}
+        return self._connection.get(f"reconstructions/{reconstruction_id}/timeline", TimelineOut, query=query)
 
     def trajectory(
         self,

@@ -95,6 +95,18 @@ class ClockPair(BaseModel):
     unix_ns: int
 
 
+class ClosureOut(BaseModel):
+    """
+    A closed loop: the camera sees at the later time what it saw at the earlier one; seconds since the start.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    earlier_s: float
+    later_s: float
+
+
 class DeviceState(StrEnum):
     """
     State of a capture's camera: absent -> idle -> armed -> streaming -> lost -> absent.
@@ -597,6 +609,7 @@ class TimelineOut(BaseModel):
     psnr_db: list[float | None]
     splats: list[int | None]
     gaps: list[GapOut]
+    closures: Annotated[list[ClosureOut], Field(description="In the order in which they were closed.")]
 
 
 class TokenOut(BaseModel):

@@ -9,7 +9,20 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from browsing import PHONE, Studied, address, choose, decoded, keep, picture, psnr_db, shown_version, still, until
+from browsing import (
+    PHONE,
+    Studied,
+    address,
+    choose,
+    decoded,
+    keep,
+    picture,
+    psnr_db,
+    shown_version,
+    still,
+    until,
+    violations,
+)
 from spiked_service.results.shown_scene import ShownScene
 
 from spiked.scene import Scene
@@ -119,11 +132,12 @@ def test_states_are_told_without_colours(studied: Studied, visit: Callable[..., 
     def retold(route: Any) -> None:
         answer = route.fetch()
         told = answer.json()
-        rows = len(told["states"])
-        told["states"] = [stretches[len(stretches) * row // rows] for row in range(rows)]
+        for name in {"state", "states"} & set(told):
+            rows = len(told[name])
+            told[name] = [stretches[len(stretches) * row // rows] for row in range(rows)]
         route.fulfill(response=answer, json=told)
 
-    page.route(re.compile(r"/trajectory\?"), retold)
+    page.route(re.compile(r"/(trajectory|timeline)\?"), retold)
 
     def pieces(*states: str) -> int:
         """How many the path on the canvas falls into, in shades of grey."""
@@ -209,6 +223,98 @@ def test_scrubbing_moves_the_camera_and_is_kept_in_the_url(studied: Studied, vis
     page.get_by_role("button", name="Play").click()
     until(lambda: "frame" in address(page), "it plays")
     page.get_by_role("button", name="Pause").click()
+
+
+def shown_frames(page: Any) -> tuple[int, int]:
+    """The part of the time that the timeline shows."""
+    first, last = (page.locator(".track > canvas").get_attribute(f"data-{end}") for end in ("first", "last"))
+    return int(first), int(last)
+
+
+@pytest.mark.slow
+def test_the_timeline_zooms_by_wheel_keys_buttons_and_fingers(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = open_scene(visit, f"{studied.address}?page=scene&frame=600")
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url) if "/timeline?" in request.url else None)
+    strip = page.locator(".track > canvas")
+    until(lambda: shown_frames(page)[1] > 900, "the path is there")
+    whole = shown_frames(page)
+    box = strip.bounding_box()
+    quarter = box["x"] + box["width"] / 4, box["y"] + box["height"] / 2
+    page.mouse.move(*quarter)
+    page.mouse.wheel(0, -250)
+    until(lambda: shown_frames(page) != whole, "the wheel zooms")
+    first, last = shown_frames(page)
+    length = (whole[1] - whole[0]) / np.e
+    assert last - first == pytest.approx(length, abs=3)
+    assert first + length / 4 == pytest.approx(whole[0] + (whole[1] - whole[0]) / 4, abs=5), "about the pointer"
+    until(lambda: any("from_s" in url and "points" in url for url in asked), "the part is asked for by itself")
+    page.mouse.down()
+    page.mouse.move(quarter[0] - box["width"] / 4, quarter[1], steps=5)
+    page.mouse.up()
+    until(lambda: shown_frames(page)[0] == pytest.approx(first + length / 4, abs=5), "a drag moves it")
+    assert "frame=600" in address(page)
+    page.mouse.click(*quarter)
+    wanted = shown_frames(page)[0] + length / 4
+    until(lambda: f"frame={wanted:.0f}"[:8] in address(page), "a click goes to a frame")
+    slider = page.get_by_label("Frame", exact=True)
+    slider.press("0")
+    until(lambda: shown_frames(page) == whole, "0 shows everything")
+    assert page.locator(".overview").count() == 0
+    slider.press("+")
+    until(lambda: shown_frames(page) != whole, "+ zooms")
+    assert "The timeline shows" in page.get_by_role("status").all_inner_texts()[-1]
+    assert page.locator(".overview").count() == 1 and violations(page) == []
+    page.get_by_role("button", name="Zoom out").click()
+    until(lambda: shown_frames(page) == whole, "and out again")
+    page.get_by_role("button", name="Zoom in").click()
+    page.get_by_role("button", name="Whole time").click()
+    until(lambda: shown_frames(page) == whole, "the whole again")
+    phone = open_scene(visit, f"{studied.address}?page=scene&frame=600", viewport=PHONE, touch=True)
+    until(lambda: shown_frames(phone)[1] > 900, "the path is there")
+    assert phone.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
+    box = phone.locator(".track > canvas").bounding_box()
+    fingers = phone.context.new_cdp_session(phone)
+    y = box["y"] + box["height"] / 2
+    for kind, ends in (("touchStart", (0.4, 0.6)), ("touchMove", (0.25, 0.75)), ("touchMove", (0.1, 0.9))):
+        points = [{"x": box["x"] + end * box["width"], "y": y, "id": i} for i, end in enumerate(ends)]
+        fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    fingers.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    until(lambda: shown_frames(phone)[1] - shown_frames(phone)[0] < (whole[1] - whole[0]) / 2.5, "two fingers zoom")
+
+
+@pytest.mark.slow
+def test_a_loop_is_drawn_and_told_when_it_closes(
+    studied: Studied, visit: Callable[..., Any], pictures_folder: Path
+) -> None:
+    closed = [{"earlier_s": 0.004, "later_s": 0.03}]
+
+    def retold(route: Any) -> None:
+        answer = route.fetch()
+        route.fulfill(response=answer, json=answer.json() | {"closures": closed})
+
+    page = visit("about:blank")
+    page.route(re.compile(r"/timeline\?"), retold)
+    page.goto(f"{studied.address}?page=scene&frame=500")
+    until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+    page.get_by_role("button", name="30.0").wait_for()
+    before, strip = still(page), picture(page, ".track > canvas")
+    closed.append({"earlier_s": 0.008, "later_s": 0.045})
+    choice = page.get_by_role("combobox", name="Version")
+    choice.select_option(index=1)  # another version: the timeline is asked for again
+    said = page.get_by_role("status").filter(has_text="Loop closed")
+    said.wait_for()
+    assert "sees again what it saw at 8.0" in said.inner_text()
+    choice.select_option("")
+    until(lambda: np.abs(picture(page, ".track > canvas") - strip).max() > 0.3, "it is marked on the timeline")
+    until(lambda: np.abs(picture(page) - before).max() > 0.3, "an arc is drawn")
+    keep(page, pictures_folder / "scene-loop.webp")
+    page.get_by_role("button", name="45.0").click()
+    until(lambda: "frame=900" in address(page), "it leads to the moment")
+    assert violations(page) == []
+    drawn = still(page)
+    page.get_by_role("checkbox", name="Closed loops").uncheck()
+    until(lambda: np.abs(picture(page) - drawn).max() > 0.1, "the layer is gone")
 
 
 @pytest.mark.slow

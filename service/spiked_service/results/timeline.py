@@ -28,9 +28,9 @@ _MOMENT = np.dtype(
         ("time_s", "f8"),
         ("frame", "i8"),
         ("state", "u1"),
-        *((name, "f4") for name in _MEANS),
-        ("psnr_db", "f4"),
-        ("splats", "f4"),
+        *((name, "f8") for name in _MEANS),
+        ("psnr_db", "f8"),
+        ("splats", "f8"),
     ]
 )
 

@@ -11,6 +11,8 @@ import { gapSpans, Plot, type PlotProps } from "./Plot";
 import { type Column, flicker, isKnown, joined, PLOTS } from "./series";
 
 const LIVE_MS = 2000;
+/** Points of a plot: several for each pixel, so that zooming in shows more. */
+const POINTS = 5000;
 
 export function Plots({
   capture,
@@ -23,8 +25,8 @@ export function Plots({
   other: Reconstruction | null;
   nameOf: (job: Reconstruction) => string;
 }): JSX.Element {
-  const own = useFetch(job.id, () => fetchTimeline(job.id));
-  const beside = useFetch(other?.id ?? null, () => fetchTimeline(other?.id ?? ""));
+  const own = useFetch(job.id, () => fetchTimeline(job.id, { points: POINTS }));
+  const beside = useFetch(other?.id ?? null, () => fetchTimeline(other?.id ?? "", { points: POINTS }));
   const ended = isEnded(job);
   const { again } = own;
   useEffect(() => {

@@ -2,21 +2,23 @@
 
 import { type JSX, useState } from "react";
 
-import type { Capture, Reconstruction, Version } from "../../shared/api/types";
+import type { Capture, Closure, Reconstruction, Version } from "../../shared/api/types";
 import { nameOf } from "../../shared/state/capture";
-import { count, decibel, percent } from "../../shared/state/format";
+import { count, decibel, duration, percent } from "../../shared/state/format";
 import { toast } from "../../shared/state/toasts";
 import { Icon } from "../../shared/ui/icons";
 import { JobBadge, JobReason, Meter, Segmented, Stat, trackingMeaning } from "../../shared/ui/parts";
 import { type Bookmark, readBookmarks, writeBookmarks } from "./bookmarks";
 import type { Colouring } from "./path";
 import { MAX_WIDTH_PX, type LineStyle, SPEED_STYLES, STATE_STYLES, STATES } from "./stateStyles";
+import type { Closures } from "./useClosures";
 import type { Shown } from "./useScene";
 import type { Layers, Steering } from "./Viewer";
 
 const LAYER_NAMES: Record<keyof Layers, string> = {
   splats: "Splats",
   path: "Path",
+  loops: "Closed loops",
   frustum: "Frustum",
   grid: "Grid",
   axes: "Axes",
@@ -40,6 +42,8 @@ export interface InspectorProps {
   onVersion: (version: number | null) => void;
   shown: Shown | null;
   loading: boolean;
+  closures: Closures;
+  onTime: (time_s: number) => void;
   full: boolean;
   onFull: () => void;
   layers: Layers;
@@ -114,6 +118,7 @@ export function Inspector(props: InspectorProps): JSX.Element {
         <Segmented label="Path coloured by" value={props.colouring} choices={COLOURINGS} onChange={props.onColouring} />
       </div>
       <Legend colouring={props.colouring} />
+      <Loops closures={props.closures} onTime={props.onTime} />
       <Bookmarks key={capture.id} captureId={capture.id} currentView={props.currentView} onView={props.onView} />
       <button type="button" onClick={props.onScreenshot}>
         <Icon name="camera" /> Screenshot
@@ -174,6 +179,13 @@ function Legend({ colouring }: { colouring: Colouring }): JSX.Element {
           </svg>
           missing
         </li>
+        <li title="The camera sees a place again: the empty diamond is the earlier sight of it">
+          <svg className="swatch" viewBox={`0 0 ${SWATCH_PX} ${MAX_WIDTH_PX + 4}`} aria-hidden="true">
+            <path className="loop earlier" d="M4 5.5 8 1.5 12 5.5 8 9.5z" />
+            <path className="loop" d="M20 5.5 24 1.5 28 5.5 24 9.5z" />
+          </svg>
+          closed loop
+        </li>
       </ul>
     </>
   );
@@ -198,6 +210,44 @@ function Swatch({ style }: { style: LineStyle }): JSX.Element {
     </svg>
   );
 }
+
+/** The newest closed loops in words; a loop that is closed while the page looks is said at once. */
+function Loops({ closures, onTime }: { closures: Closures; onTime: (time_s: number) => void }): JSX.Element {
+  const newest = closures.all.slice(-LOOPS_LISTED).reverse();
+  const last = closures.all.at(-1);
+  return (
+    <section className="bookmarks loops" aria-label="Closed loops">
+      <p className="hidden" role="status">
+        {closures.fresh > 0 && last !== undefined && `Loop closed: ${inWords(last)}`}
+      </p>
+      {newest.length > 0 && (
+        <>
+          <span className="dim">Closed loops: {count(closures.all.length)}</span>
+          <ul>
+            {newest.map((one, i) => (
+              <li key={`${one.earlier_s} ${one.later_s}`}>
+                <button
+                  type="button"
+                  className={i < closures.fresh ? "bare fresh" : "bare"}
+                  title={inWords(one)}
+                  onClick={() => onTime(one.later_s)}
+                >
+                  <Icon name="loop" /> {duration(one.later_s)} <span className="dim">sees again</span>{" "}
+                  {duration(one.earlier_s)}
+                </button>
+              </li>
+            ))}
+          </ul>
+        </>
+      )}
+    </section>
+  );
+}
+
+/** Closed loops that are listed: the newest. */
+const LOOPS_LISTED = 5;
+const inWords = (loop: Closure): string =>
+  `at ${duration(loop.later_s)} the camera sees again what it saw at ${duration(loop.earlier_s)}`;
 
 function Bookmarks({
   captureId,

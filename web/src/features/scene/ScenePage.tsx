@@ -23,11 +23,12 @@ import { type Colouring, rowAt } from "./path";
 import { RideAlong } from "./RideAlong";
 import { Scrubber } from "./Scrubber";
 import { usePath } from "./usePath";
+import { useClosures } from "./useClosures";
 import { useScene } from "./useScene";
 import { useVersions } from "./useVersions";
 import { type Layers, type Steering, Viewer } from "./Viewer";
 
-const LAYERS: Layers = { splats: true, path: true, frustum: true, grid: true, axes: true };
+const LAYERS: Layers = { splats: true, path: true, loops: true, frustum: true, grid: true, axes: true };
 const URL_MS = 300;
 
 export function ScenePage(): JSX.Element {
@@ -100,6 +101,7 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   const path = usePath(job, pinned);
   const { shown, loading, problem } = useScene(viewer, job, full, pinned);
 
+  const closures = useClosures(jobId, shown?.version ?? 0);
   const mount = useCallback((canvas: HTMLCanvasElement | null) => {
     if (canvas === null) return;
     let timer: ReturnType<typeof setTimeout> | undefined;
@@ -136,6 +138,9 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   useEffect(() => {
     if (path !== null) viewer?.setPath(path, colouring);
   }, [viewer, path, colouring]);
+  useEffect(() => {
+    if (path !== null) viewer?.setLoops(path, closures.all, closures.fresh);
+  }, [viewer, path, closures, shown?.version]);
   useEffect(() => viewer?.setLayers(layers), [viewer, layers]);
   useEffect(() => viewer?.steer(steering), [viewer, steering]);
   useEffect(() => viewer?.setRiding(at.ride), [viewer, at.ride]);
@@ -209,6 +214,8 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
         }}
         shown={shown}
         loading={loading}
+        closures={closures}
+        onTime={(time_s) => sensor !== null && adjust({ frame: Math.round(time_s * sensor.frame_rate_hz) })}
         full={full}
         onFull={() => setFull(true)}
         layers={layers}

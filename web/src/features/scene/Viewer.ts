@@ -18,12 +18,13 @@ import { LineMaterial } from "three/addons/lines/LineMaterial.js";
 import { LineSegments2 } from "three/addons/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "three/addons/lines/LineSegmentsGeometry.js";
 
-import type { Sensor } from "../../shared/api/types";
+import type { Closure, Sensor } from "../../shared/api/types";
 import { colour } from "../../shared/state/theme";
 import { type Placement, placementOf, pointOf, projectionOf } from "./axes";
 import { axisNames } from "./axisNames";
 import { type Changes, changed, NO_SLOTS, type Slots } from "./changes";
 import { type Colouring, type Path, quantile } from "./path";
+import { LoopLines } from "./loops";
 import { OVERLAY_ORDER, PathLines } from "./PathLines";
 
 export type Steering = "orbit" | "fly";
@@ -31,12 +32,15 @@ export type Steering = "orbit" | "fly";
 export interface Layers {
   splats: boolean;
   path: boolean;
+  loops: boolean;
   frustum: boolean;
   grid: boolean;
   axes: boolean;
 }
 
 const FRUSTUM_PX = 1.6;
+/** Size of the diamonds at closed loops, in units of the depth of the scene. */
+const LOOP_SIZE = 0.03;
 const SAMPLE = 20_000;
 /** Room for splats that come later, so that a growing scene does not get new textures with every version. */
 const HEADROOM = 1.25;
@@ -76,11 +80,12 @@ export class Viewer {
   /** Splats for which the textures have room. */
   private capacity = 0;
   private readonly path = new PathLines();
+  private readonly loops = new LoopLines();
   private readonly frustum = new LineSegments2(new LineSegmentsGeometry(), new LineMaterial({ linewidth: FRUSTUM_PX }));
   private grid = new GridHelper(1, 1);
   private readonly gridColour = new Color();
   private readonly axes = new AxesHelper(1);
-  private layers: Layers = { splats: true, path: true, frustum: true, grid: true, axes: true };
+  private layers: Layers = { splats: true, path: true, loops: true, frustum: true, grid: true, axes: true };
   private extent: Extent | null = null;
   private placement: Placement | null = null;
   private sensor: Sensor | null = null;
@@ -108,7 +113,7 @@ export class Viewer {
       enableLod: false,
     });
     this.turned.quaternion.set(1, 0, 0, 0);
-    this.world.add(this.spark, this.turned, this.path, this.frustum, this.axes);
+    this.world.add(this.spark, this.turned, this.path, this.loops, this.frustum, this.axes);
     this.frustum.renderOrder = OVERLAY_ORDER;
     this.frustum.frustumCulled = false;
     this.frustum.material.depthTest = false;
@@ -151,6 +156,7 @@ export class Viewer {
     this.canvas.removeEventListener("blur", this.flyWhileFocused);
     this.mesh?.dispose();
     this.path.clear();
+    this.loops.clear();
     this.canvas.removeEventListener("webglcontextlost", this.onLost);
     this.canvas.removeEventListener("webglcontextrestored", this.draw);
     this.renderer.dispose();
@@ -196,6 +202,7 @@ export class Viewer {
     const { layers } = this;
     if (this.mesh !== null) this.mesh.visible = layers.splats;
     this.path.visible = layers.path && !this.riding;
+    this.loops.visible = layers.loops && !this.riding;
     // The size of the frustum follows the scene, so none is drawn before there is one.
     const placed = this.extent !== null && this.placement !== null && this.sensor !== null;
     this.frustum.visible = layers.frustum && !this.riding && placed;
@@ -263,6 +270,7 @@ export class Viewer {
     this.placed = false;
     this.placement = null;
     this.path.clear();
+    this.loops.clear();
     this.show();
   }
 
@@ -306,6 +314,11 @@ export class Viewer {
 
   setPath(path: Path, by: Colouring): void {
     this.path.set(path, by);
+    this.show();
+  }
+
+  setLoops(path: Path, closures: readonly Closure[], fresh: number): void {
+    this.loops.set(path, closures, (this.extent?.depth ?? 1) * LOOP_SIZE, fresh);
     this.show();
   }
 

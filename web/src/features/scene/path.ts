@@ -34,18 +34,23 @@ export function pathOf(trajectory: Trajectory, tail: readonly Pose[] = []): Path
 }
 
 /** Row of the pose nearest to a frame; -1 for an empty path. */
-export function rowAt(path: Path, frame: number): number {
-  const n = path.frames.length;
+export const rowAt = (path: Path, frame: number): number => nearest(path.frames, frame);
+
+/** Row of the pose nearest to a time in seconds; -1 for an empty path. */
+export const rowAtTime = (path: Path, time_s: number): number => nearest(path.times, time_s);
+
+function nearest(sorted: Float64Array, wanted: number): number {
+  const n = sorted.length;
   if (n === 0) return -1;
   let low = 0;
   let high = n - 1;
   while (low < high) {
     const middle = (low + high) >> 1;
-    if ((path.frames[middle] ?? 0) < frame) low = middle + 1;
+    if ((sorted[middle] ?? 0) < wanted) low = middle + 1;
     else high = middle;
   }
-  const before = path.frames[low - 1];
-  return before !== undefined && frame - before < (path.frames[low] ?? 0) - frame ? low - 1 : low;
+  const before = sorted[low - 1];
+  return before !== undefined && wanted - before < (sorted[low] ?? 0) - wanted ? low - 1 : low;
 }
 
 /** Speeds, length units of the scene a second: centred differences over some poses, against the noise of single ones. */

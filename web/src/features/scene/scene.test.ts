@@ -5,6 +5,7 @@ import type { Trajectory } from "../../shared/api/types";
 import { placementOf, projectionOf } from "./axes";
 import { classes, pathOf, rowAt, runs, stylesBy, speeds, thinned } from "./path";
 import { SPEED_STYLES, STATE_STYLES, STATES } from "./stateStyles";
+import { containing, moved, zoomed } from "./timelineWindow";
 import { readBookmarks, writeBookmarks } from "./bookmarks";
 
 const straight = (n: number): Trajectory => ({
@@ -109,4 +110,19 @@ it("keeps bookmarks and ignores what is not one", () => {
   expect(readBookmarks("c")).toEqual([]);
   localStorage.setItem("spiked.bookmarks.c", "{");
   expect(readBookmarks("c")).toEqual([]);
+});
+
+it("zooms the timeline around a frame, keeps it inside, and shows everything again", () => {
+  const whole = { first: 0, last: 1_200_000 };
+  const once = zoomed(null, whole, 4, 900_000);
+  expect(once).toEqual({ first: 675_000, last: 975_000 });
+  expect(moved(once, whole, 1_000_000)).toEqual({ first: 900_000, last: 1_200_000 });
+  expect(moved(once, whole, -1_000_000)).toEqual({ first: 0, last: 300_000 });
+  expect(containing(once, whole, 980_000)).toEqual({ first: 680_000, last: 980_000 });
+  expect(containing(once, whole, 700_000)).toBe(once);
+  expect(zoomed(once, whole, 1 / 5, 0)).toBeNull();
+  const close = zoomed(null, whole, 1e9, 5);
+  expect((close?.last ?? 0) - (close?.first ?? 0)).toBe(100);
+  expect(zoomed(null, { first: 3, last: 50 }, 2, 10)).toBeNull();
+  expect(moved(null, whole, 5)).toBeNull();
 });

@@ -78,8 +78,13 @@ export const submit = (captureId: string, options: OptionValues): Promise<Recons
   );
 export const cancel = (id: string): Promise<Reconstruction> =>
   answered(client.POST("/api/v1/reconstructions/{reconstruction_id}:cancel", ofReconstruction(id)));
-export const timeline = (id: string): Promise<Timeline> =>
-  answered(client.GET("/api/v1/reconstructions/{reconstruction_id}/timeline", ofReconstruction(id)));
+/** At most `points` neighbouring moments joined, of a part of the time. */
+export const timeline = (id: string, asked: { points: number; from_s?: number; to_s?: number }): Promise<Timeline> =>
+  answered(
+    client.GET("/api/v1/reconstructions/{reconstruction_id}/timeline", {
+      params: { path: { reconstruction_id: id }, query: asked },
+    }),
+  );
 /** Kept versions, oldest first. */
 export const versions = async (id: string): Promise<Version[]> =>
   (await answered(client.GET("/api/v1/reconstructions/{reconstruction_id}/versions", ofReconstruction(id)))).items;

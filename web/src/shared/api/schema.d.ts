@@ -639,7 +639,7 @@ export interface paths {
         };
         /**
          * Get Timeline
-         * @description Timeline: state, fit and loss over the frames.
+         * @description Timeline: state, fit and loss over the frames, and closed loops; a part of it, at most so many points.
          *
          *     Scope of a token: `read`.
          */
@@ -1329,6 +1329,16 @@ export interface components {
             frame: number;
             /** Unix Ns */
             unix_ns: number;
+        };
+        /**
+         * ClosureOut
+         * @description A closed loop: the camera sees at the later time what it saw at the earlier one; seconds since the start.
+         */
+        ClosureOut: {
+            /** Earlier S */
+            earlier_s: number;
+            /** Later S */
+            later_s: number;
         };
         /**
          * ConsumerOut
@@ -2222,6 +2232,11 @@ export interface components {
             splats: (number | null)[];
             /** Gaps */
             gaps: components["schemas"]["GapOut"][];
+            /**
+             * Closures
+             * @description In the order in which they were closed.
+             */
+            closures: components["schemas"]["ClosureOut"][];
         };
         /**
          * TokenOut
@@ -6035,7 +6050,14 @@ export interface operations {
     };
     get_timeline_api_v1_reconstructions__reconstruction_id__timeline_get: {
         parameters: {
-            query?: never;
+            query?: {
+                /** @description First time, seconds since the start of the capture. */
+                from_s?: number | null;
+                /** @description End time, not included, in seconds. */
+                to_s?: number | null;
+                /** @description Most points: neighbours are joined. Default: every tracked view. */
+                points?: number | null;
+            };
             header?: never;
             path: {
                 reconstruction_id: string;

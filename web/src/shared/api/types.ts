@@ -29,6 +29,7 @@ export type RateHistogram = Schemas["RateHistogram"];
 /** Pixels as [x, y]; the generated client forgets that pairs have two numbers. */
 export type Stats = Omit<Schemas["StatsOut"], "hot_pixels"> & { hot_pixels: number[][] };
 export type Gap = Schemas["GapOut"];
+export type Closure = Schemas["ClosureOut"];
 export type Timeline = Schemas["TimelineOut"];
 export type System = Schemas["SystemOut"];
 export type Setting = Schemas["SettingOut"];

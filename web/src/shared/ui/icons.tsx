@@ -30,6 +30,10 @@ const PATHS = {
   close: "M4 4l8 8M12 4l-8 8",
   compare: "M8 1.5v13M2 4h4v8H2zM10 4h4v8h-4z",
   key: "M5 6.5a2.8 2.8 0 1 0 .01 0M7.2 9.2H14v2.6M11 9.2v2",
+  plus: "M8 3v10M3 8h10",
+  minus: "M3 8h10",
+  whole: "M2 3.5v9M14 3.5v9M4.5 8h7M6.5 6l-2 2 2 2M9.5 6l2 2-2 2",
+  loop: "M4 5.5a5 5 0 1 1-.8 4.6M3 2.5v3.5h3.5",
   home: "M2 8l6-5.5L14 8M4 6.5V13h8V6.5",
 } as const;
 

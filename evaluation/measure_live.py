@@ -212,7 +212,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--steps", type=int, default=0, help="of refinement after the capture")
     parser.add_argument("--page", action="store_true", help="with the scene page open in Chromium")
-    parser.add_argument("--folder", type=Path, default=Path("."), help="where the recording is written, 250 MB a second")
+    parser.add_argument("--folder", type=Path, default=Path(), help="where it is recorded, 250 MB a second")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=given.folder) as folder:
         found = measure(given.recording, given.truth, given.seconds, given.steps, given.page, Path(folder))

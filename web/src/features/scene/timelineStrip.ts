@@ -50,13 +50,13 @@ export function paint(
     pen.fillRect(from, over, place(seen.at(-1)?.to ?? 0) - from, inner);
     for (const { state, after, to } of seen) {
       const style = STATE_STYLES[state];
-      const left = Math.max(place(after), 0);
+      const left = Math.round(Math.max(place(after), 0)); // whole pixels: gaps between dashes stay dark
       const right = Math.min(Math.max(place(to), left + ratio), width);
-      const thick = (inner * style.width_px) / MAX_WIDTH_PX;
+      const thick = Math.round((inner * style.width_px) / MAX_WIDTH_PX);
       const [dash, gap] = (style.dash_px ?? [Infinity, 0]).map((length) => length * ratio) as [number, number];
       pen.fillStyle = colour(style.colour);
       for (let x = left; x < right; x += dash + gap)
-        pen.fillRect(x, (height - thick) / 2, Math.min(dash, right - x), thick);
+        pen.fillRect(x, Math.floor((height - thick) / 2), Math.min(dash, right - x), thick);
     }
     for (const gap of timeline.gaps) {
       const wide = Math.max(place(gap.first + gap.count) - place(gap.first), ratio);

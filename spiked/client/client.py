@@ -229,8 +229,8 @@ class Spiked:
         points: int | None = None,
     ) -> TimelineOut:
         """How it went, or a part of it; neighbouring views are joined to at most `points`."""
-        query = {"from_s": from_s, "to_s": to_s, "points": points}
-        return self._connection.get(f"reconstructions/{reconstruction_id}/timeline", TimelineOut, query=query)
+        path = f"reconstructions/{reconstruction_id}/timeline"
+        return self._connection.get(path, TimelineOut, from_s=from_s, to_s=to_s, points=points)
 
     def trajectory(
         self,

@@ -224,8 +224,12 @@ def test_not_a_number_is_refused(service: Any, job: str) -> None:
 
 def test_a_timeline_and_a_log(service: Any, job: str) -> None:
     timeline = service.client.timeline(job)
-    lengths = {len(values) for name, values in timeline.model_dump().items() if name != "gaps"}
+    lengths = {len(values) for name, values in timeline.model_dump().items() if name not in ("gaps", "closures")}
     assert lengths == {len(timeline.frame)} and len(timeline.frame) > 5
+    coarse = service.client.timeline(job, points=3)
+    assert len(coarse.frame) <= 3 and coarse.frame[-1] == timeline.frame[-1]
+    part = service.client.timeline(job, from_s=timeline.time_s[2], to_s=timeline.time_s[4])
+    assert part.frame == timeline.frame[2:4]
     assert timeline.frame == sorted(timeline.frame)
     assert service.http.get(f"reconstructions/{job}/log").status_code == 200
 

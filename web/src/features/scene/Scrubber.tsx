@@ -66,12 +66,14 @@ export function Scrubber({
     setPlaying(false);
     adjust({ frame: Math.round(Math.min(Math.max(to, whole.first), whole.last)) });
   };
-  /** Who looks elsewhere follows the newest pose no longer. */
-  const look = (next: Span | null): void => {
+  /** Several gestures may come before the next rendering. Who looks elsewhere follows the newest pose no longer. */
+  const look = (change: (before: Span | null) => Span | null): void => {
+    const next = change(part);
     if (following && next !== null && (frame < next.first || frame > next.last)) adjust({ frame });
-    setZoom(next);
+    setZoom((before) => change(following ? containing(before, whole, frame) : before));
   };
-  const zoomBy = (factor: number, around = frame): void => look(zoomed(part, whole, factor, around));
+  const zoomBy = (factor: number, around = frame): void => look((before) => zoomed(before, whole, factor, around));
+  const pan = (frames: number): void => look((before) => moved(before, whole, frames));
   const onKeyDown = (event: KeyboardEvent): void => {
     const action = {
       "+": () => zoomBy(ZOOM_STEP),
@@ -105,7 +107,7 @@ export function Scrubber({
           frameRateHz={frameRateHz}
           describe={(at) => (path === null ? "" : describe(path, (timeline.part ?? timeline.whole)?.gaps ?? [], at))}
           onZoom={zoomBy}
-          onPan={(frames) => look(moved(part, whole, frames))}
+          onPan={pan}
           onSeek={seek}
         />
         <input
@@ -119,9 +121,12 @@ export function Scrubber({
           disabled={empty}
           onChange={(event) => seek(event.target.valueAsNumber)}
         />
-        {part !== null && (
-          <Overview timeline={timeline.whole} whole={whole} part={part} frameRateHz={frameRateHz} onMove={look} />
-        )}
+        <div className="overview" aria-hidden="true">
+          {/* The room is kept, so that nothing moves from under the pointer. */}
+          {part !== null && (
+            <Overview timeline={timeline.whole} whole={whole} part={part} frameRateHz={frameRateHz} onMove={pan} />
+          )}
+        </div>
       </div>
       <div className="zoom" role="group" aria-label="Zoom of the timeline">
         <button
@@ -234,7 +239,7 @@ function Overview({
   whole: Span;
   part: Span;
   frameRateHz: number | null;
-  onMove: (part: Span | null) => void;
+  onMove: (frames: number) => void;
 }): JSX.Element {
   const canvas = useRef<HTMLCanvasElement>(null);
   const frame = useRef<HTMLSpanElement>(null);
@@ -246,14 +251,13 @@ function Overview({
     style.left = `${(100 * (part.first - whole.first)) / length}%`;
     style.width = `${(100 * (part.last - part.first)) / length}%`;
   });
-  const centre = (share: number): void =>
-    onMove(moved(part, whole, whole.first + share * length - (part.first + part.last) / 2));
-  useGestures(canvas, { pan: (share) => onMove(moved(part, whole, share * length)), tap: centre });
+  const centre = (share: number): void => onMove(whole.first + share * length - (part.first + part.last) / 2);
+  useGestures(canvas, { pan: (share) => onMove(share * length), tap: centre });
   return (
-    <div className="overview" aria-hidden="true">
+    <>
       <canvas ref={canvas} />
       <span ref={frame} />
-    </div>
+    </>
   );
 }
 

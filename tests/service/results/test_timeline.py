@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from spiked_service.results.timeline import STATES, Timeline, Timelines
+from spiked_service.results.timeline_writer import TimelineWriter
 
 from spiked.recon import State
 
@@ -51,3 +52,15 @@ def test_what_is_added_is_read_and_a_new_timeline_takes_its_place(tmp_path: Path
     assert len(again.moments) == 200 and not again.closures
     path.write_text(line(5))
     np.testing.assert_array_equal(timelines.read(path).moments["frame"], [5])
+
+
+def test_closed_loops_are_told_once_also_after_a_resumption(tmp_path: Path) -> None:
+    path = tmp_path / "timeline.jsonl"
+    path.write_text(line(16) + '{"closure": {"earlier_s": 0.1, "later_s": 3.5}}\n' + gap(20, 4) + line(32))
+    writer = TimelineWriter(tmp_path, views=2, frames=40)
+    assert writer.moments == 2
+    for closures in ([(0.1, 3.5)], [(0.1, 3.5), (0.2, 3.6)]):
+        writer.closed(closures)
+    timeline = Timeline.read(path)
+    assert [(one.earlier_s, one.later_s) for one in timeline.closures] == [(0.1, 3.5), (0.2, 3.6)]
+    assert len(timeline.moments) == 2 and len(timeline.gaps) == 1

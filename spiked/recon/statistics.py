@@ -10,6 +10,11 @@ WHITE_PERCENTILE = 99.5
 """Percentile of an image's rates that is shown as white: a few pixels are lamps, reflections or hot."""
 
 
+def evenly(length: int, count: int) -> list[int]:
+    """At most `count` of the indices of `length` things, evenly spread from the first to the last, ascending."""
+    return [int(i) for i in np.unique(np.linspace(0, length - 1, min(count, length)).round())]
+
+
 def median(values: Array) -> float:
     """Of [n > 0] numbers without NaN: `np.median` takes five times as long to look for axes and NaN as to sort."""
     middle = len(values) // 2

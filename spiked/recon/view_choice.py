@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from spiked.pose import Array
 from spiked.recon.odometry.sparse_map import TrackedView
+from spiked.recon.statistics import evenly
 
 CELL_PX = 32.0
 """Side of a cell of the surface in the image, at the distance of a power of two just below that of the camera."""
@@ -41,7 +42,7 @@ def choose(views: Sequence[TrackedView], points: Array, focal_px: float, most: i
         chosen, each = more, 2 * each
     if not chosen:  # too many even with one view of each cell
         more = _seen_by_fewer(cells, 1)
-        chosen = more and [more[i] for i in np.linspace(0, len(more) - 1, most).round().astype(int)]
+        chosen = [more[i] for i in evenly(len(more), most)]
     return sorted(views[row].id for row in chosen)
 
 

@@ -11,6 +11,7 @@ from spiked.recon.frontend.recorded_views import RecordedViews, ViewFrames
 from spiked.recon.frontend.windowing import View
 from spiked.recon.odometry.sparse_map import TrackedView
 from spiked.recon.odometry.tracking_state import State
+from spiked.recon.statistics import evenly
 from spiked.spline import Path
 
 PROTECTED_VIEWS = 16
@@ -191,7 +192,7 @@ class ViewStore:
     @staticmethod
     def spread(ids: Sequence[int], count: int) -> list[int]:
         """At most `count` of these ids, evenly spread."""
-        return [ids[i] for i in np.unique(np.linspace(0, len(ids) - 1, min(count, len(ids))).round().astype(int))]
+        return [ids[i] for i in evenly(len(ids), count)]
 
     def nearest(self, time: float) -> int | None:
         """Id of the kept view nearest to a time in frames; None without views."""

@@ -16,7 +16,7 @@ from spiked.recon.merging.coverage import Agreement, Shown, compare, fineness
 from spiked.recon.merging.known_map import KnownMap
 from spiked.recon.merging.registration import MapPlace, NotOnePlaceError, Registration, register
 from spiked.recon.odometry.sparse_map import Pose
-from spiked.recon.statistics import median
+from spiked.recon.statistics import evenly, median
 from spiked.render import rasteriser_for
 from spiked.scene import Scene
 from spiked.trajectory import Trajectory
@@ -144,8 +144,7 @@ def join(first: KnownMap, second: KnownMap, threads: int | None = None) -> Joint
 
 def some(views: Sequence[_Any]) -> list[_Any]:
     """At most `FINENESS_VIEWS` views, evenly spread."""
-    rows = np.unique(np.linspace(0, len(views) - 1, min(len(views), FINENESS_VIEWS)).round().astype(int))
-    return [views[row] for row in rows]
+    return [views[row] for row in evenly(len(views), FINENESS_VIEWS)]
 
 
 def _path(own: list[MapPlace]) -> Trajectory:

@@ -62,14 +62,15 @@ def moved_path(path: Trajectory, similarity: Similarity) -> Trajectory:
 def moved_scene(scene: Scene, similarity: Similarity, brightness: float = 1.0) -> Scene:
     """A copy of a scene in another frame of reference, its radiance multiplied by `brightness`."""
     turn = quaternion(similarity.rotation)
-    return Scene(
+    moved = Scene(
         np.ascontiguousarray(similarity.points(scene.means.astype(np.float64)), np.float32),
         np.ascontiguousarray(turned_quaternions(turn, scene.quats), np.float32),
         scene.log_scales + np.float32(np.log(similarity.scale)),
         scene.opacity_logits.copy(),
-        scene.colours * np.float32(brightness),
-        None if scene.white is None else scene.white * brightness,
+        scene.colours,
+        scene.white,
     )
+    return brightened(moved, brightness)
 
 
 def turned_quaternions(by: Array, quats: NDArray[np.float32]) -> Array:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from spiked.evaluate import Similarity
 from spiked.pose import Array, exp_so3, log_so3, quaternion
-from spiked.recon.merging.known_map import turned_quaternions
+from spiked.recon.merging.known_map import brightened, turned_quaternions
 from spiked.scene import Scene
 from spiked.trajectory import Trajectory
 
@@ -61,11 +61,12 @@ class PathWarp:
             means += share[:, None] * part.points(points)
             log_scale += share * np.log(part.scale)
         best = quaternion(np.stack([part.rotation for part in parts]))[shares.argmax(1)]
-        return Scene(
+        moved = Scene(
             np.ascontiguousarray(means, np.float32),
             np.ascontiguousarray(turned_quaternions(best, scene.quats), np.float32),
             np.ascontiguousarray(scene.log_scales + log_scale[:, None], np.float32),
             scene.opacity_logits.copy(),
-            scene.colours * np.float32(brightness),
-            None if scene.white is None else scene.white * brightness,
+            scene.colours,
+            scene.white,
         )
+        return brightened(moved, brightness)

@@ -38,8 +38,8 @@ AGREEING_VIEWS = 3
 AGREEING_PX, RUN_PX = 12.0, 60.0
 """Largest difference of their corrections, as image motion, and largest image motion from one to the next."""
 MOST_DRIFT = 0.2
-"""Largest correction of a view, as image motion, over the image motion of the loop: two equal walls of a room are
-farther apart."""
+"""Largest correction of a view, as image motion, over the image motion of the loop. Chosen, not measured: drift of a
+long path was below it, and two equal parts of a room may be nearer (decision 19)."""
 RIVAL = 0.6
 """Points of another place that agree, over those of the best one, from which on the two cannot be told apart."""
 COARSE_LEVELS, FINE_LEVELS = 4, 2
@@ -113,8 +113,8 @@ class LoopSearch:
 
     def search(self, view: TrackedView) -> list[LoopClosure]:
         """Closures to be applied: of a new kept view, and of those just before it that it confirms."""
-        travelled_px = self.index.travelled_px(view.id)
-        if self._run and travelled_px - self.index.travelled_px(self._run[-1].later.id) > RUN_PX:
+        travelled_px = self.map.travelled_px(view.id)
+        if self._run and travelled_px - self.map.travelled_px(self._run[-1].later.id) > RUN_PX:
             self._run = []
         undecided = 0 < len(self._run) < AGREEING_VIEWS
         if view.pose is None or (not undecided and travelled_px - self._searched_px < EVERY_PX):
@@ -135,7 +135,7 @@ class LoopSearch:
 
     def _add(self, view: TrackedView) -> Features | None:
         """Add a view to the index; its features, if its place is kept with them."""
-        travelled_px = self.index.travelled_px(view.id)
+        travelled_px = self.map.travelled_px(view.id)
         if travelled_px - self._searched_px < EVERY_PX:
             return None
         self._searched_px = travelled_px
@@ -150,7 +150,7 @@ class LoopSearch:
     def _find_by_features(self, view: TrackedView, features: Features) -> LoopClosure | None:
         """The loop of a view with a place that looks alike, wherever the path says that it is."""
         assert view.pose is not None
-        before_px = self.index.travelled_px(view.id) - LEAST_APART_PX
+        before_px = self.map.travelled_px(view.id) - LEAST_APART_PX
         found: list[LoopClosure] = []
         for pose, _ in self.index.drawn_poses(features, before_px):
             one = find_by_path(self.map, self.pictures, self.index, view, pose)
@@ -166,7 +166,7 @@ class LoopSearch:
         return best
 
     def _plausible(self, closure: LoopClosure) -> bool:
-        way_px = self.index.travelled_px(closure.later.id) - self.index.travelled_px(closure.earlier.id)
+        way_px = self.map.travelled_px(closure.later.id) - self.map.travelled_px(closure.earlier.id)
         return closure.correction_px(self.map.intrinsics) < MOST_DRIFT * way_px
 
     def _confirmed(self, found: LoopClosure) -> list[LoopClosure]:
@@ -200,7 +200,7 @@ def find_by_path(
     """The loop of a view, taken to be at `expected`, with the earlier one of which it should see most points again."""
     known = sparse_map.known_tracks(view)[0]
     depth = median((sparse_map.points[known] - expected.centre) @ expected.rotation[:, 2]) if len(known) else 1.0
-    before_px = index.travelled_px(view.id) - LEAST_APART_PX
+    before_px = sparse_map.travelled_px(view.id) - LEAST_APART_PX
     best, most = None, LEAST_INSIDE
     for other in index.near(expected, max(depth, LEAST_DEPTH), before_px, COMPARED):
         assert other.rotation is not None
@@ -225,7 +225,7 @@ def spread_drift(sparse_map: SparseMap, found: list[LoopClosure]) -> list[LoopCl
     """
     if not found:
         return []
-    travelled_px = _travelled_px(sparse_map)
+    travelled_px = np.array([sparse_map.travelled_px(view.id) for view in sparse_map.views])
     first = min((closure.later for closure in found), key=lambda view: view.id)
     closures = [
         closure
@@ -294,11 +294,6 @@ def _poses(closures: list[LoopClosure]) -> list[tuple[Pose, Pose]]:
 def shift_px(intrinsics: Intrinsics, a: Pose, b: Pose, depth: float) -> float:
     """How far the image moves from one pose to another, at most, for points at `depth`."""
     return float(shifts_px(intrinsics, a.rotation, a.centre, b, depth))
-
-
-def _travelled_px(sparse_map: SparseMap) -> Array:
-    """Image motion up to each view."""
-    return np.cumsum([view.moved_px for view in sparse_map.views])
 
 
 def _match(

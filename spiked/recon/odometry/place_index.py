@@ -63,16 +63,9 @@ class PlaceIndex:
     numbers: list[int] = field(default_factory=list)
     """Ids of the views, ascending."""
     places: list[Place] = field(default_factory=list)
-    _travelled_px: list[float] = field(default_factory=list)
     _retrieval: Retrieval | None = None
     _learned: int = 0
     """Number of places from which the retrieval has its principal components."""
-
-    def travelled_px(self, number: int) -> float:
-        """Image motion up to a view."""
-        for view in self.map.views[len(self._travelled_px) :]:
-            self._travelled_px.append((self._travelled_px[-1] if self._travelled_px else 0.0) + view.moved_px)
-        return self._travelled_px[number]
 
     def add(self, view: TrackedView) -> None:
         """Add a view, newer than the others, that was taken elsewhere."""
@@ -96,7 +89,7 @@ class PlaceIndex:
 
         `depth` is what a shift of the camera is compared with.
         """
-        last = bisect_left(self.numbers, before_px, key=self.travelled_px)
+        last = bisect_left(self.numbers, before_px, key=self.map.travelled_px)
         views = [view for view in map(self.map.views.__getitem__, self.numbers[:last]) if view.pose is not None]
         if not views:
             return []
@@ -110,7 +103,7 @@ class PlaceIndex:
         if self._retrieval is None:
             return []
         votes = self._retrieval.votes(features)
-        old = np.array([self.travelled_px(place.view.id) < before_px for place in self.places])
+        old = np.array([self.map.travelled_px(place.view.id) < before_px for place in self.places])
         votes[~old] = 0
         drawn = []
         for row in np.argsort(-votes, kind="stable")[:RETRIEVED]:

@@ -140,6 +140,13 @@ class SparseMap:
     noise_px: float = 0.0
     """Standard deviation of a track's place in one view and one direction, by the last initialisation or
     adjustment of keyframes or of the whole path."""
+    _travelled_px: list[float] = field(default_factory=list)
+
+    def travelled_px(self, number: int) -> float:
+        """Image motion from the first view up to view `number`."""
+        for view in self.views[len(self._travelled_px) :]:
+            self._travelled_px.append((self._travelled_px[-1] if self._travelled_px else 0.0) + view.moved_px)
+        return self._travelled_px[number]
 
     def reserve(self, tracks: int) -> None:
         """Make room for the points of track ids below `tracks`."""

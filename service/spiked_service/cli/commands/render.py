@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 from rich.progress import track
 
+from spiked.recon.statistics import evenly
 from spiked.render import Camera
 from spiked.render.cpu import Rasteriser
 from spiked.scene import Scene
@@ -45,7 +45,7 @@ def render(
     rasteriser = Rasteriser(Camera(k, width, height))
     splats, path = Scene.read_ply(scene), Trajectory.read_tum(poses)
     shown_white = splats.colour_of_white if white is None else white
-    rows = np.unique(np.linspace(0, len(path) - 1, count).round().astype(int))
+    rows = evenly(len(path), count)
     with outputs.writing("--out", out):
         out.mkdir(parents=True, exist_ok=True)
         for row in track(rows, "rendering", console=messages, transient=True):

@@ -273,7 +273,7 @@ class Reconstructor:
                 return cancelled() or time.perf_counter() > deadline
 
             with self._log.measure("tracking"):
-                self._end_tracking(stop)
+                self._end_tracking(stop, save)
             if not stop():  # otherwise loops may be open
                 self.tracking_ended = True
                 save()
@@ -285,12 +285,12 @@ class Reconstructor:
         self._stage = "done"
         progress(self.status())
 
-    def _end_tracking(self, stop: Callable[[], bool]) -> None:
+    def _end_tracking(self, stop: Callable[[], bool], save: Callable[[], None]) -> None:
         with one_blas_thread():
             for view in self._windows.flush():
                 self._track(view)
             if self._given is None:
-                self.odometry.end(stop)
+                self.odometry.end(stop, save)
                 self._waypoints = -1, None  # the views have moved
             else:
                 self._unit = self._given.end(self.odometry, self._frames)

@@ -130,6 +130,22 @@ def test_a_copy_ends_like_the_original(walked: tuple[Reconstructor, Trajectory],
     assert ends[0] is not None and ends[1] is not None and (ends[0] == ends[1]).all()
 
 
+def test_a_copy_of_the_last_adjustment_ends_like_it(
+    walked: tuple[Reconstructor, Trajectory], not_ended: Odometry
+) -> None:
+    """One between closing loops and the last rounds, and one before the very last."""
+    odometry, copies = deepcopy(not_ended), list[Odometry]()
+    odometry.end(save=lambda: copies.append(deepcopy(odometry)))
+    assert len(copies) > 3
+    for copy in (copies[0], copies[-2]):
+        rounds = list[None]()
+        copy.end(save=lambda: rounds.append(None))  # noqa: B023
+        assert 0 < len(rounds) < len(copies)
+        for mine, theirs in zip(copy.views, walked[0].odometry.views, strict=True):
+            assert mine.centre is not None and theirs.centre is not None
+            assert (mine.centre == theirs.centre).all()
+
+
 def test_no_loop_is_closed_between_different_places(walked: tuple[Reconstructor, Trajectory]) -> None:
     """Images of another room in the place of the later ones: the path says that they should match."""
     reconstructor, _ = walked

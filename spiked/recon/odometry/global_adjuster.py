@@ -113,8 +113,10 @@ class GlobalAdjuster:
                     view.pose, view.state = None, State.LOST
             effort = FULL_EFFORT
 
-    def finish(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """The last adjustments: an estimated focal length may need several. Ends after one if `stop` is true."""
+    def finish(self, stop: Callable[[], bool] = lambda: False, save: Callable[[], None] = lambda: None) -> None:
+        """The last adjustments: an estimated focal length may need several. Ends after one if `stop` is true. They are
+        one piece: `save` is not called."""
+        del save
         self.adjust()
         for _ in range(MAX_FOCAL_ROUNDS):
             before = self.map.intrinsics.fx

@@ -91,6 +91,9 @@ class KeyframeAdjuster:
     """Number of keyframes at which its result is taken; without one, from which the next may begin."""
     _open: bool = False
     """Loops were closed since the last adjustment of all keyframes."""
+    _loop_rounds: int = 0
+    _final_rounds: int = 0
+    """Rounds of `finish` that are done."""
 
     @property
     def reference_views(self) -> list[TrackedView]:
@@ -181,26 +184,33 @@ class KeyframeAdjuster:
             chosen |= {closure.earlier.id: closure.earlier, closure.later.id: closure.later}
         return _in_order(chosen)
 
-    def finish(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Close loops and adjust all keyframes; every view follows. See `PathAdjuster.finish` about `stop`."""
+    def finish(self, stop: Callable[[], bool] = lambda: False, save: Callable[[], None] = lambda: None) -> None:
+        """Close loops and adjust all keyframes; every view follows. See `PathAdjuster.finish` about the arguments."""
         self._choose()
         if self._whole is not None and stop():
             self._whole.stop()
         self._take_whole(now=True)
-        for turn in range(LOOP_ROUNDS):
-            if stop():
-                return
+        while self._loop_rounds < LOOP_ROUNDS and not stop():
             found = find_closures(self.map, self.pictures, self.loops.index)
             closures = spread_drift(self.map, found)
-            if not closures and not (turn == 0 and self._open):
-                break
-            self._link(closures)
-            self._adjust_all(LOOP_ITERATIONS, stop)
-        for _ in range(FINAL_ROUNDS):
+            if closures or (self._open and self._loop_rounds == 0):
+                self._link(closures)
+                self._adjust_all(LOOP_ITERATIONS, stop)
+                self._loop_rounds += 1
+            else:
+                self._loop_rounds = LOOP_ROUNDS
+            self._save_unless(stop, save)
+        while self._final_rounds < FINAL_ROUNDS and not stop():
             self._adjust_all(FINAL_ITERATIONS, stop)
             self.map.triangulate(self._all_chosen())
-            if stop():
-                return
+            self._final_rounds += 1
+            self._save_unless(stop, save)
+
+    @staticmethod
+    def _save_unless(stop: Callable[[], bool], save: Callable[[], None]) -> None:
+        """A round that was stopped early is not done."""
+        if not stop():
+            save()
 
     def _adjust_all(self, iterations: int, stop: Callable[[], bool]) -> None:
         """Adjust all keyframes and their points; all other views follow."""

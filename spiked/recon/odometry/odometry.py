@@ -210,14 +210,14 @@ class Odometry:
         self._map.reserve(self._tracks.next_id)
         return view
 
-    def end(self, stop: Callable[[], bool] = lambda: False) -> None:
+    def end(self, stop: Callable[[], bool] = lambda: False, save: Callable[[], None] = lambda: None) -> None:
         """After the last view: a last bootstrap attempt if needed, then the final global adjustment.
 
-        `stop`: see `PathAdjuster.finish`.
+        `stop` and `save`: see `PathAdjuster.finish`.
         """
         if self.state is State.BOOT and self._initialiser.last_attempt():
             self._adjuster.adjust()
-        self._adjuster.finish(stop)
+        self._adjuster.finish(stop, save)
         self.path_error = self._adjuster.path_error()
         self._reassess_views()
 

@@ -37,9 +37,9 @@ class PathAdjuster(Protocol):
     def adjust(self, final: bool = True) -> None:
         """Adjust what is due; without `final`, with less effort where that suffices."""
 
-    def finish(self, stop: Callable[[], bool] = lambda: False) -> None:
+    def finish(self, stop: Callable[[], bool] = lambda: False, save: Callable[[], None] = lambda: None) -> None:
         """The last adjustment, of the whole path. On a long path it ends soon after `stop` becomes true: loops may then
-        be open."""
+        be open. `save` is called wherever a copy of the adjuster goes on with the same result."""
 
     def path_error(self) -> float | None:
         """Predicted error of the path relative to its RMS radius; None if it is not predicted."""

@@ -36,7 +36,7 @@ ADJUST_EVERY = 8
 REFERENCE_KEYFRAMES = 60
 """Newest keyframes from which tracks are triangulated, and to which the newest views are adjusted (decision 15)."""
 REFITTED_VIEWS = 48
-"""Newest views that are fitted again after an adjustment while tracking; those before move with their keyframe."""
+"""Newest views that are fitted again after an adjustment but the last; those before move with their keyframe."""
 LOOP_ROUNDS = 4
 """Searches for loops at the end, at most: each closes the first loop of the path that is open (decision 15)."""
 SPREAD_PX = 2.0
@@ -130,7 +130,7 @@ class KeyframeAdjuster:
             return
         fixed = np.array([view.id < first_free for view in made.views])
         made.bundle.optimise(WINDOW_ITERATIONS, SCALE_PX, fixed, TOLERANCE)
-        self._take(made, self.map.views[first:], len(self.map.views) - REFITTED_VIEWS)
+        self._take(made, self.map.views[first:])
         self._adjust_whole_if_due()
 
     def close_loops(self, view: TrackedView) -> list[LoopClosure]:
@@ -201,9 +201,9 @@ class KeyframeAdjuster:
                 self._loop_rounds = LOOP_ROUNDS
             self._save_unless(stop, save)
         while self._final_rounds < FINAL_ROUNDS and not stop():
-            self._adjust_all(FINAL_ITERATIONS, stop)
-            self.map.triangulate(self._all_chosen())
             self._final_rounds += 1
+            self._adjust_all(FINAL_ITERATIONS, stop, refit_all=self._final_rounds == FINAL_ROUNDS)
+            self.map.triangulate(self._all_chosen())
             self._save_unless(stop, save)
 
     @staticmethod
@@ -212,8 +212,8 @@ class KeyframeAdjuster:
         if not stop():
             save()
 
-    def _adjust_all(self, iterations: int, stop: Callable[[], bool]) -> None:
-        """Adjust all keyframes and their points; all other views follow."""
+    def _adjust_all(self, iterations: int, stop: Callable[[], bool], refit_all: bool = False) -> None:
+        """Adjust all keyframes and their points; all other views follow, see `_take`."""
         keyframes = self._all_chosen()
         if len(keyframes) <= 2 or (made := self.map.bundle(keyframes)) is None:
             return
@@ -223,7 +223,7 @@ class KeyframeAdjuster:
         if self.map.focal is not None:
             self.map.intrinsics = made.bundle.intrinsics
             self.map.focal = replace(self.map.focal, intrinsics=made.bundle.intrinsics)
-        self._take(made, self.map.views)
+        self._take(made, self.map.views, refit_all)
 
     def path_error(self) -> float | None:
         """Not predicted for long paths."""
@@ -242,12 +242,13 @@ class KeyframeAdjuster:
                 self._travelled_px = 0.0
         self._next_view = len(self.map.views)
 
-    def _take(self, made: MapBundle, followers: list[TrackedView], refit_from: int = 0) -> None:
+    def _take(self, made: MapBundle, followers: list[TrackedView], refit_all: bool = False) -> None:
         """Take over adjusted keyframes and points.
 
-        `followers` and the other points in them move with the keyframe before them; those views are fitted to the
-        points again from id `refit_from` on.
+        `followers` and the other points in them move with the keyframe before them. The newest of these views are then
+        fitted to the points, or all of them: that takes seconds for a path of 10 s.
         """
+        refit_from = 0 if refit_all else len(self.map.views) - REFITTED_VIEWS
         motion = _Motion.of(made, self.map)
         self.map.noise_px = made.bundle.noise_px()
         self.map.apply(made)

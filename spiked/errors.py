@@ -4,6 +4,7 @@ __all__ = [
     "CalibrationError",
     "CheckpointError",
     "ConfigurationError",
+    "ProfileError",
     "RecordingError",
     "SceneError",
     "SourceError",
@@ -33,6 +34,10 @@ class ConfigurationError(SpikedError):
 
 class CalibrationError(SpikedError):
     """A calibration, or a recording to make one from, cannot be used."""
+
+
+class ProfileError(SpikedError):
+    """A camera profile cannot be read, written or used for a camera."""
 
 
 class CheckpointError(SpikedError):

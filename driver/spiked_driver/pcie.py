@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from spiked.native._wire import PcieParser
 
+from spiked.camera import CameraOptions
 from spiked.errors import SourceError
 from spiked.ring import DeviceState, DeviceStatus, End, EndReason, Gap
-from spiked.sensor import Intrinsics, Sensor
+from spiked.sensor import Sensor
 from spiked_driver.capabilities import PCIE_CAPABILITIES
 from spiked_driver.framing import Framing, FramingBenchmark, benchmark_framing
 from spiked_driver.source import READ_WAIT_S, Chunk, former_source_names
-from spiked_driver.source_kind import CameraOptions, Device, SourceKind, SourceSpec, Warn, path_of
+from spiked_driver.source_kind import RATE_HZ, Device, HardwareOptions, SourceKind, SourceSpec, Warn, path_of
 
 PCIE_SIZE = 1000
 """Pixels in a row, and rows."""
@@ -43,11 +44,10 @@ class PcieFraming(Framing):
 class PcieSource:
     """A camera read from a path: the capture card's device node, a pipe, or a file of the raw stream."""
 
-    def __init__(
-        self, path: str | os.PathLike[str], *, frame_rate_hz: float = 20_000.0, intrinsics: Intrinsics | None = None
-    ) -> None:
+    def __init__(self, path: str | os.PathLike[str], camera: CameraOptions | None = None) -> None:
+        """`camera`: what the stream does not say of its camera."""
         self.path = Path(path)
-        self._sensor = Sensor(PCIE_SIZE, PCIE_SIZE, frame_rate_hz, intrinsics=intrinsics)
+        self._sensor = (camera or CameraOptions()).sensor(Sensor(PCIE_SIZE, PCIE_SIZE, RATE_HZ))
         self._framing = PcieFraming()
         self._block = bytearray(BLOCK_BYTES)
         self._file: int | None = None
@@ -165,9 +165,8 @@ def benchmark_pcie(frames: int = 150, repeat: int = 3) -> FramingBenchmark:
     return benchmark_framing(PcieFraming, encode_pcie(pixels), PCIE_COMPACT_BYTES, BLOCK_BYTES, repeat)
 
 
-def _open(spec: SourceSpec, options: CameraOptions, warn: Warn | None) -> PcieSource:
-    path = path_of(spec, f"{KIND.usage}, a device node, a pipe or a file")
-    return PcieSource(path, frame_rate_hz=options.rate, intrinsics=options.intrinsics(PCIE_SIZE, PCIE_SIZE))
+def _open(spec: SourceSpec, options: HardwareOptions, warn: Warn | None) -> PcieSource:
+    return PcieSource(path_of(spec, f"{KIND.usage}, a device node, a pipe or a file"), options)
 
 
 def _describe(spec: SourceSpec) -> Device:
@@ -178,7 +177,7 @@ KIND = SourceKind(
     name="pcie",
     usage="pcie:PATH",
     summary="the raw stream of a PCIe spike camera, from a device node, a pipe or a file",
-    options=CameraOptions,
+    options=HardwareOptions,
     open=_open,
     describe=_describe,
     is_camera=True,

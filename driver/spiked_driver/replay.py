@@ -9,27 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, WithJsonSchema, field_validator
 
+from spiked.camera import StoredCameraOptions
 from spiked.errors import SourceError
 from spiked.recording import Recording, RecordingGeometry, open_recording
 from spiked.ring import DeviceState, DeviceStatus, End, EndReason, Gap, LossCause
 from spiked.sensor import BitOrder, Sensor
 from spiked_driver.fault_options import MOST_FRAMES
 from spiked_driver.source import Chunk, Pacer, former_source_names
-from spiked_driver.source_kind import Device, PacedOptions, Rate, Side, SourceKind, SourceSpec, Warn, path_of
+from spiked_driver.source_kind import Device, PacedOptions, SourceKind, SourceOptions, SourceSpec, Warn, path_of
 
 _Index = Annotated[int, Field(ge=0, le=MOST_FRAMES)]
 _Range = Annotated[tuple[_Index | None, _Index | None], WithJsonSchema({"type": "string", "pattern": r"^\d*:\d*$"})]
 
 
-class ReplayOptions(PacedOptions):
-    """Options of `replay:FILE`. Width, height and rate are for a recording without a sidecar."""
+class ReplayOptions(PacedOptions, SourceOptions, StoredCameraOptions):
+    """Options of `replay:FILE`. What they state of the camera wins over the sidecar."""
 
-    width: Side | None = None
-    """Pixels in a row."""
-    height: Side | None = None
-    """Rows."""
-    rate: Rate | None = None
-    """Frames per second."""
     repeat: int = Field(1, ge=1, le=10**6)
     """Number of times the range is played."""
     range: _Range = (None, None)
@@ -170,14 +165,18 @@ def _cause(recording: Recording, text: str) -> LossCause:
 
 
 def _open(spec: SourceSpec, options: ReplayOptions, warn: Warn | None) -> ReplaySource:
-    geometry = RecordingGeometry(options.width, options.height, options.rate)
-    recording = open_recording(path_of(spec, KIND.usage), **geometry.stated())
+    recording = open_recording(path_of(spec, KIND.usage), **RecordingGeometry.of(options).stated())
+    recording = replace(recording, sensor=options.sensor(recording.sensor))
     first, stop = options.range
     return ReplaySource(recording, pace=options.pace, repeat=options.repeat, first=first or 0, stop=stop)
 
 
 def _describe(spec: SourceSpec) -> Device:
     return Device(spec.text, KIND.name, "configured with --device")
+
+
+def _recording_of(spec: SourceSpec) -> Path:
+    return Path(path_of(spec, KIND.usage))
 
 
 KIND = SourceKind(
@@ -187,6 +186,7 @@ KIND = SourceKind(
     options=ReplayOptions,
     open=_open,
     describe=_describe,
+    recording_of=_recording_of,
     can_block=True,
     takes_path=True,
 )

@@ -6,16 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from spiked.camera import Rate, Side
 from spiked.errors import SourceError
 from spiked.ring import DeviceState, DeviceStatus, End, EndReason, Gap
 from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
 from spiked.simulate.camera import DEFAULT_FOV_DEG
 from spiked_driver.source import Chunk, Pacer, former_source_names
-from spiked_driver.source_kind import Device, PacedOptions, Rate, Side, SourceKind, SourceSpec, Warn
+from spiked_driver.source_kind import Device, PacedOptions, SourceKind, SourceOptions, SourceSpec, Warn
 
 
-class SimulationOptions(PacedOptions):
+class SimulationOptions(PacedOptions, SourceOptions):
     """Options of `sim:`."""
 
     seed: int = Field(0, ge=0, lt=1 << 32)
@@ -124,7 +125,7 @@ def _open(spec: SourceSpec, options: SimulationOptions, warn: Warn | None) -> Si
     if spec.target:
         raise SourceError(f"source {spec.text!r}: sim: takes options only, as in sim:?seed=1")
     return SimulatedSource(
-        Sensor(options.width, options.height, options.rate),
+        options.sensor(Sensor(options.width, options.height, options.rate)),
         seed=options.seed,
         motion=options.motion,
         flow_px=options.flow_px,
@@ -139,7 +140,7 @@ def _describe(spec: SourceSpec) -> Device:
 
 
 def _find() -> list[Device]:
-    room = "simulated hand-held camera in a built-in room; options seed, seconds, width, height"
+    room = "simulated hand-held camera in a built-in room; options seed, seconds, width, height, mosaic"
     return [Device(KIND.usage, KIND.name, room)]
 
 

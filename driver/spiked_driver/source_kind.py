@@ -6,25 +6,33 @@ The options of a kind are a pydantic model. Its fields carry types, bounds and d
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Generic, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
+from pydantic import BaseModel, BeforeValidator, Field, WithJsonSchema
 
+from spiked.camera import CameraFiles, CameraOptions, Rate
 from spiked.errors import SourceError
 from spiked.ring import DeviceState
-from spiked.sensor import Intrinsics
 from spiked_driver.capabilities import Capability
 from spiked_driver.fault_options import FaultOptions
 from spiked_driver.source import Source
 
-__all__ = ["CameraOptions", "Device", "PacedOptions", "SourceKind", "SourceSpec", "Warn", "path_of"]
+__all__ = [
+    "Device",
+    "HardwareOptions",
+    "PacedOptions",
+    "SourceKind",
+    "SourceOptions",
+    "SourceSpec",
+    "Warn",
+    "path_of",
+]
 
 Warn = Callable[[str], None]
 """Called with one sentence for each fault of a camera that a capture survives."""
 RATE_HZ = 20_000.0
 """Frame rate of both cameras by their data sheets; neither stream carries it."""
-Rate = Annotated[float, Field(ge=0.1, le=1e6)]
-Side = Annotated[int, Field(ge=1, le=1 << 14)]
 Pace = Annotated[
     float,
     Field(ge=0, le=1e4),
@@ -40,19 +48,15 @@ class PacedOptions(FaultOptions):
     """Factor of the sensor's frame rate; 0 or `max`: as fast as lossless consumers take frames."""
 
 
-class CameraOptions(BaseModel):
-    """Options of every camera."""
+class SourceOptions(CameraOptions, CameraFiles):
+    """What a camera is, as options of a source; what is stated wins over what the source itself says."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+class HardwareOptions(SourceOptions):
+    """Options of every camera."""
 
     rate: Rate = RATE_HZ
     """Frames per second; the stream does not carry it."""
-    fov: float | None = Field(None, ge=1, le=170)
-    """Horizontal field of view in degrees of a pinhole camera with square pixels; without it the optics are unknown."""
-
-    def intrinsics(self, width: int, height: int) -> Intrinsics | None:
-        """The pinhole model in pixels; None without `fov`."""
-        return None if self.fov is None else Intrinsics.from_fov(width, height, self.fov)
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,11 @@ class Device:
     capabilities: Mapping[str, Capability] = field(default_factory=dict)
 
 
+def _no_recording(spec: SourceSpec) -> Path | None:
+    """Of a source that is none."""
+    return None
+
+
 _Options = TypeVar("_Options", bound=BaseModel)
 
 
@@ -115,6 +124,8 @@ class SourceKind(Generic[_Options]):
     """The device that a text names, whether or not it is present. Raises nothing."""
     find: Callable[[], list[Device]] = list
     """Devices of this kind that are present without being configured."""
+    recording_of: Callable[[SourceSpec], Path | None] = _no_recording
+    """The recording that is the source, whose sidecar describes the camera."""
     is_camera: bool = False
     """Hardware: frames that are not read in time are lost, and its process runs with real-time priority."""
     can_block: bool = False

@@ -35,7 +35,8 @@ class UsbSource:
         self.choice = choice
         self.options = options or UsbOptions()
         self._forward_warning = warn
-        self._sensor = Sensor(USB_WIDTH, USB_HEIGHT, self.options.rate_hz, intrinsics=self.options.intrinsics)
+        camera = self.options.camera.model_copy(update={"rate": self.options.rate_hz})
+        self._sensor = camera.sensor(Sensor(USB_WIDTH, USB_HEIGHT, self.options.rate_hz))
         self._connection: UsbConnection | None = None
         self._start_stream()
 

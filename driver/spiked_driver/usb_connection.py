@@ -12,9 +12,9 @@ import numpy as np
 import usb.core
 from numpy.typing import NDArray
 
+from spiked.camera import CameraOptions
 from spiked.errors import SourceError
 from spiked.ring import DeviceState, DeviceStatus, LossCause
-from spiked.sensor import Intrinsics
 from spiked_driver.camera_search import CameraSearch
 from spiked_driver.connection_state import ConnectionState, ConnectionStateMachine
 from spiked_driver.framing import USB_FRAME_BYTES
@@ -53,7 +53,8 @@ class UsbOptions:
     """How a USB camera is read."""
 
     rate_hz: float = RATE_HZ
-    intrinsics: Intrinsics | None = None
+    camera: CameraOptions = field(default_factory=CameraOptions)
+    """What the stream does not say of the camera, but for its rate."""
     buffer_s: float | None = None
     """Seconds the host may be busy without a loss; None: BUFFER_S, or what the kernel's limit allows."""
     transfer_bytes: int = TRANSFER_BYTES

@@ -7,15 +7,14 @@ from pydantic import Field
 from spiked.errors import SourceError
 from spiked.ring import DeviceState
 from spiked_driver.capabilities import USB_CAPABILITIES
-from spiked_driver.framing import USB_HEIGHT, USB_WIDTH
-from spiked_driver.source_kind import CameraOptions, Device, SourceKind, SourceSpec, Warn
+from spiked_driver.source_kind import Device, HardwareOptions, SourceKind, SourceSpec, Warn
 from spiked_driver.usb import UsbSource
 from spiked_driver.usb_budget import TRANSFER_BYTES
 from spiked_driver.usb_cameras import CameraChoice, UsbCamera, find_cameras
 from spiked_driver.usb_connection import SILENCE_S, UsbOptions
 
 
-class UsbCameraOptions(CameraOptions):
+class UsbCameraOptions(HardwareOptions):
     """Options of the USB3 camera."""
 
     hide_ms: float | None = Field(None, gt=0, le=10_000)
@@ -33,7 +32,7 @@ def _open(spec: SourceSpec, options: UsbCameraOptions, warn: Warn | None) -> Usb
         CameraChoice.parse(spec.address),
         UsbOptions(
             rate_hz=options.rate,
-            intrinsics=options.intrinsics(USB_WIDTH, USB_HEIGHT),
+            camera=options,
             buffer_s=None if options.hide_ms is None else options.hide_ms / 1e3,
             transfer_bytes=options.transfer_kib << 10,
             asynchronous=options.transfers == "queued",

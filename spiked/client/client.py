@@ -8,6 +8,7 @@ from http import HTTPStatus
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
+from urllib.parse import quote
 
 import httpx
 
@@ -24,10 +25,13 @@ from spiked.client.models import (
     IntrinsicsModel,
     JobState,
     Output,
+    ProfileModel,
+    ProfileOut,
     ReconstructionOptions,
     ReconstructionOut,
     ReconstructionPage,
     SceneFormat,
+    StatedCameraModel,
     SystemOut,
     TimelineOut,
     TrajectoryFormat,
@@ -80,6 +84,14 @@ class Spiked:
         """What captures can be started from."""
         return self._connection.get("devices", DevicesOut).items
 
+    def profile(self, device: str) -> ProfileModel:
+        """The camera profile of a device. Raises ApiError if it has none."""
+        return self._connection.get(f"devices/{quote(device, safe='')}/profile", ProfileOut).profile
+
+    def set_profile(self, device: str, profile: ProfileModel) -> None:
+        """Replace the camera profile of a device."""
+        self._connection.request("PUT", f"devices/{quote(device, safe='')}/profile", json=_plain(profile))
+
     def options(self) -> dict[str, Any]:
         """JSON Schema of the options of a reconstruction."""
         return dict(self._connection.request("GET", "options").json())
@@ -96,6 +108,7 @@ class Spiked:
         record: bool = True,
         reconstruct: bool = True,
         options: ReconstructionOptions | None = None,
+        camera: StatedCameraModel | None = None,
         intrinsics: IntrinsicsModel | None = None,
     ) -> CaptureOut:
         """Start a capture of so many frames or seconds, or until it is stopped."""
@@ -109,6 +122,7 @@ class Spiked:
             "record": record,
             "reconstruct": reconstruct,
             "options": _plain(options or ReconstructionOptions()),
+            "camera": _plain(camera),
             "intrinsics": _plain(intrinsics),
         }
         return self._connection.post("captures", body, CaptureOut)

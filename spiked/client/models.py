@@ -291,7 +291,7 @@ class PictureKind(StrEnum):
 
 class Pinhole(BaseModel):
     """
-    Intrinsics in a sidecar, in pixels.
+    A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5).
     """
 
     model_config = ConfigDict(
@@ -327,6 +327,53 @@ class Problem(BaseModel):
     detail: Annotated[str, Field(description="What is wrong, in one or more sentences.")]
     instance: Annotated[str | None, Field(description="Path of the request.")]
     what_to_do: Annotated[str | None, Field(description="How to correct it, if known.")]
+
+
+class ProfileModel(BaseModel):
+    """
+    What is known of one camera; options of a source or request win over it.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    rate: Annotated[float | None, Field(description="Frames per second.")] = None
+    mosaic: Annotated[
+        Mosaic | None,
+        Field(description="Colour mosaic of the upright image; none: a grey sensor."),
+    ] = None
+    flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
+    fov: Annotated[
+        float | None,
+        Field(
+            description="Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated."
+        ),
+    ] = None
+    intrinsics: IntrinsicsModel | None = None
+    model: Annotated[str, Field(description="Name of the product.")] = ""
+    serial: Annotated[
+        str | None,
+        Field(description="Serial number of the camera that the profile is of; null: of any."),
+    ] = None
+    width: Annotated[int | None, Field(description="Pixels in a row.")] = None
+    height: Annotated[int | None, Field(description="Rows.")] = None
+    calibration: Annotated[
+        str | None,
+        Field(description="File of gains, dark rates and dead pixels, relative to the profile."),
+    ] = None
+    note: str = ""
+
+
+class ProfileOut(BaseModel):
+    """
+    The profile of a device.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    file: Annotated[str, Field(description="Its file in the folder `profiles` of the data folder.")]
+    profile: ProfileModel
 
 
 class RateHistogram(BaseModel):
@@ -567,6 +614,37 @@ class State(StrEnum):
     reloc = "reloc"
 
 
+class StatedCameraModel(BaseModel):
+    """
+    What is stated of a camera; it wins over the options of the source, its profile and its sidecar.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    calibration: Annotated[
+        str | None,
+        Field(description="File of gains, dark rates and dead pixels, from `spiked calibrate`."),
+    ] = None
+    profile: Annotated[
+        str | None,
+        Field(description="Camera profile, a JSON file; options that are stated win over it."),
+    ] = None
+    rate: Annotated[float | None, Field(description="Frames per second.")] = None
+    mosaic: Annotated[
+        Mosaic | None,
+        Field(description="Colour mosaic of the upright image; none: a grey sensor."),
+    ] = None
+    flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
+    fov: Annotated[
+        float | None,
+        Field(
+            description="Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated."
+        ),
+    ] = None
+    intrinsics: IntrinsicsModel | None = None
+
+
 class StatsOut(BaseModel):
     """
     Statistics of a few frames.
@@ -714,6 +792,7 @@ class UploadSidecar(BaseModel):
     clock: Annotated[list[ClockPair], Field(validate_default=True)] = []
     calibration: str | None = None
     device: dict[str, Any] | None = None
+    profile: dict[str, Any] | None = None
 
 
 class UploadsOut(BaseModel):
@@ -859,6 +938,10 @@ class CaptureRequest(BaseModel):
     record: Annotated[bool, Field(description="Keep the frames in the data folder.")] = True
     reconstruct: Annotated[bool, Field(description="Reconstruct while it runs.")] = True
     options: ReconstructionOptions | None = None
+    camera: Annotated[
+        StatedCameraModel | None,
+        Field(description="The same as options of the source's text."),
+    ] = None
     intrinsics: Annotated[
         IntrinsicsModel | None,
         Field(description="If the source does not know its own."),
@@ -992,14 +1075,30 @@ class GeometryModel(BaseModel):
     model_config = ConfigDict(
         extra="ignore",
     )
-    width: int | None = None
-    height: int | None = None
-    frame_rate_hz: float | None = None
-    layout: Layout | None = None
-    bit_order: BitOrder | None = None
-    flipped: Annotated[bool | None, Field(description="Rows are stored bottom-up.")] = None
-    mosaic: Annotated[Mosaic | None, Field(description="Colour pattern of the upright image.")] = None
+    rate: Annotated[float | None, Field(description="Frames per second.")] = None
+    mosaic: Annotated[
+        Mosaic | None,
+        Field(description="Colour mosaic of the upright image; none: a grey sensor."),
+    ] = None
+    flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
+    fov: Annotated[
+        float | None,
+        Field(
+            description="Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated."
+        ),
+    ] = None
     intrinsics: IntrinsicsModel | None = None
+    width: Annotated[int | None, Field(description="Pixels in a row, a multiple of 8.")] = None
+    height: Annotated[int | None, Field(description="Rows.")] = None
+    layout: Annotated[
+        Layout | None,
+        Field(description="How a frame is stored: rows only, or each row followed by its number."),
+    ] = None
+    bit_order: Annotated[
+        BitOrder | None,
+        Field(description="Which bit of a byte is the leftmost of its eight pixels."),
+    ] = None
+    frame_rate_hz: Annotated[float | None, Field(deprecated=True, description="Deprecated: use rate.")] = None
 
 
 class HealthOut(BaseModel):

@@ -5,7 +5,15 @@ from spiked.recording.geometry import Flavour, Origin, OriginKind, RecordingGeom
 from spiked.recording.index import Index, index_path, read_index
 from spiked.recording.reader import Recording, open_recording
 from spiked.recording.recover import Recovered, recover
-from spiked.recording.sidecar import ClockPair, Gap, Sidecar, read_sidecar, sidecar_path, write_sidecar
+from spiked.recording.sidecar import (
+    ClockPair,
+    Gap,
+    Sidecar,
+    read_sidecar,
+    recorded_calibration,
+    sidecar_path,
+    write_sidecar,
+)
 from spiked.recording.verify import Verdict, Verification, verify
 from spiked.recording.writer import RecordingWriter
 
@@ -31,6 +39,7 @@ __all__ = [
     "open_recording",
     "read_index",
     "read_sidecar",
+    "recorded_calibration",
     "recover",
     "sidecar_path",
     "verify",

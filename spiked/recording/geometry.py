@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spiked.camera import StoredCameraOptions
 from spiked.errors import RecordingError
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic
 
@@ -30,6 +31,20 @@ class RecordingGeometry:
     mosaic: Mosaic | None = None
     """Colour filter pattern of the upright image."""
     intrinsics: Intrinsics | None = None
+
+    @classmethod
+    def of(cls, options: StoredCameraOptions) -> "RecordingGeometry":
+        """What the options state; a field of view needs the size, see `StoredCameraOptions.sensor`."""
+        return cls(
+            options.width,
+            options.height,
+            options.rate,
+            options.layout,
+            options.bit_order,
+            options.flipped,
+            options.mosaic,
+            None if options.intrinsics is None else options.intrinsics.intrinsics(),
+        )
 
     def stated(self) -> dict[str, Any]:
         """The stated fields by name: keyword arguments of `open_recording` and `verify`, fields of `Sensor`."""

@@ -20,6 +20,7 @@ from spiked.recording.sidecar import (
     find_spikecv_config,
     read_sidecar,
     read_spikecv_config,
+    recorded_calibration,
     sidecar_path,
 )
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
@@ -183,6 +184,8 @@ def open_unchecked(path: Path, given: RecordingGeometry) -> Recording:
     if trailing:
         warnings.append(f"the last frame is truncated to {trailing} of {sensor.frame_bytes} bytes and is ignored")
     sidecar = described.sidecar
+    if sidecar is not None and sidecar.calibration is not None and recorded_calibration(path) is None:
+        warnings.append(f"its calibration {sidecar.calibration} is not there, so its rates are not corrected")
     if sidecar is not None and sidecar.frames is None:
         warnings.append("the recording was not finished: its sidecar has no number of frames")
     # A file cut within its last frame is a common interruption; any other difference means another file's sidecar.

@@ -9,6 +9,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, StrictInt, ValidationError
 
+from spiked.camera import Pinhole
 from spiked.errors import ConfigurationError, RecordingError
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
 
@@ -45,15 +46,6 @@ class ClockPair(_Strict):
     unix_ns: StrictInt
 
 
-class Pinhole(_Strict):
-    """Intrinsics in a sidecar, in pixels."""
-
-    fx: StrictFloat = Field(gt=0)
-    fy: StrictFloat = Field(gt=0)
-    cx: StrictFloat
-    cy: StrictFloat
-
-
 class Sidecar(BaseModel):
     """Content of a sidecar. Unknown fields are kept by `read_sidecar` and written back."""
 
@@ -83,11 +75,12 @@ class Sidecar(BaseModel):
     """Calibration file, relative to the sidecar."""
     device: dict[str, Any] | None = None
     """Properties that the camera reported."""
+    profile: dict[str, Any] | None = None
+    """The camera profile that the recording was made with."""
 
     @classmethod
     def of(cls, sensor: Sensor, frames: int | None, **more: Any) -> "Sidecar":
         """The sidecar of a recording of `sensor`; `more` are further fields."""
-        k = sensor.intrinsics
         return cls(
             format=sensor.layout,
             width=sensor.width,
@@ -97,7 +90,7 @@ class Sidecar(BaseModel):
             bit_order=sensor.bit_order,
             flipped=sensor.flipped,
             cfa=sensor.mosaic,
-            intrinsics=None if k is None else Pinhole(fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy),
+            intrinsics=Pinhole.of(sensor.intrinsics),
             **more,
         )
 
@@ -134,6 +127,17 @@ def read_sidecar(path: Path) -> Sidecar:
     except ConfigurationError as error:
         raise RecordingError(f"{path}: {error}; correct the sidecar") from error
     return sidecar
+
+
+def recorded_calibration(recording: Path) -> Path | None:
+    """The calibration file that a recording's sidecar names, if it is there; None without a sidecar.
+
+    Raises RecordingError for a sidecar that cannot be read.
+    """
+    beside = sidecar_path(recording)
+    named = read_sidecar(beside).calibration if beside.exists() else None
+    path = None if named is None else beside.parent / named
+    return path if path is not None and path.is_file() else None
 
 
 def _first_problem(error: ValidationError) -> str:

@@ -1,6 +1,9 @@
 """An armed device: its ring holds the last seconds, and standby workers wait for the trigger."""
 
 from collections.abc import Callable
+from pathlib import Path
+
+from spiked_driver import open_camera
 
 from spiked.errors import ConfigurationError
 from spiked.sensor import Sensor
@@ -8,6 +11,7 @@ from spiked_service.base.errors import BusyError
 from spiked_service.base.ids import new_id
 from spiked_service.captures.acquisition import AcquisitionSupervisor
 from spiked_service.captures.live_capture import LiveCapture
+from spiked_service.captures.sources import stated_options
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import Counters, Plan
@@ -50,6 +54,7 @@ class ArmedDevice:
             seconds=None,
             consumers=1,
             history_s=pretrigger_s + _TRIGGER_S,
+            profiles=folder.profiles,
         )
         self._acquisition = AcquisitionSupervisor(command, logs, None, self)
 
@@ -73,14 +78,21 @@ class ArmedDevice:
         """The newest preview images."""
         return self._acquisition.picture
 
-    def check(self, plan: Plan) -> None:
-        """Raises ConfigurationError if the ring is too short for the plan, BusyError before the ring exists."""
+    def check(self, plan: Plan, profiles: Path) -> None:
+        """Raises ConfigurationError if ring or camera do not fit the plan, BusyError before the ring exists."""
         if plan.pretrigger_s > self.pretrigger_s:
             raise ConfigurationError(
                 f"{self.source} keeps {self.pretrigger_s:g} s, not {plan.pretrigger_s:g}: arm it with a longer time"
             )
         if self._acquisition.opened is None:
             raise BusyError(f"{self.source} is still being armed: try again in a moment")
+        if stated_options(plan.source):
+            wanted = open_camera(plan.source, profiles=profiles).source.sensor
+            if wanted != self.sensor:
+                raise ConfigurationError(
+                    f"{self.source} is armed with other options than {plan.source}: disarm it, or start the capture "
+                    "without options of the camera"
+                )
 
     def trigger(self, capture: LiveCapture, plan: Plan) -> None:
         """Hand the acquisition to a capture that starts `plan.pretrigger_s` ago. Its length counts from now.

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-from spiked_driver import open_source
+from spiked_driver import open_camera
 
 from spiked.errors import ConfigurationError
 from spiked_service.base.errors import BusyError
@@ -69,12 +69,12 @@ class Captures:
             armed_device = self._armed.get(device)
         size: int | None = None
         if armed_device is not None:
-            armed_device.check(plan)
+            armed_device.check(plan, self._folder.profiles)
             size = recording_bytes(plan, armed_device.sensor, None)
         elif plan.pretrigger_s:
             raise ConfigurationError(f"{device} is not armed, so it has no earlier frames: arm the device first")
         else:
-            source = open_source(plan.source)
+            source = open_camera(plan.source, profiles=self._folder.profiles).source
             size = recording_bytes(plan, source.sensor, source.frames)
         with self._lock:
             self._refuse_if_busy(device)
@@ -118,7 +118,7 @@ class Captures:
         Raises as `start`.
         """
         device = device_of(source)
-        open_source(source)  # errors are raised here rather than in the worker
+        open_camera(source, profiles=self._folder.profiles)  # errors are raised here rather than in the worker
         with self._lock:
             self._refuse_if_busy(device)
             if device in self._armed:

@@ -100,6 +100,7 @@ class LiveCapture:
             consumers=1 + plan.record + plan.reconstruct,
             history_s=0.0,
             backlog_s=BACKLOG_S if plan.reconstruct else 0.0,
+            profiles=self._folder.profiles,
         )
         with self._lock:
             self._acquisition = AcquisitionSupervisor(
@@ -274,6 +275,8 @@ class LiveCapture:
             intrinsics=plan.intrinsics,
             source=plan.source,
             note=plan.name,
+            profile=opened.profile,
+            calibration=opened.calibration,
         )
         log = self._folder.capture(self.id) / "logs" / "recorder.log"
         self._recorder = RecorderSupervisor(command, log, self, standby)

@@ -1,8 +1,16 @@
 """Addresses of sources: the device that one names, and its pace."""
 
-from urllib.parse import urlencode
+from urllib.parse import parse_qsl, urlencode
 
+from pydantic import BaseModel
 from spiked_driver.source_kinds import find_kind
+
+from spiked.camera import CameraFiles, CameraOptions
+
+_ALIASES = {"flipped": "flip"}
+"""Other names of options."""
+_OPTICS = {"fov", "intrinsics"}
+"""Options that both set the focal length."""
 
 
 def device_of(source: str) -> str:
@@ -13,6 +21,34 @@ def device_of(source: str) -> str:
         return address
     options = [option for option in query.split("&") if option and not option.startswith("pace=")]
     return f"{address}?{'&'.join(options)}" if options else address
+
+
+def stated_options(source: str) -> bool:
+    """Whether the source states something of its camera."""
+    names = {name for name, _ in parse_qsl(source.partition("?")[2], keep_blank_values=True)}
+    return bool(names & (CameraOptions.model_fields.keys() | CameraFiles.model_fields.keys() | set(_ALIASES.values())))
+
+
+def with_options(source: str, stated: BaseModel) -> str:
+    """The source with options in place of those of the same name; a field of view and intrinsics replace each other."""
+    values = {name: _text(value) for name, value in stated.model_dump(mode="json", exclude_none=True).items()}
+    replaced = set(values) | {_ALIASES.get(name, name) for name in values}
+    if replaced & _OPTICS:
+        replaced |= _OPTICS
+    address, _, query = source.partition("?")
+    kept = [(name, value) for name, value in parse_qsl(query, keep_blank_values=True) if name not in replaced]
+    pairs = kept + list(values.items())
+    return f"{address}?{urlencode(pairs, safe='/:,')}" if pairs else address
+
+
+def _text(value: object) -> str:
+    """As it stands in a source's text."""
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case dict():
+            return ",".join(f"{number!r}" for number in value.values())
+    return f"{value}"
 
 
 def unpaced(source: str) -> str:

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from fastapi.concurrency import run_in_threadpool
-from pydantic import TypeAdapter
 from starlette.exceptions import HTTPException
 
+from spiked.camera import StoredCameraOptions
 from spiked.errors import RecordingError, SpikedError
-from spiked.recording import RecordingGeometry, sidecar_path
+from spiked.recording import sidecar_path
 from spiked.recording.sidecar import Sidecar
 from spiked.sensor import Sensor
 from spiked_service.base.ids import new_id
@@ -240,6 +240,14 @@ class _Tail:
         return self._offset
 
 
+def _camera(stated: dict[str, Any]) -> StoredCameraOptions:
+    """What was stated of the camera; earlier releases stored `frame_rate_hz`."""
+    stated = {name: value for name, value in stated.items() if value is not None}
+    if "frame_rate_hz" in stated:
+        stated["rate"] = stated.pop("frame_rate_hz")
+    return StoredCameraOptions.model_validate(stated)
+
+
 def _too_much(row: UploadRow) -> UploadError:
     return UploadError(
         f"upload {row.id} was announced with {row.bytes} bytes and more were received; this chunk was dropped"
@@ -252,7 +260,7 @@ def _checked(path: Path, row: UploadRow, geometry: dict[str, Any] | None) -> Upl
         path=path,
         sha256=row.sha256,
         sidecar=None if row.sidecar is None else Sidecar.model_validate_json(row.sidecar),
-        geometry=TypeAdapter(RecordingGeometry).validate_python(geometry or {}),
+        camera=_camera(geometry or {}),
     )
     found: list[UploadChecked] = []
     errors: list[str] = []

@@ -1,20 +1,34 @@
 """Options that describe a recording without a sidecar, for every command that opens one."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
+from spiked.calibration import Calibration
+from spiked.camera import CameraFiles, StoredCameraOptions
 from spiked.errors import ConfigurationError
+from spiked.profile import CameraProfile
+from spiked.recording import Recording, RecordingGeometry, open_recording, recorded_calibration, sidecar_path
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
 
 _PANEL = "Geometry of a recording without a sidecar"
 
-Width = Annotated[int | None, typer.Option(help="Width in pixels; a multiple of 8.", rich_help_panel=_PANEL)]
-Height = Annotated[int | None, typer.Option(help="Height in pixels.", rich_help_panel=_PANEL)]
-Rate = Annotated[float | None, typer.Option("--rate", help="Frame rate in Hz.", rich_help_panel=_PANEL)]
+
+def _flag(name: str, *flags: str, panel: str = _PANEL, **more: Any) -> Any:
+    """A flag with description and bounds of the field of `StoredCameraOptions` or `CameraFiles`."""
+    fields = StoredCameraOptions.model_fields | CameraFiles.model_fields
+    return typer.Option(*flags, help=fields[name].description, rich_help_panel=panel, **more)
+
+
+Width = Annotated[int | None, _flag("width", "--width")]
+Height = Annotated[int | None, _flag("height", "--height")]
+Rate = Annotated[float | None, _flag("rate", "--rate")]
+Profile = Annotated[Path | None, _flag("profile", "--profile", panel="Camera")]
+CalibrationFile = Annotated[Path | None, _flag("calibration", "--calibration", panel="Camera")]
 
 
 def parse_layout(text: str) -> Layout:
@@ -27,24 +41,11 @@ def parse_layout(text: str) -> Layout:
 
 FrameLayout = Annotated[
     Layout | None,
-    typer.Option(
-        "--layout",
-        help="Storage of a frame.",
-        parser=parse_layout,
-        metavar=f"<{'|'.join(Layout)}>",
-        rich_help_panel=_PANEL,
-    ),
+    _flag("layout", "--layout", parser=parse_layout, metavar=f"<{'|'.join(Layout)}>"),
 ]
-Bits = Annotated[
-    BitOrder | None,
-    typer.Option("--bit-order", help="Which bit of a byte is its leftmost pixel.", rich_help_panel=_PANEL),
-]
-Flipped = Annotated[
-    bool | None, typer.Option("--flipped/--upright", help="Rows stored bottom-up or top-down.", rich_help_panel=_PANEL)
-]
-Colours = Annotated[
-    Mosaic | None, typer.Option("--mosaic", help="Colour mosaic of the upright image.", rich_help_panel=_PANEL)
-]
+Bits = Annotated[BitOrder | None, _flag("bit_order", "--bit-order")]
+Flipped = Annotated[bool | None, _flag("flipped", "--flipped/--upright")]
+Colours = Annotated[Mosaic | None, _flag("mosaic", "--mosaic")]
 
 
 class MosaicChoice(StrEnum):
@@ -63,13 +64,57 @@ ColoursOrAuto = Annotated[
         "--mosaic", help="Colour mosaic of the upright image; auto: detect it from the pixels.", rich_help_panel=_PANEL
     ),
 ]
-Fov = Annotated[
-    float | None, typer.Option("--fov", help="Horizontal field of view in degrees.", rich_help_panel="Optics")
-]
-IntrinsicsText = Annotated[
-    str | None,
-    typer.Option("--intrinsics", help="fx,fy,cx,cy in pixels.", metavar="FX,FY,CX,CY", rich_help_panel="Optics"),
-]
+Fov = Annotated[float | None, _flag("fov", "--fov", panel="Optics")]
+IntrinsicsText = Annotated[str | None, _flag("intrinsics", "--intrinsics", metavar="FX,FY,CX,CY", panel="Optics")]
+
+
+@dataclass(frozen=True)
+class DescribedRecording:
+    """A recording with what options and profile say of its camera."""
+
+    recording: Recording
+    geometry: RecordingGeometry
+    """What options and profile state, by which `open_recording` opens it again."""
+    calibration: Path | None
+    """The profile's, else the sidecar's."""
+
+
+def open_described(file: Path, stated: RecordingGeometry, profile: Path | None) -> DescribedRecording:
+    """Open a recording by what is stated, then by the profile, then by its sidecar.
+
+    Raises RecordingError, and ProfileError for a profile of another camera.
+    """
+    calibration = recorded_calibration(file)
+    if profile is None:
+        return DescribedRecording(open_recording(file, **stated.stated()), stated, calibration)
+    known = CameraProfile.read(profile)
+    given = {name: getattr(stated, field) for name, field in _FIELDS.items() if getattr(stated, field) is not None}
+    options = known.completed(StoredCameraOptions.model_validate(given), size=not sidecar_path(file).exists())
+    geometry = RecordingGeometry.of(options)
+    recording = open_recording(file, **geometry.stated())
+    known.check(recording.sensor)
+    recording = replace(recording, sensor=options.sensor(recording.sensor))
+    if known.calibration is not None:
+        calibration = profile.parent / known.calibration
+    return DescribedRecording(recording, replace(geometry, intrinsics=recording.sensor.intrinsics), calibration)
+
+
+def read_calibration(given: Path | None, described: DescribedRecording) -> Calibration | None:
+    """The calibration that is given, else the recording's. Raises CalibrationError."""
+    path = given or described.calibration
+    return None if path is None else Calibration.read(path)
+
+
+_FIELDS = {
+    "width": "width",
+    "height": "height",
+    "rate": "frame_rate_hz",
+    "layout": "layout",
+    "bit_order": "bit_order",
+    "flipped": "flipped",
+    "mosaic": "mosaic",
+}
+"""Options of a camera, and the fields of `RecordingGeometry`."""
 
 
 def with_optics(sensor: Sensor, fov_deg: float | None, intrinsics: str | None) -> Sensor:

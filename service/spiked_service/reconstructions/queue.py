@@ -86,6 +86,7 @@ class Reconstructions:
             can_block=opened.can_block,
             options=options,
             intrinsics=_intrinsics(options, capture),
+            calibration=opened.calibration,
             first_frame=first_frame,
             stop_frame=stop_frame,
             recorded=capture.plan.record,

@@ -3,27 +3,16 @@
 The defaults are the library's; names, limits and descriptions are here.
 """
 
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, StrictInt
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictInt
 
+from spiked.camera import Pinhole
 from spiked.recon import Options
-from spiked.sensor import Intrinsics
 
 _LIBRARY = Options()
 
 
-class IntrinsicsOption(BaseModel):
+class IntrinsicsOption(Pinhole):
     """A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    fx: StrictFloat = Field(gt=0)
-    fy: StrictFloat = Field(gt=0)
-    cx: StrictFloat
-    cy: StrictFloat
-
-    def intrinsics(self) -> Intrinsics:
-        """The same for the library."""
-        return Intrinsics(self.fx, self.fy, self.cx, self.cy)
 
 
 class ReconstructionOptions(BaseModel):

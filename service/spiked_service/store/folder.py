@@ -44,7 +44,7 @@ class DataFolder:
         """Create the folder if it does not exist, and lock it. Raises ConfigurationError."""
         self.path = (path or default_folder()).absolute()
         try:
-            for folder in (self.path, self._captures, self._reconstructions, self._uploads):
+            for folder in (self.path, self._captures, self._reconstructions, self._uploads, self.profiles):
                 folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             self._lock = (self.path / _LOCK).open("w")
         except OSError as error:
@@ -63,6 +63,11 @@ class DataFolder:
     def catalogue(self) -> Path:
         """The SQLite file."""
         return self.path / "catalogue.sqlite"
+
+    @property
+    def profiles(self) -> Path:
+        """Folder of camera profiles, and of the calibrations that they name."""
+        return self.path / "profiles"
 
     def capture(self, capture_id: str) -> Path:
         """Folder of a capture. Raises ValueError for text that is not an id, so that no client chooses a path."""

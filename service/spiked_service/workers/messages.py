@@ -6,8 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field, TypeAdapter
 
+from spiked.camera import StoredCameraOptions
+from spiked.profile import CameraProfile
 from spiked.recon import State
-from spiked.recording import RecordingGeometry
 from spiked.recording.sidecar import Sidecar
 from spiked.sensor import Intrinsics, Sensor
 from spiked_service.events.payloads import PosePayload
@@ -54,6 +55,8 @@ class AcquisitionCommand(_Command):
     """Existing ring to continue, whose writer has died."""
     died_s: float | None = None
     """Time of its death on the monotonic clock."""
+    profiles: Path | None = None
+    """Folder of camera profiles."""
 
 
 class RecorderCommand(_Command):
@@ -71,6 +74,10 @@ class RecorderCommand(_Command):
     intrinsics: Intrinsics | None
     source: str
     note: str
+    profile: CameraProfile | None = None
+    """The profile of the camera, for the sidecar."""
+    calibration: Path | None = None
+    """Calibration of the camera; it is copied to the recording."""
 
 
 class ReconstructionCommand(_Command):
@@ -85,6 +92,8 @@ class ReconstructionCommand(_Command):
     """The source waits for its readers, which gives the mapper time between frames."""
     options: ReconstructionOptions
     intrinsics: Intrinsics | None
+    calibration: Path | None = None
+    """Of the frames of a ring; a recording names its own."""
     first_frame: int = 0
     stop_frame: int | None = None
     recorded: bool = False
@@ -109,7 +118,8 @@ class UploadCommand(_Command):
     path: Path
     sha256: str | None
     sidecar: Sidecar | None
-    geometry: RecordingGeometry
+    camera: StoredCameraOptions
+    """Wins over the sidecar."""
 
 
 Command = Annotated[
@@ -128,6 +138,8 @@ class RingOpened(BaseModel):
     sensor: Sensor
     frames: int | None
     can_block: bool
+    profile: CameraProfile | None = None
+    calibration: Path | None = None
 
 
 class Warned(BaseModel):

@@ -38,6 +38,7 @@ TRASH = "use_after_free"
 
 
 BEYOND_SCHEMA = {
+    "/api/v1/devices/{device_id}/profile": "it fits the camera, and its calibration is a file that requests may name",
     "/api/v1/captures": "a source is a small language of its own: options, files that requests may name",
     "/api/v1/captures/{capture_id}/views": "a matrix is a rotation, the sum of all pixels has a limit",
     "/api/v1/reconstructions/{reconstruction_id}/views": "a matrix is a rotation, the sum of all pixels has a limit",
@@ -55,7 +56,8 @@ def configuration(known: dict[str, str]) -> str:
     lines += ["[parameters]", *(f'"path.{name}" = "{value}"' for name, value in known.items())]
     for path in BEYOND_SCHEMA:
         accepted = json.dumps([*_ACCEPTED, "413", "422"])
-        lines += ["[[operations]]", f'include-path = "{path}"', 'include-method = "POST"']
+        method = "PUT" if path.endswith("/profile") else "POST"
+        lines += ["[[operations]]", f'include-path = "{path}"', f'include-method = "{method}"']
         lines += [f"checks.positive_data_acceptance.expected-statuses = {accepted}"]
         if path in TOO_LARGE:
             lines += ['checks.not_a_server_error.expected-statuses = ["2xx", "3xx", "4xx", "507"]']

@@ -81,7 +81,7 @@ def _add_end_routes(router: APIRouter, captures: Captures) -> None:
 
 def _plan(body: CaptureRequest, sources: Sources) -> Plan:
     return Plan(
-        source=sources.named(body.source, body.device),
+        source=sources.named(body.source, body.device, body.camera),
         frames=body.frames,
         seconds=body.seconds,
         pretrigger_s=body.pretrigger_s,

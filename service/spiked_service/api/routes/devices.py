@@ -3,32 +3,47 @@
 import threading
 from dataclasses import asdict
 from http import HTTPStatus
+from pathlib import Path
 from typing import Annotated
 
-from fastapi import APIRouter, Path
+import fastapi
+from fastapi import APIRouter
 from fastapi.routing import APIRoute
-from spiked_driver.source_kind import Device
+from spiked_driver import open_camera
+from spiked_driver.source_kind import Device, SourceSpec
+from spiked_driver.spec import stored_profile
 
+from spiked.camera import CameraFiles
 from spiked.errors import SpikedError
+from spiked.profile import CameraProfile, profile_path
 from spiked.ring import DeviceState
 from spiked_service.api.idempotency import IdempotencyKey
-from spiked_service.api.problems import problems
-from spiked_service.api.schemas.captures import ArmRequest, CapabilityOut, CountersOut, DeviceOut, DevicesOut
+from spiked_service.api.problems import ConflictError, problems
+from spiked_service.api.schemas.captures import (
+    ArmRequest,
+    CapabilityOut,
+    CountersOut,
+    DeviceOut,
+    DevicesOut,
+    ProfileModel,
+    ProfileOut,
+)
 from spiked_service.api.sources import Sources
+from spiked_service.base.ids import new_id
 from spiked_service.captures.captures import Captures
-from spiked_service.captures.sources import device_of, unpaced
+from spiked_service.captures.sources import device_of, unpaced, with_options
 from spiked_service.events.bus import Bus, Topic
 from spiked_service.events.logging import logger
 from spiked_service.store.catalogue import UnknownIdError
 
-DeviceId = Annotated[str, Path(description="As `GET devices` names it, percent-encoded.", max_length=4096)]
+DeviceId = Annotated[str, fastapi.Path(description="As `GET devices` names it, percent-encoded.", max_length=4096)]
 
 _LOOK_S = 2.0
 """Interval at which devices are checked, seconds."""
 _log = logger("spiked.devices")
 
 
-def device_routes(captures: Captures, sources: Sources, route_class: type[APIRoute]) -> APIRouter:
+def device_routes(captures: Captures, sources: Sources, profiles: Path, route_class: type[APIRoute]) -> APIRouter:
     """Routes below `devices`."""
     router = APIRouter(prefix="/devices", tags=["devices"], route_class=route_class)
 
@@ -55,12 +70,60 @@ def device_routes(captures: Captures, sources: Sources, route_class: type[APIRou
         captures.disarm(unpaced(device.source))
         return shown(captures, device)
 
+    _add_profile_routes(router, sources, profiles)
+
     @router.get("/{device_id:device}", responses=problems(404))
     def get_device(device_id: DeviceId) -> DeviceOut:
         """State, counters and capabilities of a device."""
         return shown(captures, _find(sources, device_id))
 
     return router
+
+
+def _add_profile_routes(router: APIRouter, sources: Sources, profiles: Path) -> None:
+    """Routes that read, write and remove the profile of a device."""
+
+    @router.get("/{device_id:device}/profile", responses=problems(404))
+    def get_device_profile(device_id: DeviceId) -> ProfileOut:
+        """What captures of the device take from its profile."""
+        path = _profile_of(sources, profiles, device_id)
+        return ProfileOut(file=path.name, profile=ProfileModel(**CameraProfile.read(path).model_dump()))
+
+    @router.put("/{device_id:device}/profile", responses=problems(404, 409))
+    def set_device_profile(device_id: DeviceId, body: ProfileModel) -> ProfileOut:
+        """Replace the profile of the device; captures that run keep theirs. It is checked and survives a restart.
+
+        It is kept by the camera's serial number, or by the device's id if the number is missing or not its own.
+        """
+        device = _find(sources, device_id)
+        if body.serial is not None and device.serial is not None and body.serial != device.serial:
+            raise ConflictError(f"the profile is of camera {body.serial}, and {device_id} is camera {device.serial}")
+        if body.calibration is not None:
+            sources.check_file(str(profiles / body.calibration), profiles)
+        address = SourceSpec.parse(device.source).address
+        path = profile_path(profiles, address, device.serial)
+        # Opened with the profile before it replaces the one before: an impossible one is refused.
+        trial = path.with_name(f".{path.name}.{new_id()}.part")
+        try:
+            body.write(trial)
+            open_camera(with_options(device.source, CameraFiles(profile=trial)))
+            trial.replace(path)
+        finally:
+            trial.unlink(missing_ok=True)
+        return ProfileOut(file=path.name, profile=body)
+
+    @router.delete("/{device_id:device}/profile", status_code=HTTPStatus.NO_CONTENT, responses=problems(404))
+    def remove_device_profile(device_id: DeviceId) -> None:
+        """Remove the profile of the device."""
+        _profile_of(sources, profiles, device_id).unlink(missing_ok=True)
+
+
+def _profile_of(sources: Sources, profiles: Path, device_id: str) -> Path:
+    """The file of a device's profile. Raises UnknownIdError without one."""
+    path = stored_profile(_find(sources, device_id), profiles)
+    if path is None:
+        raise UnknownIdError(f"device {device_id} has no profile; PUT one")
+    return path
 
 
 def _find(sources: Sources, device_id: str) -> Device:

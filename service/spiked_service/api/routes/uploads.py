@@ -39,7 +39,7 @@ def upload_routes(uploads: Uploads, captures: Captures, route_class: type[APIRou
             body.notes,
             body.bytes,
             None if body.sidecar is None else body.sidecar.model_dump_json(),
-            None if body.geometry is None else body.geometry.model_dump_json(),
+            None if body.geometry is None else body.geometry.options().model_dump_json(exclude_none=True),
             body.sha256,
         )
         response.headers["Location"] = request.url_for("get_upload", upload_id=row.id).path

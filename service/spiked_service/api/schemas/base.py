@@ -7,7 +7,7 @@ from typing import Annotated, Any, Generic, TypeVar
 from fastapi import Query
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, StrictFloat, model_validator
 
-from spiked.sensor import Intrinsics
+from spiked.camera import Pinhole
 
 T = TypeVar("T")
 
@@ -145,7 +145,13 @@ class PageOut(Out, Generic[T]):
     )
 
 
-class IntrinsicsModel(In):
+def camera_example(**fields: Any) -> ConfigDict:
+    """Configuration of a model of camera options: strict types, and one kind of optics."""
+    config = examples(fields, rules=at_most_one_of(fov="number", intrinsics="object"))
+    return ConfigDict(**config, strict=True)
+
+
+class IntrinsicsModel(In, Pinhole):
     """A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5)."""
 
     model_config = example(fx=420.0, fy=420.0, cx=200.0, cy=125.0)
@@ -154,14 +160,3 @@ class IntrinsicsModel(In):
     fy: StrictFloat = Field(gt=0, le=1e6)
     cx: StrictFloat = Field(ge=-1e6, le=1e6)
     cy: StrictFloat = Field(ge=-1e6, le=1e6)
-
-    def intrinsics(self) -> Intrinsics:
-        """The same for the library."""
-        return Intrinsics(self.fx, self.fy, self.cx, self.cy)
-
-    @classmethod
-    def of(cls, intrinsics: Intrinsics | None) -> "IntrinsicsModel | None":
-        """The same from the library."""
-        if intrinsics is None:
-            return None
-        return cls(fx=intrinsics.fx, fy=intrinsics.fy, cx=intrinsics.cx, cy=intrinsics.cy)

@@ -5,6 +5,8 @@ from typing import Any, Self
 
 from pydantic import ConfigDict, Field, StrictBool, StrictFloat, StrictInt, model_validator
 
+from spiked.camera import CameraFiles, CameraOptions
+from spiked.profile import CameraProfile
 from spiked.ring import DeviceState, Policy
 from spiked.sensor import Mosaic, Sensor
 from spiked_service.api.schemas.base import (
@@ -18,6 +20,7 @@ from spiked_service.api.schemas.base import (
     Out,
     PageOut,
     at_most_one_of,
+    camera_example,
     exactly_one_of,
     example,
     examples,
@@ -127,12 +130,36 @@ class ArmRequest(In):
     )
 
 
+class ProfileModel(In, CameraProfile):
+    """What is known of one camera; options of a source or request win over it."""
+
+    model_config = camera_example(model="M1K40", width=1000, height=1000, mosaic="BGGR", fov=50.0)
+
+    intrinsics: IntrinsicsModel | None = None
+
+
+class ProfileOut(Out):
+    """The profile of a device."""
+
+    file: str = Field(description="Its file in the folder `profiles` of the data folder.")
+    profile: ProfileModel
+
+
+class StatedCameraModel(In, CameraOptions, CameraFiles):
+    """What is stated of a camera; it wins over the options of the source, its profile and its sidecar."""
+
+    model_config = camera_example(mosaic="BGGR", fov=50.0)
+
+    intrinsics: IntrinsicsModel | None = None
+
+
 class CaptureRequest(In):
     """A capture to start."""
 
     model_config = examples(
         {"source": "sim:?seed=1", "frames": 1280, "name": "desk, by hand"},
         {"source": "sim:", "seconds": 0.1, "reconstruct": False},
+        {"source": "sim:?seed=1", "frames": 640, "camera": {"mosaic": "BGGR", "fov": 60.0}},
         rules=[
             *exactly_one_of(source="string", device="string"),
             *at_most_one_of(frames="integer", seconds="number"),
@@ -169,6 +196,7 @@ class CaptureRequest(In):
     record: StrictBool = Field(True, description="Keep the frames in the data folder.")
     reconstruct: StrictBool = Field(True, description="Reconstruct while it runs.")
     options: ReconstructionOptions = Field(default_factory=ReconstructionOptions)
+    camera: StatedCameraModel | None = Field(None, description="The same as options of the source's text.")
     intrinsics: IntrinsicsModel | None = Field(None, description="If the source does not know its own.")
 
     @model_validator(mode="after")

@@ -2,27 +2,29 @@
 
 from datetime import datetime
 
-from pydantic import ConfigDict, Field, StrictBool, StrictFloat, StrictInt
+from pydantic import ConfigDict, Field, StrictInt
 
+from spiked.camera import Rate, StoredCameraOptions
 from spiked.recording.sidecar import Sidecar
-from spiked.sensor import BitOrder, Layout, Mosaic
-from spiked_service.api.schemas.base import Id, In, IntrinsicsModel, Name, Notes, Out, examples
+from spiked_service.api.schemas.base import Id, In, IntrinsicsModel, Name, Notes, Out, camera_example, examples
 
 MAX_UPLOAD_BYTES = 1 << 42
 """Upper bound of the schema, 4 TiB; `limit_upload_bytes` is the limit in effect."""
 
 
-class GeometryModel(In):
+class GeometryModel(In, StoredCameraOptions):
     """What the recording holds, where there is no sidecar."""
 
-    width: StrictInt | None = Field(None, ge=1, le=16384)
-    height: StrictInt | None = Field(None, ge=1, le=16384)
-    frame_rate_hz: StrictFloat | None = Field(None, gt=0, le=1e7)
-    layout: Layout | None = None
-    bit_order: BitOrder | None = None
-    flipped: StrictBool | None = Field(None, description="Rows are stored bottom-up.")
-    mosaic: Mosaic | None = Field(None, description="Colour pattern of the upright image.")
+    model_config = camera_example(width=640, height=360, rate=40_000, mosaic="BGGR")
+
     intrinsics: IntrinsicsModel | None = None
+    frame_rate_hz: Rate | None = Field(None, deprecated=True, description="Deprecated: use rate.")
+
+    def options(self) -> StoredCameraOptions:
+        """The same for the library."""
+        stated = self.model_dump(exclude_none=True)
+        rate = stated.pop("frame_rate_hz", None)
+        return StoredCameraOptions(**({} if rate is None else {"rate": rate}) | stated)
 
 
 class UploadSidecar(Sidecar):
@@ -41,7 +43,7 @@ class UploadRequest(In):
             "geometry": {
                 "width": 400,
                 "height": 250,
-                "frame_rate_hz": 20000,
+                "rate": 20000,
                 "layout": "compact",
                 "intrinsics": {"fx": 346.4, "fy": 346.4, "cx": 200, "cy": 125},
             },

@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from spiked.recording import Recording, RecordingGeometry, open_recording
+from spiked.recording import Recording, RecordingGeometry
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import output, report_warning
 
@@ -23,6 +23,7 @@ def info(
     bit_order: g.Bits = None,
     flipped: g.Flipped = None,
     mosaic: g.Colours = None,
+    profile: g.Profile = None,
 ) -> None:
     """Print geometry, length, spike rate and gaps of a recording, and the origin of the geometry.
 
@@ -32,9 +33,8 @@ def info(
 
     - `spiked info rec.dat --width 640 --height 360 --rate 40000 --mosaic BGGR`
     """
-    recording = open_recording(
-        file, **RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic).stated()
-    )
+    stated = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic)
+    recording = g.open_described(file, stated, profile).recording
     for warning in recording.warnings:
         report_warning(warning)
     for name, value in rows(recording):

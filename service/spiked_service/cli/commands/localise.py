@@ -12,7 +12,7 @@ from rich.progress import track
 
 from spiked.errors import ConfigurationError, RecordingError
 from spiked.recon import Localisation, Localiser, MapIndex
-from spiked.recording import Recording, RecordingGeometry, open_recording
+from spiked.recording import Recording, RecordingGeometry
 from spiked.render import Camera
 from spiked.sensor import Intrinsics, Sensor
 from spiked_service.cli import outputs
@@ -41,6 +41,8 @@ def localise(
     bit_order: g.Bits = None,
     flipped: g.Flipped = None,
     mosaic: g.Colours = None,
+    profile: g.Profile = None,
+    calibration: g.CalibrationFile = None,
 ) -> None:
     """Find where the camera of a recording was in a map.
 
@@ -59,14 +61,16 @@ def localise(
     if json_out is not None:
         outputs.try_file("--json", json_out)
     known = MapFolder.read(map_folder)
-    geometry = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic)
-    recording = open_recording(file, **geometry.stated())
+    stated = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic)
+    described = g.open_described(file, stated, profile)
+    recording = described.recording
+    measured = g.read_calibration(calibration, described)
     for warning in recording.warnings:
         report_warning(warning)
     end = _end(recording, start, frames)
     sensor = g.with_optics(recording.sensor, fov, intrinsics)
     index = MapIndex(known.scene, known.known.trajectory, Camera(_optics(sensor, known), sensor.width, sensor.height))
-    localiser = Localiser(index, sensor)
+    localiser = Localiser(index, sensor, measured)
     for first_frame, part in track(
         list(_parts(recording, start, end)), "localising", console=messages, transient=True,
         disable=not messages.is_terminal,

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from spiked.noise import NoiseReport, measure_noise
-from spiked.recording import RecordingGeometry, open_recording
+from spiked.recording import RecordingGeometry
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import output, report_warning
@@ -25,6 +25,7 @@ def noise_report(
     bit_order: g.Bits = None,
     flipped: g.Flipped = None,
     mosaic: g.Colours = None,
+    profile: g.Profile = None,
 ) -> None:
     """Measure the noise of a camera from a recording of a static scene.
 
@@ -39,9 +40,8 @@ def noise_report(
     """
     if json_file is not None:
         outputs.try_file("--json", json_file)
-    recording = open_recording(
-        file, **RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic).stated()
-    )
+    stated = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic)
+    recording = g.open_described(file, stated, profile).recording
     for warning in recording.warnings:
         report_warning(warning)
     report = measure_noise(recording, frames)

@@ -24,12 +24,11 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from spiked.calibration import Calibration
 from spiked.errors import ConfigurationError, SceneError, SpikedError
 from spiked.recon import NotOnePlaceError, Reconstructor, State, Status, extend
 from spiked.recon.frontend.mosaic_check import detect
 from spiked.recon.frontend.windowing import Windows
-from spiked.recording import Recording, RecordingGeometry, open_recording
+from spiked.recording import Recording, RecordingGeometry
 from spiked.sensor import Mosaic, Sensor
 from spiked.trajectory import Trajectory
 from spiked_service.cli import outputs
@@ -93,9 +92,8 @@ def reconstruct(
     bit_order: g.Bits = None,
     flipped: g.Flipped = None,
     mosaic: g.ColoursOrAuto = None,
-    calibration: Annotated[
-        Path | None, typer.Option(help="Gains, dark rates and dead pixels, from `spiked calibrate`.")
-    ] = None,
+    profile: g.Profile = None,
+    calibration: g.CalibrationFile = None,
 ) -> None:
     """Reconstruct the camera's trajectory and a Gaussian scene from a recording.
 
@@ -132,8 +130,10 @@ def reconstruct(
     if map is not None:
         _check_map(map, out)
     colours = None if mosaic in (None, g.MosaicChoice.AUTO) else Mosaic(mosaic)
-    geometry = RecordingGeometry(width, height, rate, layout, bit_order, flipped, colours)
-    recording = open_recording(file, **geometry.stated())
+    described = g.open_described(
+        file, RecordingGeometry(width, height, rate, layout, bit_order, flipped, colours), profile
+    )
+    recording = described.recording
     for warning in recording.warnings:
         report_warning(warning)
     sensor = g.with_optics(recording.sensor, fov, intrinsics)
@@ -149,11 +149,11 @@ def reconstruct(
         refine_poses=refine_poses,
     )
     known = None if poses is None else Trajectory.read_tum(poses)
-    measured = None if calibration is None else Calibration.read(calibration)
+    measured = g.read_calibration(calibration, described)
     reconstructor = Reconstructor(
         sensor, replace(chosen.options(), poses=known, calibration=measured), recording=recording
     )
-    run = ReconstructionRun.begun(recording, reconstructor, out, parameters_of(context, geometry))
+    run = ReconstructionRun.begun(recording, reconstructor, out, parameters_of(context, described.geometry))
     _carry_out(run, _watched(file.name, watch_port) if watch else None)
 
 

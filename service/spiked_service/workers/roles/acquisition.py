@@ -7,7 +7,7 @@ from spiked_driver.acquisition import acquire
 from spiked_driver.realtime import take_priority
 from spiked_driver.source import Source
 from spiked_driver.source_kinds import is_camera
-from spiked_driver.spec import open_source
+from spiked_driver.spec import open_camera
 
 from spiked.ring import RingWriter
 from spiked.ring.segment import FOLDER
@@ -30,12 +30,13 @@ _HISTORY_SHARE = 0.4
 
 
 def run_acquisition(command: AcquisitionCommand, channel: WorkerChannel) -> None:
-    """Acquire until the end of the source. Raises SourceError, RecordingError or RingError, which end the capture."""
+    """Acquire until the end of the source. Raises a SpikedError, which ends the capture."""
 
     def warn(text: str) -> None:
         channel.send(Warned(text=text))
 
-    source = open_source(command.source, warn)
+    opened = open_camera(command.source, warn, command.profiles)
+    source = opened.source
     sensor = source.sensor
     limit = command.frames if command.seconds is None else max(1, round(command.seconds * sensor.frame_rate_hz))
     with _ring(command, source) as writer:
@@ -46,6 +47,8 @@ def run_acquisition(command: AcquisitionCommand, channel: WorkerChannel) -> None
                     sensor=sensor,
                     frames=limit if limit is not None else source.frames,
                     can_block=source.can_block,
+                    profile=opened.profile,
+                    calibration=opened.calibration,
                 )
             )
         if is_camera(command.source):

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spiked.calibration import Calibration
 from spiked.errors import CheckpointError, SceneError
 from spiked.pose import quaternion
 from spiked.poses import PoseFile
-from spiked.recon import Reconstructor, State, Status, Tracked
+from spiked.recon import Options, Reconstructor, State, Status, Tracked
 from spiked.recon.checkpoint import CHECKPOINT, CheckpointSaver, Interrupted, exists
 from spiked.recon.frontend.windowing import SEARCH_FRAMES
-from spiked.recording import Recording, open_recording
+from spiked.recording import Recording, open_recording, recorded_calibration
 from spiked.ring import End, Frames, Gap, Policy, RingReader
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
@@ -141,9 +142,16 @@ def _begin(
 ) -> _Work:
     intrinsics: Intrinsics | None = command.intrinsics or sensor.intrinsics
     live = command.ring is not None and not command.can_block
-    options = command.options.options()
+    options = options_of(command, recording)
     reconstructor = Reconstructor(replace(sensor, intrinsics=intrinsics), options, live=live, recording=recording)
     return _Work(reconstructor, ProgressReporter(reconstructor, command, channel), channel)
+
+
+def options_of(command: ReconstructionCommand, recording: Recording | None) -> Options:
+    """The options for the library, with the calibration of the camera. Raises CalibrationError."""
+    path = command.calibration if recording is None else recorded_calibration(recording.path)
+    measured = None if path is None else Calibration.read(path)
+    return replace(command.options.options(), calibration=measured)
 
 
 def _parameters(command: ReconstructionCommand) -> dict[str, Any]:

@@ -2,11 +2,13 @@
 
 import logging
 import os
+import shutil
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +35,8 @@ _LOOK_S = 0.1
 """Interval at which a frame is checked for spikes, seconds: a stream of only zeros or only ones is no picture."""
 _DRAIN_S = 0.5
 """Time to wait for the last frames after a stop."""
+CALIBRATION = "calibration.npz"
+"""Name of the calibration beside a recording."""
 _NICE = -5
 """Niceness: above the other readers."""
 
@@ -51,7 +55,7 @@ def run_recorder(command: RecorderCommand, channel: WorkerChannel) -> None:
         if not command.resume:
             sensor = reader.geometry.sensor
             sensor = replace(sensor, intrinsics=command.intrinsics or sensor.intrinsics)
-            more = {"device": {"source": command.source}}
+            more = {"device": {"source": command.source}, **_camera_fields(command)}
             writer = RecordingWriter(command.path, sensor, note=command.note, durability=LIVE, **more)
         account = record(
             reader,
@@ -63,6 +67,26 @@ def run_recorder(command: RecorderCommand, channel: WorkerChannel) -> None:
         )
     _log.info("recording closed with %d frames; lost %s", account.frames, account.lost or "none")
     channel.send(account)
+
+
+def _camera_fields(command: RecorderCommand) -> dict[str, Any]:
+    """Fields of the sidecar from what is known of the camera; its calibration is copied beside the recording.
+
+    Raises RecordingError if it cannot be copied.
+    """
+    fields: dict[str, Any] = {}
+    if command.profile is not None:
+        fields["profile"] = command.profile.model_dump(mode="json", exclude_defaults=True)
+    if command.calibration is not None:
+        copy = command.path.with_name(CALIBRATION)
+        try:
+            shutil.copyfile(command.calibration, copy)
+        except OSError as error:
+            raise RecordingError(
+                f"the calibration {command.calibration} cannot be copied to {copy}: {error.strerror}; free disk space"
+            ) from error
+        fields["calibration"] = CALIBRATION
+    return fields
 
 
 def record(

@@ -4,7 +4,7 @@ import hashlib
 from pathlib import Path
 
 from spiked.errors import RecordingError
-from spiked.recording import verify
+from spiked.recording import RecordingGeometry, verify
 from spiked.recording.sidecar import Sidecar, lost_by_cause, sidecar_path, write_sidecar
 from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.messages import UploadChecked, UploadCommand
@@ -27,8 +27,8 @@ def run_upload(command: UploadCommand, channel: WorkerChannel) -> None:
     if command.sidecar is not None:
         # A calibration refers to a file of the machine that sent it.
         write_sidecar(beside, command.sidecar.model_copy(update={"calibration": None}))
-    found = verify(command.path, **command.geometry.stated())
-    recording, sensor = found.recording, found.recording.sensor
+    found = verify(command.path, **RecordingGeometry.of(command.camera).stated())
+    recording, sensor = found.recording, command.camera.sensor(found.recording.sensor)
     if max(sensor.width, sensor.height) > _LARGEST_SIDE:
         raise RecordingError(f"{sensor.width}x{sensor.height} pixels are more than {_LARGEST_SIDE} on a side")
     more = {} if command.sidecar is None else {"note": command.sidecar.note, "device": command.sidecar.device}

@@ -72,6 +72,42 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/api/v1/devices/{device_id}/profile": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Device Profile
+         * @description What captures of the device take from its profile.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["get_device_profile_api_v1_devices__device_id__profile_get"];
+        /**
+         * Set Device Profile
+         * @description Replace the profile of the device; captures that run keep theirs. It is checked and survives a restart.
+         *
+         *     It is kept by the camera's serial number, or by the device's id if the number is missing or not its own.
+         *
+         *     Scope of a token: `operate`.
+         */
+        put: operations["set_device_profile_api_v1_devices__device_id__profile_put"];
+        post?: never;
+        /**
+         * Remove Device Profile
+         * @description Remove the profile of the device.
+         *
+         *     Scope of a token: `operate`.
+         */
+        delete: operations["remove_device_profile_api_v1_devices__device_id__profile_delete"];
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
     "/api/v1/devices/{device_id}": {
         parameters: {
             query?: never;
@@ -1260,6 +1296,14 @@ export interface components {
          *       "seconds": 0.1,
          *       "source": "sim:"
          *     }
+         * @example {
+         *       "camera": {
+         *         "fov": 60,
+         *         "mosaic": "BGGR"
+         *       },
+         *       "frames": 640,
+         *       "source": "sim:?seed=1"
+         *     }
          */
         CaptureRequest: {
             /**
@@ -1311,6 +1355,8 @@ export interface components {
              */
             reconstruct?: boolean;
             options?: components["schemas"]["ReconstructionOptions"];
+            /** @description The same as options of the source's text. */
+            camera?: components["schemas"]["StatedCameraModel"] | null;
             /** @description If the source does not know its own. */
             intrinsics?: components["schemas"]["IntrinsicsModel"] | null;
         } & (unknown & unknown & unknown & unknown);
@@ -1566,25 +1612,53 @@ export interface components {
         /**
          * GeometryModel
          * @description What the recording holds, where there is no sidecar.
+         * @example {
+         *       "height": 360,
+         *       "mosaic": "BGGR",
+         *       "rate": 40000,
+         *       "width": 640
+         *     }
          */
         GeometryModel: {
-            /** Width */
-            width?: number | null;
-            /** Height */
-            height?: number | null;
-            /** Frame Rate Hz */
-            frame_rate_hz?: number | null;
-            layout?: components["schemas"]["Layout"] | null;
-            bit_order?: components["schemas"]["BitOrder"] | null;
+            /**
+             * Rate
+             * @description Frames per second.
+             */
+            rate?: number | null;
+            /** @description Colour mosaic of the upright image; none: a grey sensor. */
+            mosaic?: components["schemas"]["Mosaic"] | null;
             /**
              * Flipped
-             * @description Rows are stored bottom-up.
+             * @description Rows come bottom-up; false: top-down.
              */
             flipped?: boolean | null;
-            /** @description Colour pattern of the upright image. */
-            mosaic?: components["schemas"]["Mosaic"] | null;
+            /**
+             * Fov
+             * @description Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated.
+             */
+            fov?: number | null;
             intrinsics?: components["schemas"]["IntrinsicsModel"] | null;
-        };
+            /**
+             * Width
+             * @description Pixels in a row, a multiple of 8.
+             */
+            width?: number | null;
+            /**
+             * Height
+             * @description Rows.
+             */
+            height?: number | null;
+            /** @description How a frame is stored: rows only, or each row followed by its number. */
+            layout?: components["schemas"]["Layout"] | null;
+            /** @description Which bit of a byte is the leftmost of its eight pixels. */
+            bit_order?: components["schemas"]["BitOrder"] | null;
+            /**
+             * Frame Rate Hz
+             * @deprecated
+             * @description Deprecated: use rate.
+             */
+            frame_rate_hz?: number | null;
+        } & unknown;
         /**
          * Grade
          * @description Quality of a recording, as `spiked verify` prints it.
@@ -1705,7 +1779,7 @@ export interface components {
         PictureKind: "interval" | "rate" | "accumulation" | "render";
         /**
          * Pinhole
-         * @description Intrinsics in a sidecar, in pixels.
+         * @description A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5).
          */
         Pinhole: {
             /** Fx */
@@ -1762,6 +1836,80 @@ export interface components {
              * @default null
              */
             what_to_do: string | null;
+        };
+        /**
+         * ProfileModel
+         * @description What is known of one camera; options of a source or request win over it.
+         * @example {
+         *       "fov": 50,
+         *       "height": 1000,
+         *       "model": "M1K40",
+         *       "mosaic": "BGGR",
+         *       "width": 1000
+         *     }
+         */
+        ProfileModel: {
+            /**
+             * Rate
+             * @description Frames per second.
+             */
+            rate?: number | null;
+            /** @description Colour mosaic of the upright image; none: a grey sensor. */
+            mosaic?: components["schemas"]["Mosaic"] | null;
+            /**
+             * Flipped
+             * @description Rows come bottom-up; false: top-down.
+             */
+            flipped?: boolean | null;
+            /**
+             * Fov
+             * @description Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated.
+             */
+            fov?: number | null;
+            intrinsics?: components["schemas"]["IntrinsicsModel"] | null;
+            /**
+             * Model
+             * @description Name of the product.
+             * @default
+             */
+            model?: string;
+            /**
+             * Serial
+             * @description Serial number of the camera that the profile is of; null: of any.
+             */
+            serial?: string | null;
+            /**
+             * Width
+             * @description Pixels in a row.
+             */
+            width?: number | null;
+            /**
+             * Height
+             * @description Rows.
+             */
+            height?: number | null;
+            /**
+             * Calibration
+             * @description File of gains, dark rates and dead pixels, relative to the profile.
+             */
+            calibration?: string | null;
+            /**
+             * Note
+             * @default
+             */
+            note?: string;
+        } & unknown;
+        /**
+         * ProfileOut
+         * @description The profile of a device.
+         */
+        ProfileOut: {
+            /**
+             * File
+             * @description Its file in the folder `profiles` of the data folder.
+             */
+            file: string;
+            profile: components["schemas"]["ProfileModel"];
         };
         /**
          * RateHistogram
@@ -2129,6 +2277,44 @@ export interface components {
          */
         State: "boot" | "track" | "degraded" | "lost" | "reloc";
         /**
+         * StatedCameraModel
+         * @description What is stated of a camera; it wins over the options of the source, its profile and its sidecar.
+         * @example {
+         *       "fov": 50,
+         *       "mosaic": "BGGR"
+         *     }
+         */
+        StatedCameraModel: {
+            /**
+             * Calibration
+             * @description File of gains, dark rates and dead pixels, from `spiked calibrate`.
+             */
+            calibration?: string | null;
+            /**
+             * Profile
+             * @description Camera profile, a JSON file; options that are stated win over it.
+             */
+            profile?: string | null;
+            /**
+             * Rate
+             * @description Frames per second.
+             */
+            rate?: number | null;
+            /** @description Colour mosaic of the upright image; none: a grey sensor. */
+            mosaic?: components["schemas"]["Mosaic"] | null;
+            /**
+             * Flipped
+             * @description Rows come bottom-up; false: top-down.
+             */
+            flipped?: boolean | null;
+            /**
+             * Fov
+             * @description Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated.
+             */
+            fov?: number | null;
+            intrinsics?: components["schemas"]["IntrinsicsModel"] | null;
+        } & unknown;
+        /**
          * StatsOut
          * @description Statistics of a few frames.
          */
@@ -2342,7 +2528,6 @@ export interface components {
          * @example {
          *       "bytes": 16000000,
          *       "geometry": {
-         *         "frame_rate_hz": 20000,
          *         "height": 250,
          *         "intrinsics": {
          *           "cx": 200,
@@ -2351,6 +2536,7 @@ export interface components {
          *           "fy": 346.4
          *         },
          *         "layout": "compact",
+         *         "rate": 20000,
          *         "width": 400
          *       },
          *       "name": "garden.dat"
@@ -2429,6 +2615,10 @@ export interface components {
             calibration?: string | null;
             /** Device */
             device?: {
+                [key: string]: unknown;
+            } | null;
+            /** Profile */
+            profile?: {
                 [key: string]: unknown;
             } | null;
         } & {
@@ -2857,6 +3047,302 @@ export interface operations {
             };
             /** @description It conflicts with the current state. */
             409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_device_profile_api_v1_devices__device_id__profile_get: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                /** @description As `GET devices` names it, percent-encoded. */
+                device_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["ProfileOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    set_device_profile_api_v1_devices__device_id__profile_put: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                /** @description As `GET devices` names it, percent-encoded. */
+                device_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["ProfileModel"];
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["ProfileOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It conflicts with the current state. */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    remove_device_profile_api_v1_devices__device_id__profile_delete: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                /** @description As `GET devices` names it, percent-encoded. */
+                device_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            204: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
                 headers: {
                     [name: string]: unknown;
                 };

@@ -1,0 +1,100 @@
+"""Camera profiles over HTTP: checked, kept over a restart, and used by captures."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from spiked.calibration import Calibration
+from spiked.client import ApiError, ProfileModel, Spiked, StatedCameraModel
+from spiked.profile import CameraProfile
+
+DEVICE = "sim:"
+PATH = "devices/sim%3A/profile"
+
+
+@pytest.fixture
+def folder(service: Any) -> Path:
+    return Path(service.client.system().data_folder) / "profiles"
+
+
+def test_a_profile_is_written_read_and_removed(service: Any, folder: Path) -> None:
+    assert service.http.get(PATH).status_code == 404
+    body = {"model": "toy", "mosaic": "BGGR", "flipped": False, "intrinsics": {"fx": 90, "fy": 90, "cx": 48, "cy": 32}}
+    written = service.http.put(PATH, json=body)
+    assert written.status_code == 200 and written.json()["file"] == "sim%3A.json"
+    assert service.http.get(PATH).json() == written.json()
+    assert service.client.profile(DEVICE).mosaic == "BGGR"
+    assert CameraProfile.read(folder / "sim%3A.json").intrinsics is not None
+    assert service.http.delete(PATH).status_code == 204
+    assert service.http.delete(PATH).status_code == 404
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("body", "told"),
+    [
+        ({"mosaic": "RGBW"}, "mosaic"),
+        ({"rate": "20000"}, "rate"),
+        ({"fov": 50, "intrinsics": {"fx": 1, "fy": 1, "cx": 0, "cy": 0}}, "give one of them"),
+        ({"lens": "50 mm"}, "lens"),
+        ({"width": 12, "height": 8}, "multiple of 8"),
+        ({"width": 16384, "height": 16384}, "larger than"),
+        ({"calibration": "missing.npz"}, "cannot read the calibration"),
+        ({"calibration": "/etc/passwd"}, "is not in a folder"),
+        ({"calibration": "../" * 9 + "etc/passwd"}, "is not in a folder"),
+    ],
+)
+def test_a_profile_that_cannot_be_used_is_refused_and_the_one_before_stays(
+    service: Any, folder: Path, body: dict[str, Any], told: str
+) -> None:
+    service.client.set_profile(DEVICE, ProfileModel(model="before"))
+    refused = service.http.put(PATH, json=body)
+    assert refused.status_code == 422 and told in refused.text, refused.text
+    assert service.client.profile(DEVICE).model == "before"
+    assert [file.name for file in folder.iterdir()] == ["sim%3A.json"]
+    service.http.delete(PATH)
+
+
+def test_a_capture_takes_the_profile_and_a_request_wins_over_it(service: Any, folder: Path) -> None:
+    image = np.full((64, 96), 1.0, np.float32)
+    Calibration(image, 0 * image, np.zeros(image.shape, bool)).write(folder / "toy.npz")
+    profile = ProfileModel(mosaic="GRBG", flipped=False, fov=70, width=96, height=64, calibration="toy.npz")
+    service.client.set_profile(DEVICE, profile)
+    try:
+        for camera, mosaic, fx in ((None, "GRBG", 68.6), (StatedCameraModel(mosaic="RGGB", fov=90), "RGGB", 48)):
+            started = service.client.start_capture("sim:", frames=64, reconstruct=False, camera=camera)
+            sensor = service.client.wait_for_capture(started.id, 60).sensor
+            assert (sensor.width, sensor.mosaic) == (96, mosaic)
+            assert sensor.intrinsics.fx == pytest.approx(fx, abs=0.1)
+    finally:
+        service.http.delete(PATH)
+        (folder / "toy.npz").unlink()
+
+
+@pytest.mark.parametrize("option", ["profile", "calibration"])
+def test_requests_name_no_files_outside_the_folders(service: Any, option: str) -> None:
+    for body in ({"source": f"sim:?{option}=/etc/passwd"}, {"source": "sim:", "camera": {option: "/etc/passwd"}}):
+        refused = service.http.post("captures", json=body)
+        assert refused.status_code == 422 and "is not in a folder" in refused.text
+
+
+def test_a_profile_survives_a_restart(tmp_path: Path, daemon_class: Any) -> None:
+    for written in (True, False):
+        daemon = daemon_class(folder=tmp_path)
+        try:
+            client = Spiked(daemon.address)
+            if written:
+                client.set_profile(DEVICE, ProfileModel(model="toy", mosaic="GBRG"))
+            assert client.profile(DEVICE).mosaic == "GBRG"
+            client.close()
+        finally:
+            daemon.close()
+        time.sleep(0.1)
+
+
+def test_a_device_that_is_not_there_has_no_profile(service: Any) -> None:
+    with pytest.raises(ApiError, match="there is no device"):
+        service.client.profile("usb9")

@@ -187,7 +187,7 @@ class Odometry:
 
     def _adjust_keyframes_if_long(self) -> None:
         """From `LONG_FRAMES` or `LONG_VIEWS` on, adjust keyframes in a window instead of the whole path."""
-        if self.sparse:  # long already, or views too far apart
+        if self._keyframes is not None:
             return
         posed = self._map.posed()
         if posed and (len(posed) >= LONG_VIEWS or posed[-1].time - posed[0].time >= LONG_FRAMES):

@@ -157,7 +157,7 @@ class Reconstructor:
         """Add stored frames uint8 [n, frame_bytes] that begin at absolute index `first_frame`."""
         with self._log.measure("tracking"), one_blas_thread():
             for view in self._windows.feed(first_frame, frames):
-                self._track(view)
+                self._track_spaced(view)
             self._frames = first_frame + len(frames)
 
     @property
@@ -186,6 +186,13 @@ class Reconstructor:
         """Frames [first_frame, first_frame + count) were lost."""
         self._gaps.append((first_frame, count))
         self._after_gap = True
+
+    def _track_spaced(self, view: View) -> None:
+        """Track a view; those of a long path have spaces between them."""
+        if self._windows.spaced:
+            self.odometry.skip()
+        self._track(view, skipped=self._windows.spaced)
+        self._windows.spaced = self.odometry.long
 
     def _track(self, view: View, skipped: bool = False) -> None:
         """Track a view and store it; with `skipped`, frames before it were left out."""
@@ -288,7 +295,7 @@ class Reconstructor:
     def _end_tracking(self, stop: Callable[[], bool], save: Callable[[], None]) -> None:
         with one_blas_thread():
             for view in self._windows.flush():
-                self._track(view)
+                self._track_spaced(view)
             if self._given is None:
                 self.odometry.end(stop, save)
                 self._waypoints = -1, None  # the views have moved

@@ -78,7 +78,7 @@ def test_a_long_path_is_followed_and_its_loop_closed(walked: tuple[Reconstructor
     score = score_trajectory(truth=truth, estimate=reconstructor.trajectory(), frame_rate_hz=SENSOR.frame_rate_hz)
     assert score.coverage > 0.99
     assert score.errors.ate_percent < 1.8
-    assert len(odometry.closures) > 3
+    assert len(odometry.closures) >= 3
     seconds = FRAMES / SENSOR.frame_rate_hz
     assert all(0 < earlier < later < seconds for earlier, later in reconstructor.closures())
     told = reconstructor.report()["closures"]
@@ -87,7 +87,7 @@ def test_a_long_path_is_followed_and_its_loop_closed(walked: tuple[Reconstructor
 
 def test_loops_are_closed_while_it_runs(not_ended: Odometry, walked: tuple[Reconstructor, Trajectory]) -> None:
     """The camera is back half-way between the turn and the end; what is closed later is closed at once as well."""
-    assert len(not_ended.closures) > 3
+    assert len(not_ended.closures) >= 3
     assert walked[0].odometry.closures[: len(not_ended.closures)] == not_ended.closures
     assert all(later - earlier > FRAMES / 4 for earlier, later in not_ended.closures)
 

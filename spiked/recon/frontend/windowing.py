@@ -37,6 +37,9 @@ FIRST_WINDOW = 16
 """Length of the first views in frames."""
 WINDOW_MOTION_PX = (0.12, 0.6)
 """The next view is twice as long below the first motion in a view, half as long above twice the second (decision 2)."""
+SPACING_PX, MOST_SPACING_S = 1.6, 0.005
+"""Motion and time from one view of a long path to the next, at most, where single views see less motion: more views
+cost time and add hardly any information (decision 15); a hand trembles at up to 12 Hz."""
 MOTION_ONSET_PX = 1.0
 """Motion in a view longer than `FIRST_WINDOW` that shortens this view at once (decision 7)."""
 FAST_PX = (0.35, 0.5)
@@ -140,6 +143,10 @@ class Windows:
         """Raises CalibrationError when the calibration is of another sensor."""
         self.sensor, self.length, self.sharpen = sensor, length or FIRST_WINDOW, False
         self._follows, self._probed = length is None, length is not None
+        self.spaced = False
+        """Views lie up to `SPACING_PX` apart, and frames between them are left out."""
+        self._spacing = 0
+        """Frames from the middle of one view to that of the next, at least."""
         self._calibration = calibration
         if calibration is not None:
             calibration.check(sensor)
@@ -214,6 +221,8 @@ class Windows:
         if not self._follows or motion_px == 0:
             return
         speed_px = motion_px / frames
+        most = MOST_SPACING_S * self.sensor.frame_rate_hz
+        self._spacing = int(min(SPACING_PX / speed_px, most)) if self.spaced else 0
         self.sharpen = speed_px > FAST_PX[not self.sharpen]
         if self.sharpen:
             self.length = WINDOWS[0] if speed_px > FASTEST_PX[self.length > WINDOWS[0]] else WINDOWS[1]
@@ -233,11 +242,16 @@ class Windows:
             self.follow(speed_px, 1.0)
         self._probed = True
 
-    def _shorten(self) -> None:
+    def _begin(self, stop: int, final: bool) -> int:
+        """Where the next view begins. The last one before `stop` is not farther from it than its length."""
+        spaced = self._next + max(0, self._spacing - self.length)
+        return max(self._next, min(spaced, stop - self.length)) if final else spaced
+
+    def _shorten(self, begin: int) -> None:
         """Shorten a long view in which the camera starts to move: it would be blurred."""
         while self._follows and not self.sharpen and self.length > FIRST_WINDOW:
-            begin = self._next - self._first
-            if drift(self._frames[begin : begin + self.length], self.sensor) < MOTION_ONSET_PX:
+            frames = self._frames[begin - self._first : begin - self._first + self.length]
+            if drift(frames, self.sensor) < MOTION_ONSET_PX:
                 return
             self.length = WINDOWS[WINDOWS.index(self.length) - 1]
 
@@ -247,9 +261,9 @@ class Windows:
             self._probe()
         if not self._probed:
             return
-        while self._next + self.length + (0 if final else SEARCH_FRAMES) <= stop:
-            self._shorten()
-            begin, end = self._next, self._next + self.length
+        while (begin := self._begin(stop, final)) + self.length + (0 if final else SEARCH_FRAMES) <= stop:
+            self._shorten(begin)
+            end = begin + self.length
             low = max(self._first, begin - SEARCH_FRAMES)
             high = min(stop, end + SEARCH_FRAMES)
             part = self._frames[low - self._first : high - self._first]

@@ -135,6 +135,11 @@ class Odometry:
         """Views are too far apart for a spline, or the path is long: it is interpolated, see `waypoints`."""
         return self._adjuster.interpolated
 
+    @property
+    def long(self) -> bool:
+        """The path is long: keyframes are adjusted."""
+        return self._keyframes is not None
+
     def waypoints(self) -> Waypoints | None:
         """The path interpolated between views with a pose; None before the bootstrap."""
         return self._map.waypoints()

@@ -379,12 +379,30 @@ class Reconstructor:
 
     def trajectory(self) -> Trajectory:
         """Poses at the middle of every frame near a tracked view; empty before the bootstrap."""
-        path = self.path
-        if path is None:
+        return self._poses_at(self._posed_frames())
+
+    def trajectory_so_far(self) -> Trajectory:
+        """`trajectory`; of a long path that is still tracked only the poses of its views: far fewer than its frames."""
+        if self.tracking_ended or not self.odometry.long or self.path is None:
+            return self.trajectory()
+        return self._poses_at(np.array([view.time for view in self.views.since(0) if view.posed]))
+
+    @property
+    def posed_frames(self) -> int:
+        """Number of poses of `trajectory`."""
+        return len(self._posed_frames())
+
+    def _posed_frames(self) -> Array:
+        """Middles, in frames, of the frames near a tracked view."""
+        if (path := self.path) is None:
+            return np.zeros(0)
+        begin, end = max(0, int(np.ceil(path.begin - 0.5))), min(self._frames, int(path.end + 0.5))
+        frames = np.arange(begin, end, dtype=np.float64) + 0.5
+        return frames[self.views.covered(frames)]
+
+    def _poses_at(self, frames: Array) -> Trajectory:
+        if (path := self.path) is None:
             return Trajectory(np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
-        frames = np.arange(self._frames, dtype=np.float64) + 0.5
-        frames = frames[(frames >= path.begin) & (frames <= path.end)]
-        frames = frames[self.views.covered(frames)]
         rotations, centres = path.poses(frames)
         return Trajectory(frames / self.sensor.frame_rate_hz, rotations, centres * self._unit)
 

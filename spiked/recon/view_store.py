@@ -202,8 +202,8 @@ class ViewStore:
         return self._kept[int(np.argmin(np.abs(times - time)))]
 
     def covered(self, frames: Array) -> NDArray[np.bool_]:
-        """At which times in frames [N] the path is known: near a view with a pose and in no view without, or between
-        bridged views."""
+        """At which of these times in frames [N], ascending, the path is known: near a view with a pose and in no view
+        without, or between bridged views."""
         posed = [record for record in self._records if record.tracked.rotation is not None]
         ids = np.array([record.id for record in posed])
         times = np.array([record.time for record in posed])
@@ -213,7 +213,9 @@ class ViewStore:
         covered = np.abs(times[near] - frames) <= POSE_REACH_LENGTHS * reach[near]
         for record in self._records:
             if record.tracked.rotation is None:
-                covered &= np.abs(frames - record.time) > 0.5 * record.tracked.length
+                ends = record.time + 0.5 * record.tracked.length * np.array([-1, 1])
+                begin, end = np.searchsorted(frames, ends[0]), np.searchsorted(frames, ends[1], side="right")
+                covered[begin:end] = False
         bridged = np.array([record.bridged for record in posed]) & (np.diff(ids, prepend=-2) == 1)
         covered |= bridged[after] & (frames > times[after - 1]) & (frames < times[after])
         return np.asarray(covered)

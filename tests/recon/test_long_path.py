@@ -92,6 +92,18 @@ def test_loops_are_closed_while_it_runs(not_ended: Odometry, walked: tuple[Recon
     assert all(later - earlier > FRAMES / 4 for earlier, later in not_ended.closures)
 
 
+def test_the_trajectory_so_far_has_the_poses_of_the_views(walked: tuple[Reconstructor, Trajectory]) -> None:
+    """Until the tracking has ended; what it has is in the trajectory of all frames as well."""
+    reconstructor, _ = walked
+    assert not reconstructor.tracking_ended
+    whole, so_far = reconstructor.trajectory(), reconstructor.trajectory_so_far()
+    assert len(whole) == reconstructor.posed_frames > 0.99 * FRAMES
+    assert 100 < len(so_far) == sum(view.posed for view in reconstructor.views.since(0)) < len(whole) / 10
+    before = np.searchsorted(whole.times_s, so_far.times_s) - 1
+    steps = np.linalg.norm(whole.centres[before] - so_far.centres, axis=1)
+    assert np.median(steps) < 2 * np.median(np.linalg.norm(np.diff(whole.centres, axis=0), axis=1))
+
+
 def test_tracks_that_ended_are_found_again(walked: tuple[Reconstructor, Trajectory]) -> None:
     """Between a break of a few views and the return after a loop there is nothing else that resumes a track."""
     views = walked[0].odometry.views

@@ -10,11 +10,13 @@ from fastapi import Response
 from spiked.errors import ConfigurationError
 from spiked.pose import quaternion
 from spiked.poses import PoseFile
+from spiked.recon.reconstructor import BRIDGED_S
 from spiked.render import Camera
 from spiked.sensor import Intrinsics, Sensor
+from spiked.spline import Waypoints
 from spiked_service.api.problems import NoPoseError, NotReadyError
 from spiked_service.api.results import Result
-from spiked_service.api.schemas.views import MAX_PIXELS, CameraModel, PathModel, ViewRequest
+from spiked_service.api.schemas.views import MAX_PIXELS, PathModel, ViewRequest
 from spiked_service.api.trajectories import Range
 from spiked_service.results.image_encoding import ImageFormat, encode
 from spiked_service.results.view_renderer import Output, Pose, ViewRenderer, shown
@@ -90,18 +92,28 @@ def _poses(result: Result, request: ViewRequest) -> list[Pose]:
     known = result.poses()
     if request.path is not None:
         return _along(known, request.path)
-    return [_pose(known, result.sensor, camera) for camera in cameras]
+    rate = 1.0 if result.sensor is None else result.sensor.frame_rate_hz
+    of_views = result.published.poses > len(known)
+    return [
+        camera.pose() if camera.frame is None else _of_frame(known, camera.frame, rate, of_views) for camera in cameras
+    ]
 
 
-def _pose(poses: PoseFile, sensor: Sensor | None, camera: CameraModel) -> Pose:
-    if camera.frame is None:
-        return camera.pose()
-    rate = 1.0 if sensor is None else sensor.frame_rate_hz
-    row = poses.nearest((camera.frame + 0.5) / rate, 0.51 / rate)
-    if row is None:
-        first, last = (round(poses.time_s(row) * rate - 0.5) for row in (0, -1))
-        raise NoPoseError(f"frame {camera.frame} has no pose in this version; it has poses from {first} to {last}")
-    return _at(poses, row)
+def _of_frame(poses: PoseFile, frame: int, rate: float, of_views: bool) -> Pose:
+    """The pose of a frame; interpolated in a version that has only the poses of the views."""
+    time_s = (frame + 0.5) / rate
+    row = poses.nearest(time_s, 0.51 / rate)
+    if row is not None:
+        return _at(poses, row)
+    after = poses.first_from(time_s)
+    if of_views and 0 < after < len(poses):
+        around = poses.trajectory(range(after - 1, after + 1))
+        if around.times_s[1] - around.times_s[0] < BRIDGED_S:
+            waypoints = Waypoints(around.times_s, around.rotations, around.centres)
+            rotations, centres = waypoints.poses([time_s])
+            return Pose(rotations[0], centres[0])
+    first, last = (round(poses.time_s(row) * rate - 0.5) for row in (0, -1))
+    raise NoPoseError(f"frame {frame} has no pose in this version; it has poses from {first} to {last}")
 
 
 def _along(poses: PoseFile, path: PathModel) -> list[Pose]:

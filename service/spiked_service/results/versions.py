@@ -35,6 +35,7 @@ class Published(BaseModel):
     at: datetime
     splats: int
     poses: int
+    """Frames with a pose. The trajectory of a long path that is still tracked has a pose a view, fewer than these."""
     scene_bytes: int
     psnr_db: float | None = None
     intrinsics: tuple[float, float, float, float] | None = None
@@ -115,9 +116,10 @@ class Publisher:
         intrinsics: Intrinsics | None = None,
         states: NDArray[np.bytes_] | None = None,
         tolerance: float = TOLERANCE,
+        posed_frames: int | None = None,
     ) -> Published:
         """Publish the next version and remove old ones; `states` [n] is the tracking state at each pose, `tolerance`
-        that of `ShownScene.update`.
+        that of `ShownScene.update`. `posed_frames` have a pose, if the trajectory has only some of them.
 
         Raises OSError if it cannot be written.
         """
@@ -130,7 +132,7 @@ class Publisher:
             trajectory=f"trajectory-{version:06d}.poses",
             at=datetime.now(UTC),
             splats=len(scene),
-            poses=len(trajectory),
+            poses=len(trajectory) if posed_frames is None else posed_frames,
             scene_bytes=len(content),
             psnr_db=psnr_db,
             intrinsics=None if intrinsics is None else (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy),

@@ -350,8 +350,8 @@ class ProgressReporter:
         """Publish the live result of a capture that is reconstructed again from its recording."""
         self._least_poses = 0
         status = self._reconstructor.status()
-        if len(self._reconstructor.trajectory()):
-            self._publish(status)
+        if self._reconstructor.posed_frames:
+            self._publish(status, every_frame=True)
         self._send_status(status)
         self._channel.send(FramesSkipped(frames=status.frames, skipped=skipped))
 
@@ -370,8 +370,8 @@ class ProgressReporter:
         self._timeline.closed(self._reconstructor.closures())
         self._least_poses = 0
         status = self._reconstructor.status()
-        if len(self._reconstructor.trajectory()):
-            self._publish(status, tolerance=0.0)
+        if self._reconstructor.posed_frames:
+            self._publish(status, tolerance=0.0, every_frame=True)
         shown = self._best(cut_short)
         self._poses = self._poses if shown is None else shown.poses
         if shown is not None and shown.version != self._publisher.version:
@@ -424,18 +424,20 @@ class ProgressReporter:
             latency_s=None if latency_frames is None else latency_frames / rate,
         )
 
-    def _publish(self, status: Status, tolerance: float = TOLERANCE) -> None:
-        trajectory = self._reconstructor.trajectory()
+    def _publish(self, status: Status, tolerance: float = TOLERANCE, every_frame: bool = False) -> None:
+        """Publish a version; while a long path is tracked with the poses of its views, or of `every_frame`."""
+        poses = self._reconstructor.posed_frames
         self._published_s, self._seen = time.monotonic(), status.version
-        if not len(trajectory) or len(trajectory) < self._least_poses:
+        if not poses or poses < self._least_poses:
             return
         try:
+            trajectory = self._reconstructor.trajectory() if every_frame else self._reconstructor.trajectory_so_far()
             scene, white = self._reconstructor.scene(), self._reconstructor.white
             optics = self._reconstructor.camera.intrinsics
             rate_hz = self._reconstructor.sensor.frame_rate_hz
             states = self._timeline.states_at(frames_at(trajectory.times_s, rate_hz))
             psnr_db = _psnr_db(status.loss)
-            published = self._publisher.publish(scene, trajectory, white, psnr_db, optics, states, tolerance)
+            published = self._publisher.publish(scene, trajectory, white, psnr_db, optics, states, tolerance, poses)
         except OSError as error:
             raise _write_error(error) from error
         self._send_version(published)

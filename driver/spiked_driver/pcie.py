@@ -1,8 +1,8 @@
 """The raw stream of the PCIe camera (`Flavour.E`): parsing, and a source that reads a file, a pipe or a device node."""
 
 import os
-import select
-import stat
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from spiked.native._wire import PcieParser
 
 from spiked.camera import CameraOptions
-from spiked.errors import SourceError
-from spiked.ring import DeviceState, DeviceStatus, End, EndReason, Gap
+from spiked.ring import DeviceState, DeviceStatus, End, EndReason, Gap, LossCause
 from spiked.sensor import Sensor
 from spiked_driver.capabilities import PCIE_CAPABILITIES
+from spiked_driver.card_file import CardFile, absence
 from spiked_driver.framing import Framing, FramingBenchmark, benchmark_framing
-from spiked_driver.source import READ_WAIT_S, Chunk, former_source_names
+from spiked_driver.source import Chunk, former_source_names
 from spiked_driver.source_kind import RATE_HZ, Device, HardwareOptions, SourceKind, SourceSpec, Warn, path_of
 
 PCIE_SIZE = 1000
@@ -26,6 +26,8 @@ PCIE_COMPACT_BYTES = 125_000
 """A frame's pixels: 1000 rows of 125 bytes."""
 BLOCK_BYTES = 1 << 20
 """Bytes per read; the capture card returns multiples of 64 bytes."""
+CARDS = (Path("/dev/JR6101"),)
+"""Device nodes of the known capture card."""
 
 
 class PcieFraming(Framing):
@@ -42,18 +44,28 @@ class PcieFraming(Framing):
 
 @former_source_names
 class PcieSource:
-    """A camera read from a path: the capture card's device node, a pipe, or a file of the raw stream."""
+    """A camera read from a path: the capture card's device node, a pipe, or a file of the raw stream.
 
-    def __init__(self, path: str | os.PathLike[str], camera: CameraOptions | None = None) -> None:
-        """`camera`: what the stream does not say of its camera."""
+    A card that is absent, fails a read or comes back is a device status and a gap, not an error. The stream has no
+    frame counter: the frames of an interruption are counted by the clock. A file or pipe ends the capture with its last
+    byte.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], camera: CameraOptions | None = None, warn: Warn | None = None
+    ) -> None:
+        """`camera`: what the stream does not say of its camera. `warn` gets one sentence for each interruption."""
         self.path = Path(path)
         self._sensor = (camera or CameraOptions()).sensor(Sensor(PCIE_SIZE, PCIE_SIZE, RATE_HZ))
+        self._warn = warn
+        self._is_file = self.path.is_file()
+        self._card = CardFile(self.path)
         self._framing = PcieFraming()
         self._block = bytearray(BLOCK_BYTES)
-        self._file: int | None = None
-        self._is_file = False
+        self._zero = 0  # index in the capture of the framing's frame 0
+        self._read_s = 0.0  # monotonic time of the last bytes
+        self._break: LossCause | None = None
         self._ended = False
-        self._device_status = DeviceStatus(DeviceState.IDLE)
 
     @property
     def sensor(self) -> Sensor:
@@ -72,62 +84,81 @@ class PcieSource:
 
     @property
     def device_status(self) -> DeviceStatus:
-        """Armed once open, streaming from the first frame, idle after the end."""
-        return self._device_status
+        """Absent without a card, armed once open, streaming from the first frame, lost after an error or in silence."""
+        return self._card.status
 
     def open(self) -> None:
-        """Open the path for reading. Raises SourceError."""
+        """Open the path for reading; an absent card is no error. Raises SourceError for one that may not be read."""
         self.close()
-        try:
-            self._file = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)
-        except OSError as error:
-            raise SourceError(
-                f"{self.path}: cannot be read: {error.strerror}; check the path and its permissions"
-            ) from error
-        self._is_file = stat.S_ISREG(os.fstat(self._file).st_mode)
+        self._card = CardFile(self.path)
         self._framing = PcieFraming()
-        self._ended = False
-        self._device_status = DeviceStatus(DeviceState.ARMED)
+        self._zero, self._break, self._ended = 0, None, False
+        self._card.open()
 
     def close(self) -> None:
         """Close the path."""
-        if self._file is not None:
-            os.close(self._file)
-            self._file = None
-        self._device_status = DeviceStatus(DeviceState.IDLE)
+        self._card.close()
 
     def read_into(self, view: NDArray[np.uint8]) -> Chunk | Gap | End | None:
         """See `Source.read_into`."""
         while (item := self._framing.read_into(view)) is None:
             if self._ended:
-                self._device_status = DeviceStatus(DeviceState.IDLE, "the stream has ended")
-                return End(self._framing.next_index, EndReason.FINISHED)
-            if not self._read_block():
-                return None
-        self._device_status = DeviceStatus(DeviceState.STREAMING)
-        return item
+                self._card.status = DeviceStatus(DeviceState.IDLE, "the stream has ended")
+                return End(self._zero + self._framing.next_index, EndReason.FINISHED)
+            received = self._receive()
+            if received is None or isinstance(received, Gap):
+                return received
+        if self._card.is_open:
+            self._card.status = DeviceStatus(DeviceState.STREAMING)
+        return replace(item, first=self._zero + item.first)
 
-    def _read_block(self) -> bool:
-        """Read once; false if no byte came within READ_WAIT_S."""
-        if self._file is None:
-            raise SourceError(f"{self.path}: the source is not open: open it before reading")
-        if not select.select([self._file], [], [], READ_WAIT_S)[0]:
-            return False
+    def _receive(self) -> int | Gap | None:
+        """Feed the next bytes to the framing, and return their number; None if nothing came within READ_WAIT_S.
+
+        The first bytes after an interruption return the gap before them.
+        """
+        if not self._card.is_open:
+            if self._break is not None:  # all that came before it is delivered
+                self._zero += self._framing.next_index
+                self._framing = PcieFraming()
+            self._card.reopen()
+            return None
         self._framing.keep()
         try:
-            count = os.readv(self._file, [self._block])
-        except BlockingIOError:
-            return False
+            count = self._card.read_into(self._block)
         except OSError as error:
-            raise SourceError(
-                f"{self.path}: reading failed: {error.strerror}; check the card and its driver"
-            ) from error
+            self._interrupted(error)
+            return None
+        if count is None:
+            return None
+        gap = self._gap_before(count)
+        self._read_s = time.monotonic()
         if count:
             self._framing.feed(memoryview(self._block)[:count])
         else:
             self._framing.finish()
             self._ended = True
-        return True
+        return count if gap is None else gap
+
+    def _interrupted(self, error: OSError) -> None:
+        """Deliver what came before the error, then look for the card again."""
+        self._break = self._card.lose(error)
+        self._framing.finish()
+        if self._warn is not None:
+            self._warn(f"{self._card.status.reason}: frames until it is read again are lost")
+
+    def _gap_before(self, count: int) -> Gap | None:
+        """The frames that an interruption has cost, before the first `count` bytes after it."""
+        if self._break is None:
+            return None
+        cause = LossCause.DEVICE if self._card.was_absent else self._break
+        self._break = None
+        if not self._zero:
+            return None
+        missing_s = time.monotonic() - self._read_s
+        lost = max(1, round(missing_s * self._sensor.frame_rate_hz - count / PCIE_FRAME_BYTES))
+        self._zero += lost
+        return Gap(self._zero - lost, lost, cause)
 
 
 def encode_pcie(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -166,11 +197,17 @@ def benchmark_pcie(frames: int = 150, repeat: int = 3) -> FramingBenchmark:
 
 
 def _open(spec: SourceSpec, options: HardwareOptions, warn: Warn | None) -> PcieSource:
-    return PcieSource(path_of(spec, f"{KIND.usage}, a device node, a pipe or a file"), options)
+    return PcieSource(path_of(spec, f"{KIND.usage}, a device node, a pipe or a file"), options, warn)
 
 
 def _describe(spec: SourceSpec) -> Device:
-    return Device(spec.text, KIND.name, "raw stream of a PCIe camera", capabilities=PCIE_CAPABILITIES)
+    device = Device(spec.text, KIND.name, "raw stream of a PCIe camera", capabilities=PCIE_CAPABILITIES)
+    path = Path(spec.target or "")
+    return device if path.exists() else replace(device, state=DeviceState.ABSENT, reason=absence(path))
+
+
+def _find() -> list[Device]:
+    return [_describe(SourceSpec.parse(f"{KIND.name}:{path}")) for path in CARDS if path.exists()]
 
 
 KIND = SourceKind(
@@ -180,6 +217,7 @@ KIND = SourceKind(
     options=HardwareOptions,
     open=_open,
     describe=_describe,
+    find=_find,
     is_camera=True,
     takes_path=True,
 )

@@ -2,6 +2,7 @@
 
 import os
 import threading
+import time
 import tty
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from spiked_driver import card_file
 from spiked_driver.pcie import (
     PCIE_COMPACT_BYTES,
     PCIE_FRAME_BYTES,
@@ -19,8 +21,10 @@ from spiked_driver.pcie import (
     encode_pcie,
 )
 from spiked_driver.source import Chunk
+from spiked_driver.source_kinds import known_devices
 from spiked_driver.spec import open_source
 
+from spiked.camera import CameraOptions
 from spiked.errors import SourceError
 from spiked.ring import DeviceState, End, EndReason, Gap, LossCause
 
@@ -221,9 +225,145 @@ def _write_all(file: int, data: bytes) -> None:
         sent += os.write(file, data[sent : sent + 4096])
 
 
-def test_a_missing_device_says_where_to_look(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="check the path"):
-        PcieSource(tmp_path / "JR6101").open()
+class Card:
+    """A character device under a name of its own: a pseudo-terminal that ends with a read error."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._controller, self._node = os.openpty()
+        tty.setraw(self._node)
+        path.unlink(missing_ok=True)
+        path.symlink_to(os.ttyname(self._node))
+
+    def send(self, data: bytes) -> threading.Thread:
+        """Write from another thread, which ends with the last byte."""
+        sender = threading.Thread(target=_write_all, args=(self._controller, data), daemon=True)
+        sender.start()
+        return sender
+
+    def fail(self) -> None:
+        """Reads fail from now on."""
+        os.close(self._controller)
+        os.close(self._node)
+
+
+def until(source: PcieSource, state: DeviceState) -> list[tuple[Chunk | Gap, NDArray[np.uint8]]]:
+    """Read until the device has that state: items, with the frames of chunks."""
+    items: list[tuple[Chunk | Gap, NDArray[np.uint8]]] = []
+    view = np.zeros((4, PCIE_COMPACT_BYTES), np.uint8)
+    deadline = time.monotonic() + 30
+    while source.device_status.state is not state:
+        assert time.monotonic() < deadline, source.device_status
+        item = source.read_into(view)
+        if isinstance(item, Chunk | Gap):
+            items.append((item, view[: item.frames].copy() if isinstance(item, Chunk) else view[:0]))
+    return items
+
+
+def read_until_sent(source: PcieSource, sent: threading.Thread) -> None:
+    view = np.zeros((4, PCIE_COMPACT_BYTES), np.uint8)
+    while sent.is_alive():
+        source.read_into(view)
+
+
+def frames_of(items: list[tuple[Chunk | Gap, NDArray[np.uint8]]]) -> NDArray[np.uint8]:
+    return np.concatenate([frames for _, frames in items])
+
+
+def test_an_absent_card_is_awaited(tmp_path: Path) -> None:
+    path = tmp_path / "JR6101"
+    source = PcieSource(path)
+    source.open()
+    assert source.device_status.state is DeviceState.ABSENT
+    assert "check the path" in source.device_status.reason
+    assert known_devices([f"pcie:{path}"])[0].state is DeviceState.ABSENT
+    card = Card(path)
+    until(source, DeviceState.ARMED)
+    sent = card.send(WIRE.tobytes())
+    first, *_ = until(source, DeviceState.STREAMING)
+    assert first[0] == Chunk(0, len(first[1]))
+    read_until_sent(source, sent)
+    source.close()
+    card.fail()
+
+
+def test_a_read_error_is_a_gap_and_a_device_state(tmp_path: Path) -> None:
+    warnings: list[str] = []
+    path = tmp_path / "JR6101"
+    source = PcieSource(path, CameraOptions(rate=1000), warnings.append)
+    card = Card(path)
+    source.open()
+    sent = card.send(WIRE.tobytes())
+    began = time.monotonic()
+    items = until(source, DeviceState.STREAMING)
+    while len(frames_of(items)) < SENT:
+        view = np.zeros((4, PCIE_COMPACT_BYTES), np.uint8)
+        item = source.read_into(view)
+        if isinstance(item, Chunk):
+            items.append((item, view[: item.frames].copy()))
+    np.testing.assert_array_equal(frames_of(items), FRAMES)
+    sent.join()
+    card.fail()
+    path.unlink()
+    assert not until(source, DeviceState.LOST)
+    assert "reading failed" in source.device_status.reason
+    assert not until(source, DeviceState.ABSENT)
+    assert len(warnings) == 1 and warnings[0].endswith("frames until it is read again are lost")
+    card = Card(path)
+    sent = card.send(WIRE.tobytes())
+    (gap, _), *rest = until(source, DeviceState.STREAMING)
+    away_s = time.monotonic() - began
+    assert isinstance(gap, Gap)
+    assert (gap.first, gap.cause) == (SENT, LossCause.DEVICE)
+    assert 1 <= gap.count <= 1000 * away_s + 1
+    assert gap.count >= 100, "it was away for READ_WAIT_S at least"
+    assert isinstance(rest[0][0], Chunk) and rest[0][0].first == SENT + gap.count
+    np.testing.assert_array_equal(frames_of(rest), FRAMES[: len(frames_of(rest))])
+    read_until_sent(source, sent)
+    source.close()
+    card.fail()
+
+
+def test_a_card_that_fails_again_and_again_keeps_the_capture(tmp_path: Path) -> None:
+    path = tmp_path / "JR6101"
+    source = PcieSource(path)
+    source.open()
+    for _ in range(3):
+        card = Card(path)
+        until(source, DeviceState.ARMED)
+        card.send(WIRE[0].tobytes()[:2000]).join()
+        card.fail()
+        until(source, DeviceState.LOST)
+        path.unlink()
+        until(source, DeviceState.ABSENT)
+    source.close()
+
+
+def test_a_silent_card_is_lost_until_it_sends_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(card_file, "SILENCE_S", 0.05)
+    card = Card(tmp_path / "JR6101")
+    source = PcieSource(card.path)
+    source.open()
+    card.send(WIRE.tobytes())
+    until(source, DeviceState.STREAMING)
+    until(source, DeviceState.LOST)
+    assert "nothing was sent" in source.device_status.reason
+    sent = card.send(WIRE.tobytes())
+    until(source, DeviceState.STREAMING)
+    read_until_sent(source, sent)
+    source.close()
+    card.fail()
+
+
+def test_a_folder_is_no_card(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="it is a folder"):
+        PcieSource(tmp_path).open()
+
+
+def test_a_file_says_that_it_can_wait_before_it_is_open(tmp_path: Path) -> None:
+    path = tmp_path / "raw.dat"
+    path.write_bytes(WIRE.tobytes())
+    assert open_source(f"pcie:{path}").can_block
 
 
 def test_the_benchmark_parses_every_frame_it_times() -> None:

@@ -12,6 +12,7 @@ from spiked_service.api.bus_notifier import BusNotifier
 from spiked_service.captures.archive import DataStore
 from spiked_service.daemon import open_data_store
 from spiked_service.events.bus import Bus
+from spiked_service.store.rows import ReconstructionRow
 from spiked_service.store.snapshot import Snapshot
 
 from spiked.recording import RecordingWriter, open_recording
@@ -35,6 +36,12 @@ def over(data_store: DataStore, capture_id: str) -> Snapshot:
     """The capture when it is over."""
     wait_for(lambda: data_store.captures.get(capture_id).row.state.over, "the capture is over")
     return data_store.captures.get(capture_id)
+
+
+def ended(data_store: DataStore, job: ReconstructionRow) -> ReconstructionRow:
+    """The reconstruction when it is over."""
+    wait_for(lambda: data_store.reconstructions.rows.get(job.id).state.over, f"{job.id} is over")
+    return data_store.reconstructions.rows.get(job.id)
 
 
 def received(data_store: DataStore, capture_id: str) -> int:

@@ -3,7 +3,6 @@
 import os
 import re
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,24 +16,10 @@ from spiked_service.store.rows import CaptureState, JobState, Plan, Reconstructi
 
 from spiked.errors import ConfigurationError
 
-from .survival import SMALL, kept, moving_recording, over, random_recording, still_recording, wait_for
+from .survival import SMALL, ended, over, random_recording, still_recording, wait_for
 
 SHORT = ReconstructionOptions(steps=5)
 LONG = ReconstructionOptions(steps=200_000)
-
-
-@pytest.fixture(scope="module")
-def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[DataStore, str]]:
-    """A service, and a capture of it that has a recording and no reconstruction."""
-    folder = tmp_path_factory.mktemp("house")
-    with kept(folder / "data") as data_store:
-        plan = Plan(f"replay:{moving_recording(folder / 'moving.dat')}?pace=0", reconstruct=False)
-        yield data_store, over(data_store, data_store.captures.start(plan).id).id
-
-
-def ended(data_store: DataStore, job: ReconstructionRow) -> ReconstructionRow:
-    wait_for(lambda: data_store.reconstructions.rows.get(job.id).state.over, f"{job.id} is over")
-    return data_store.reconstructions.rows.get(job.id)
 
 
 def running(data_store: DataStore, job: ReconstructionRow) -> int:

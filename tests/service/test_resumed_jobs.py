@@ -2,7 +2,6 @@
 
 import os
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ from spiked.recon import Reconstructor
 from spiked.recon.checkpoint import CheckpointSaver, Interrupted, exists
 from spiked.recording import open_recording
 
-from .survival import kept, moving_recording, over, wait_for
+from .survival import ended, kept, moving_recording, over, wait_for
 from .test_recovery import service
 
 SHORT = ReconstructionOptions(steps=20)
@@ -28,20 +27,6 @@ LONG = ReconstructionOptions(steps=200_000)
 
 class KilledError(Exception):
     """The end of a worker, as seen from within."""
-
-
-@pytest.fixture(scope="module")
-def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[DataStore, str]]:
-    """A service, and a capture of it that has a recording and no reconstruction."""
-    folder = tmp_path_factory.mktemp("house")
-    with kept(folder / "data") as data_store:
-        plan = Plan(f"replay:{moving_recording(folder / 'moving.dat')}?pace=0", reconstruct=False)
-        yield data_store, over(data_store, data_store.captures.start(plan).id).id
-
-
-def ended(data_store: DataStore, job: ReconstructionRow) -> ReconstructionRow:
-    wait_for(lambda: data_store.reconstructions.rows.get(job.id).state.over, f"{job.id} is over")
-    return data_store.reconstructions.rows.get(job.id)
 
 
 def left_behind(data_store: DataStore, job: ReconstructionRow, frames: int) -> None:

@@ -66,26 +66,19 @@ _TRAJECTORY: dict[int | str, dict[str, Any]] = {
     **NOT_MODIFIED,
     **problems(404),
 }
-_SCENE: dict[int | str, dict[str, Any]] = {
-    200: {
-        "description": "The scene.",
-        "headers": {**ETAG, **_VERSION},
-        "content": {"application/octet-stream": BINARY},
-    },
-    206: {"description": "The requested range.", "content": {"application/octet-stream": BINARY}},
-    **NOT_MODIFIED,
-    **problems(404, 416),
-}
-_CHANGES: dict[int | str, dict[str, Any]] = {
-    200: {
-        "description": "The changes.",
-        "headers": {**ETAG, **_VERSION},
-        "content": {"application/octet-stream": BINARY},
-    },
-    206: {"description": "The requested range.", "content": {"application/octet-stream": BINARY}},
-    **NOT_MODIFIED,
-    **problems(404, 416),
-}
+
+
+def _binary(description: str) -> dict[int | str, dict[str, Any]]:
+    """Responses of a route that sends bytes of a version, or a range of them."""
+    content = {"application/octet-stream": BINARY}
+    return {
+        200: {"description": description, "headers": {**ETAG, **_VERSION}, "content": content},
+        206: {"description": "The requested range.", "content": content},
+        **NOT_MODIFIED,
+        **problems(404, 416),
+    }
+
+
 _VIEWS: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "The image; for several views a ZIP of images and views.json.",
@@ -188,7 +181,13 @@ def _result_routes(
     ) -> Response:
         return results.trajectory(request, results.of(row, version), format, Range(from_s, to_s, step))
 
-    @router.get("/scene", name=scene.name, description=scene.description, responses=_SCENE, response_class=Response)
+    @router.get(
+        "/scene",
+        name=scene.name,
+        description=scene.description,
+        responses=_binary("The scene."),
+        response_class=Response,
+    )
     def get_scene(
         request: Request,
         row: Annotated[ReconstructionRow, Depends(find)],
@@ -202,7 +201,7 @@ def _result_routes(
         "/scene/changes",
         name=changes.name,
         description=changes.description,
-        responses=_CHANGES,
+        responses=_binary("The changes."),
         response_class=Response,
     )
     def get_scene_changes(

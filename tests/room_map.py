@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from spiked.pose import Array, exp_so3
+from spiked.render import Camera
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import Room, SimulatedCamera
@@ -15,6 +16,7 @@ from spiked.trajectory import Trajectory
 
 OPTICS = Intrinsics.from_fov(240, 160, 60)
 SENSOR = Sensor(240, 160, 20_000.0, intrinsics=OPTICS)
+CAMERA = Camera(OPTICS, 240, 160)
 GAIN = 0.35
 UP = np.array([0.0, 0.0, 1.0])
 TURNS_RAD = (0.0, 0.4, 0.8)
@@ -40,15 +42,15 @@ class RoomMap:
         return folder
 
 
-def room_map(seed: int, turns_rad: tuple[float, ...] = TURNS_RAD) -> RoomMap:
+def room_map(seed: int, turns_rad: tuple[float, ...] = TURNS_RAD, camera: Camera = CAMERA) -> RoomMap:
     """The room of a seed as a splat for each pixel of some views, at its exact depth."""
-    room = Room(seed=seed)
-    x, y = np.meshgrid(np.arange(SENSOR.width) + 0.5, np.arange(SENSOR.height) + 0.5)
-    rays = OPTICS.unproject(np.stack([x, y], -1).reshape(-1, 2))
+    room, optics = Room(seed=seed), camera.intrinsics
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = optics.unproject(np.stack([x, y], -1).reshape(-1, 2))
     scene = Scene.empty(1)
     for turn in turns_rad:
         rotation, centre = _pose(room, turn)
-        view = room.render(OPTICS, SENSOR.width, SENSOR.height, rotation, centre)
+        view = room.render(optics, camera.width, camera.height, rotation, centre)
         depth = view.depth.reshape(-1, 1)
         means = centre + (rays * depth) @ rotation.T
         count = len(means)
@@ -56,7 +58,7 @@ def room_map(seed: int, turns_rad: tuple[float, ...] = TURNS_RAD) -> RoomMap:
             Scene(
                 means.astype(np.float32),
                 np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-                np.log(np.repeat(0.45 * depth / OPTICS.fx, 3, axis=1)).astype(np.float32),
+                np.log(np.repeat(0.45 * depth / optics.fx, 3, axis=1)).astype(np.float32),
                 np.full(count, 4, np.float32),
                 np.ascontiguousarray(GAIN * view.intensity.reshape(-1, 1), np.float32),
             )

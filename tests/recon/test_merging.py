@@ -15,11 +15,11 @@ from spiked.recon.merging.known_map import inverse
 from spiked.recon.merging.path_warp import PathWarp
 from spiked.render import Camera, rasteriser_for
 from spiked.scene import Scene
+from spiked.sensor import Intrinsics
 from spiked.trajectory import Trajectory
 
-from ..room_map import OPTICS, SENSOR, RoomMap, room_map, twice
+from ..room_map import CAMERA, RoomMap, room_map, twice
 
-CAMERA = Camera(OPTICS, SENSOR.width, SENSOR.height)
 LEFT, RIGHT = (0.0, 0.5), (0.45, 0.95)
 """Where the cameras of two maps look, in radians; a view is as wide as 1.05."""
 ELSEWHERE = Similarity(0.7, exp_so3(np.array([0.3, -0.8, 1.9])), np.array([4.0, -1.0, 2.5]))
@@ -141,3 +141,28 @@ def test_each_part_of_a_way_moves_by_its_own_similarity() -> None:
     there = warp.scene(one, np.array([[0.0, 1.0]], np.float32), np.array([1.0, 3.0]), 2.0)
     assert there.means[0] == pytest.approx([1, 0, 0]) and there.log_scales[0, 0] == pytest.approx(np.log(0.5))
     assert log_so3(rotation_of(there.quats[0]))[2] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "fov_deg"),
+    [
+        pytest.param(360, 360, 80, id="wider, and square"),
+        pytest.param(400, 250, 40, id="narrower, at 2.6 times the resolution"),
+        pytest.param(120, 80, 60, id="half the resolution"),
+    ],
+)
+@pytest.mark.parametrize("first", ["the usual", pytest.param("the other", marks=pytest.mark.slow)])
+def test_maps_of_different_cameras_are_merged(
+    left: KnownMap, width: int, height: int, fov_deg: float, first: str
+) -> None:
+    camera = Camera(Intrinsics.from_fov(width, height, fov_deg), width, height)
+    other = room_map(2, RIGHT, camera)
+    maps = [left, KnownMap(replace(other.scene, white=0.35), other.path, camera)]
+    if first == "the other":
+        maps.reverse()
+    made = merge(*maps)
+    assert made.joint.first.camera == maps[0].camera
+    moved, truth = made.joint.second.trajectory, maps[1].trajectory
+    assert np.linalg.norm(moved.centres - truth.centres, axis=1).max() < 0.04
+    assert made.joint.registration.similarity.scale == pytest.approx(1, rel=0.005)
+    assert made.joint.alike == len(made.joint.second_views) and min(made.psnr_db) > 24

@@ -17,8 +17,9 @@ from spiked.recon.merging.known_map import KnownMap
 from spiked.recon.merging.registration import MapPlace, NotOnePlaceError, Registration, register
 from spiked.recon.odometry.sparse_map import Pose
 from spiked.recon.statistics import evenly, median
-from spiked.render import rasteriser_for
+from spiked.render import Camera, rasteriser_for
 from spiked.scene import Scene
+from spiked.sensor import Intrinsics
 from spiked.trajectory import Trajectory
 
 SPACING_PX = 25.0
@@ -38,6 +39,8 @@ SAME_DEPTHS = 0.5
 """Share of the common pixels with equal depths that a view needs to agree, and below whose half it differs."""
 LEAST_ALIKE = 3
 """Views of the second map in which the first has to look the same."""
+NARROWER = 1.1
+"""Tangent of the second camera's field of view over that of the first above which only what both see is compared."""
 DIFFERENT_SHARE = 0.5
 """Views that differ, over those that agree, above which the maps do not show the same place."""
 
@@ -112,8 +115,9 @@ def join(first: KnownMap, second: KnownMap, threads: int | None = None) -> Joint
         raise SceneError("the second map is empty: reconstruct a recording first")
     if first.scene.colours.shape[1] != second.scene.colours.shape[1]:
         first, second = first.coloured(), second.coloured()
-    index = MapIndex(first.scene, first.trajectory, second.camera, threads)
-    own = places(second, threads)
+    seen_by = replace(second, camera=common_camera(first.camera, second.camera))
+    index = MapIndex(first.scene, first.trajectory, seen_by.camera, threads)
+    own = places(seen_by, threads)
     found = register(index, own)
     chosen = some(own)
     before = _shown(second, [place.view.pose for place in chosen], threads)
@@ -125,7 +129,7 @@ def join(first: KnownMap, second: KnownMap, threads: int | None = None) -> Joint
         scene = found.warp.scene(second.scene, weights, times, brightness)
         return KnownMap(scene, found.warp.path(second.trajectory), second.camera)
 
-    seen = _compare(first, moved(1.0), poses, threads)
+    seen = _compare(first, replace(moved(1.0), camera=seen_by.camera), poses, threads)
     compared = [one for one in seen if one is not None]
     alike = [one for one in compared if one.correlation > ALIKE and one.same > SAME_DEPTHS]
     different = sum(one.correlation < DIFFERENT or one.same < 0.5 * SAME_DEPTHS for one in compared)
@@ -140,6 +144,23 @@ def join(first: KnownMap, second: KnownMap, threads: int | None = None) -> Joint
     views = _shown(first, [place.view.pose for place in places(first, threads)], threads), _shown(there, poses, threads)
     exact = [one is not None and one.correlation > EXACT for one in seen]
     return Joint(first, there, found, brightness, len(alike), different, *views, exact)
+
+
+def common_camera(first: Camera, second: Camera) -> Camera:
+    """The second camera, cropped where it sees beyond the field of view of the first: a map has nothing there."""
+    a, b = _extent(first), _extent(second)
+    if (b <= NARROWER * a).all():
+        return second
+    k = second.intrinsics
+    left, up, right, down = np.minimum(a, b) * np.array([k.fx, k.fy, k.fx, k.fy])
+    width, height = max(1, round(left + right)), max(1, round(up + down))
+    return replace(second, intrinsics=Intrinsics(k.fx, k.fy, left, up), width=width, height=height)
+
+
+def _extent(camera: Camera) -> Array:
+    """Tangents of the field of view [4]: to the left, up, to the right, down."""
+    k = camera.intrinsics
+    return np.array([k.cx / k.fx, k.cy / k.fy, (camera.width - k.cx) / k.fx, (camera.height - k.cy) / k.fy])
 
 
 def some(views: Sequence[_Any]) -> list[_Any]:

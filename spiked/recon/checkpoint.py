@@ -93,7 +93,7 @@ class Interrupted:
     def stage(self) -> str:
         """How far it was, for users."""
         header = self.state.header
-        share = f" at {header['progress']:.0%}" if header["progress"] else ""
+        share = f" at {header['progress']:.0%}" if header["progress"] and header["stage"] != "done" else ""
         return f"{header['stage']}{share}, {header['frames']} frames, {header['work_s']:.0f} s of work"
 
     def resume(self, recording: Recording) -> Reconstructor:

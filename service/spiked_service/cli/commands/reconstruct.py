@@ -25,7 +25,7 @@ from rich.progress import (
 from rich.text import Text
 
 from spiked.errors import ConfigurationError, SceneError, SpikedError
-from spiked.recon import NotOnePlaceError, Reconstructor, State, Status, extend
+from spiked.recon import Merged, NotOnePlaceError, Reconstructor, State, Status, extend
 from spiked.recon.frontend.mosaic_check import detect
 from spiked.recon.frontend.windowing import Windows
 from spiked.recording import Recording, RecordingGeometry
@@ -162,16 +162,22 @@ def _carry_out(run: ReconstructionRun, page: "Watch | None") -> None:
     reconstructor = run.reconstructor
     known = None if run.map is None else MapFolder.read(run.map)
     interrupted = _run_through(run, page)
-    _write(reconstructor, run.out, run.recording.path.name)
+    joint: Merged | SpikedError | None = None
+    if known is not None and not interrupted and reconstructor.failure is None:
+        run.checkpoints.save(reconstructor, now=True)  # after a kill only the rest is repeated
+        joint, interrupted = _extended(known, reconstructor)
+    if known is not None and isinstance(joint, Merged):
+        _write_joint(run, known, joint)
+    else:
+        _write(run, {} if joint is None else {"map": str(run.map), "joined": False, "reason": str(joint)})
     _report(reconstructor, run.out)
+    if known is not None and joint is not None:
+        _report_joint(run, known, joint)
     if interrupted:
         run.checkpoints.close()
         raise typer.Exit(INTERRUPTED)
-    found = reconstructor.failure is None
-    if found and known is not None:
-        found = _extended(run, known)
     run.checkpoints.remove()
-    if not found:
+    if reconstructor.failure is not None or isinstance(joint, SpikedError):
         raise typer.Exit(1)
 
 
@@ -182,34 +188,44 @@ def _check_map(folder: Path, out: Path) -> None:
         raise ConfigurationError(f"--out {out} is the map that is to be extended; name another folder")
 
 
-def _extended(run: ReconstructionRun, known: MapFolder) -> bool:
-    """Write the map extended by the reconstruction, in place of the reconstruction alone; false if that cannot be."""
-    reconstructor, folder = run.reconstructor, str(run.map)
-    with Progress(console=messages, transient=True, disable=not messages.is_terminal) as bar:
+def _extended(known: MapFolder, reconstructor: Reconstructor) -> tuple[Merged | SpikedError | None, bool]:
+    """The map extended by the reconstruction, or why that cannot be; and whether it was interrupted."""
+    with _interruptible() as interrupt, Progress(
+        console=messages, transient=True, disable=not messages.is_terminal
+    ) as bar:  # fmt: skip
         task = bar.add_task("extending", total=1.0)
         try:
-            made = extend(known.known, reconstructor, lambda share: bar.update(task, completed=share))
+            made = extend(known.known, reconstructor, lambda share: bar.update(task, completed=share), interrupt.is_set)
         except (NotOnePlaceError, SceneError) as error:
-            report_error(SpikedError(f"{folder} was not extended: {error}; {run.out} has the reconstruction alone"))
-            about = {"map": folder, "joined": False, "reason": str(error)}
-            report = {**reconstructor.report(), "extended": about}
-            with outputs.writing("--out", run.out):
-                (run.out / "report.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
-            return False
-    own = {file_name(run.out.resolve().name): reconstructor.trajectory()}
-    moved = made.joint.second.trajectory
-    paths = joint_paths(known.paths, own, moved)
-    figures = {"map": folder, "joined": True, "versions": known.versions, **made.report()}
+            return error, interrupt.is_set()
+    return (None, True) if interrupt.is_set() else (made, False)
+
+
+def _write_joint(run: ReconstructionRun, known: MapFolder, made: Merged) -> None:
+    reconstructor = run.reconstructor
+    figures = {"map": str(run.map), "joined": True, "versions": known.versions, **made.report()}
     report = {**reconstructor.report(), "splats": len(made.scene), "extended": figures}
     with outputs.writing("--out", run.out):
-        write_map(run.out, made.scene, moved, paths, report)
-    found = made.joint.registration
+        run.out.mkdir(parents=True, exist_ok=True)
+        _draw(run)
+        write_map(run.out, made.scene, made.joint.second.trajectory, _joint_paths(run, known, made), report)
+
+
+def _joint_paths(run: ReconstructionRun, known: MapFolder, made: Merged) -> dict[str, Trajectory]:
+    own = {file_name(run.out.resolve().name): run.reconstructor.trajectory()}
+    return joint_paths(known.paths, own, made.joint.second.trajectory)
+
+
+def _report_joint(run: ReconstructionRun, known: MapFolder, joint: Merged | SpikedError) -> None:
+    if isinstance(joint, SpikedError):
+        report_error(SpikedError(f"{run.map} was not extended: {joint}; {run.out} has the reconstruction alone"))
+        return
     output.print(
-        f"{run.out}: {len(made.scene)} splats with those of {folder}, paths {', '.join(paths)}; "
-        f"{len(found.sightings)} views agree with it",
+        f"{run.out}: {len(joint.scene)} splats with those of {run.map}, "
+        f"paths {', '.join(_joint_paths(run, known, joint))}; "
+        f"{len(joint.joint.registration.sightings)} views agree with it",
         markup=False,
     )
-    return True
 
 
 def _run_through(run: ReconstructionRun, page: "Watch | None") -> bool:
@@ -345,12 +361,20 @@ class ProgressDisplay:
             self._console.print(f"{status.stage}: {figures}  {100 * status.progress:.0f} % refined", markup=False)
 
 
-def _write(reconstructor: Reconstructor, out: Path, title: str) -> None:
-    from spiked_service.cli.overview import draw_overview  # matplotlib takes longer to load than most commands run
-
+def _write(run: ReconstructionRun, extended: dict[str, object]) -> None:
+    """Write the reconstruction alone; `extended` says why the map is not in it, if there is one."""
+    reconstructor, out = run.reconstructor, run.out
+    report = {**reconstructor.report(), **({"extended": extended} if extended else {})}
     with outputs.writing("--out", out):
         out.mkdir(parents=True, exist_ok=True)
         reconstructor.scene().write_ply(out / "scene.ply", reconstructor.white)
         reconstructor.trajectory().write_tum(out / "trajectory.tum")
-        (out / "report.json").write_text(json.dumps(reconstructor.report(), indent=1), encoding="utf-8")
-        draw_overview(reconstructor, title, reconstructor.losses, out / "overview.png")
+        (out / "report.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
+        _draw(run)
+
+
+def _draw(run: ReconstructionRun) -> None:
+    from spiked_service.cli.overview import draw_overview  # matplotlib takes longer to load than most commands run
+
+    reconstructor = run.reconstructor
+    draw_overview(reconstructor, run.recording.path.name, reconstructor.losses, run.out / "overview.png")

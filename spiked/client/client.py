@@ -3,7 +3,7 @@
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from http import HTTPStatus
 from pathlib import Path
 from types import TracebackType
@@ -12,8 +12,9 @@ from urllib.parse import quote
 
 import httpx
 
-from spiked.client.connection import ApiError, Connection
+from spiked.client.connection import ApiError, Connection, plain
 from spiked.client.events import Event, events_in
+from spiked.client.maps import MapMethods
 from spiked.client.models import (
     CaptureOut,
     CapturePage,
@@ -21,27 +22,19 @@ from spiked.client.models import (
     DeviceOut,
     DevicesOut,
     GeometryModel,
-    ImageFormat,
     IntrinsicsModel,
     JobState,
-    Output,
     ProfileModel,
     ProfileOut,
     ReconstructionOptions,
     ReconstructionOut,
     ReconstructionPage,
-    SceneFormat,
     StatedCameraModel,
     SystemOut,
-    TimelineOut,
-    TrajectoryFormat,
-    TrajectoryOut,
     UploadOut,
-    VersionOut,
-    VersionsOut,
 )
+from spiked.client.results import ResultMethods
 from spiked.errors import SpikedError
-from spiked.scene_changes import SceneChanges, SceneMirror
 
 _CHUNK_BYTES = 8 << 20
 """Bytes of an upload in one request."""
@@ -53,7 +46,7 @@ _T = TypeVar("_T")
 _OVER = (JobState.complete, JobState.cancelled, JobState.failed)
 
 
-class Spiked:
+class Spiked(MapMethods, ResultMethods):
     """A client of one service. Usable from any thread, and as a context manager.
 
     Every method raises ApiError when the service refuses, and ServiceUnreachableError when it does not answer.
@@ -90,7 +83,7 @@ class Spiked:
 
     def set_profile(self, device: str, profile: ProfileModel) -> None:
         """Replace the camera profile of a device."""
-        self._connection.request("PUT", f"devices/{quote(device, safe='')}/profile", json=_plain(profile))
+        self._connection.request("PUT", f"devices/{quote(device, safe='')}/profile", json=plain(profile))
 
     def options(self) -> dict[str, Any]:
         """JSON Schema of the options of a reconstruction."""
@@ -121,9 +114,9 @@ class Spiked:
             "notes": notes,
             "record": record,
             "reconstruct": reconstruct,
-            "options": _plain(options or ReconstructionOptions()),
-            "camera": _plain(camera),
-            "intrinsics": _plain(intrinsics),
+            "options": plain(options or ReconstructionOptions()),
+            "camera": plain(camera),
+            "intrinsics": plain(intrinsics),
         }
         return self._connection.post("captures", body, CaptureOut)
 
@@ -186,11 +179,16 @@ class Spiked:
         return part.replace(path)
 
     def start_reconstruction(
-        self, capture_id: str, *, options: ReconstructionOptions | None = None, priority: int = 0
+        self,
+        capture_id: str,
+        *,
+        options: ReconstructionOptions | None = None,
+        priority: int = 0,
+        map_id: str | None = None,
     ) -> ReconstructionOut:
-        """Reconstruct a recording; it may wait in line."""
+        """Reconstruct a recording; it may wait in line. With `map_id` it extends the map of that reconstruction."""
         options = options or ReconstructionOptions()
-        body = {"capture_id": capture_id, "options": _plain(options), "priority": priority}
+        body = {"capture_id": capture_id, "options": plain(options), "priority": priority, "map": map_id}
         return self._connection.post("reconstructions", body, ReconstructionOut)
 
     def reconstructions(
@@ -219,7 +217,7 @@ class Spiked:
         self, reconstruction_id: str, options: ReconstructionOptions | None = None
     ) -> ReconstructionOut:
         """Begin anew from the recording."""
-        body = {"options": _plain(options)}
+        body = {"options": plain(options)}
         return self._connection.post(f"reconstructions/{reconstruction_id}:restart", body, ReconstructionOut)
 
     def remove_reconstruction(self, reconstruction_id: str) -> None:
@@ -229,95 +227,6 @@ class Spiked:
     def wait_for_reconstruction(self, reconstruction_id: str, timeout_s: float = 3600.0) -> ReconstructionOut:
         """The reconstruction when it is over. Raises SpikedError if it is not in time."""
         return _wait(lambda: self.reconstruction(reconstruction_id), lambda one: one.state in _OVER, timeout_s)
-
-    def versions(self, reconstruction_id: str) -> list[VersionOut]:
-        """The versions that are kept, oldest first."""
-        return self._connection.get(f"reconstructions/{reconstruction_id}/versions", VersionsOut).items
-
-    def timeline(
-        self,
-        reconstruction_id: str,
-        *,
-        from_s: float | None = None,
-        to_s: float | None = None,
-        points: int | None = None,
-    ) -> TimelineOut:
-        """How it went, or a part of it; neighbouring views are joined to at most `points`."""
-        path = f"reconstructions/{reconstruction_id}/timeline"
-        return self._connection.get(path, TimelineOut, from_s=from_s, to_s=to_s, points=points)
-
-    def trajectory(
-        self,
-        reconstruction_id: str,
-        *,
-        version: int | None = None,
-        from_s: float | None = None,
-        to_s: float | None = None,
-        step: int | None = None,
-    ) -> TrajectoryOut:
-        """Poses of a version, the newest if none is given; from_s <= time < to_s, every step-th."""
-        path = f"reconstructions/{reconstruction_id}/trajectory"
-        return self._connection.get(path, TrajectoryOut, version=version, from_s=from_s, to_s=to_s, step=step)
-
-    def trajectory_file(
-        self, reconstruction_id: str, kind: TrajectoryFormat = TrajectoryFormat.tum, *, version: int | None = None
-    ) -> bytes:
-        """The trajectory as a file; COLMAP's is a ZIP."""
-        query = {"format": kind, "version": version}
-        return self._connection.request("GET", f"reconstructions/{reconstruction_id}/trajectory", query=query).content
-
-    def scene(
-        self,
-        reconstruction_id: str,
-        kind: SceneFormat = SceneFormat.ply,
-        *,
-        version: int | None = None,
-        max_splats: int | None = None,
-    ) -> bytes:
-        """The scene as a file; a fixed sample of it with max_splats."""
-        query = {"format": kind, "version": version, "max_splats": max_splats}
-        return self._connection.request("GET", f"reconstructions/{reconstruction_id}/scene", query=query).content
-
-    def update_scene(self, reconstruction_id: str, mirror: SceneMirror, *, level: int | None = None) -> SceneChanges:
-        """Bring a mirror of the scene to its newest version; only what has visibly changed since the last call travels.
-
-        `level` 0 has a sixteenth of the splats, 1 a quarter, 2 all. Return what changed.
-        """
-        query = {"since": mirror.state, "level": level}
-        answer = self._connection.request("GET", f"reconstructions/{reconstruction_id}/scene/changes", query=query)
-        changes = SceneChanges.read(answer.content)
-        mirror.apply(changes)
-        return changes
-
-    def view(
-        self,
-        reconstruction_id: str,
-        *,
-        frame: int | None = None,
-        position: Sequence[float] | None = None,
-        quaternion_wxyz: Sequence[float] | None = None,
-        c2w: Sequence[Sequence[float]] | None = None,
-        size: tuple[int, int] | None = None,
-        intrinsics: IntrinsicsModel | None = None,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        output: Output = Output.color,
-        white: float | None = None,
-        kind: ImageFormat = ImageFormat.png,
-        version: int | None = None,
-    ) -> bytes:
-        """An encoded picture from a pose: that of a frame, or position and quaternion_wxyz, or a 4x4 matrix."""
-        pose = {"frame": frame, "position": position, "quaternion_wxyz": quaternion_wxyz, "c2w": c2w}
-        body = {
-            "camera": {key: value for key, value in pose.items() if value is not None},
-            "intrinsics": _plain(intrinsics),
-            "background": background,
-            "output": output,
-            "white": white,
-        }
-        if size is not None:
-            body |= {"width": size[0], "height": size[1]}
-        path, query = f"reconstructions/{reconstruction_id}/views", {"format": kind, "version": version}
-        return self._connection.request("POST", path, query=query, json=body).content
 
     def upload(
         self,
@@ -340,7 +249,7 @@ class Spiked:
             "notes": notes,
             "bytes": size,
             "sidecar": json.loads(beside.read_bytes()) if beside.exists() else None,
-            "geometry": _plain(geometry),
+            "geometry": plain(geometry),
             "sha256": _sha256(path),
         }
         upload = self._connection.post("uploads", body, UploadOut)
@@ -376,10 +285,6 @@ def _append(part: Path, answer: httpx.Response) -> None:
     with part.open("ab" if answer.status_code == HTTPStatus.PARTIAL_CONTENT else "wb") as file:
         for chunk in answer.iter_bytes(_HASH_BYTES):
             file.write(chunk)
-
-
-def _plain(model: Any) -> Mapping[str, Any] | None:
-    return None if model is None else model.model_dump(mode="json", exclude_none=True)
 
 
 def _wait(ask: Callable[[], _T], over: Callable[[_T], bool], timeout_s: float) -> _T:

@@ -49,7 +49,7 @@ class Connection:
         """Let go of the connections."""
         self._http.close()
 
-    def get(self, path: str, model: type[_Model], **query: Any) -> _Model:
+    def get(self, path: str, model: type[_Model], /, **query: Any) -> _Model:
         """A model from a GET. Raises ApiError, ServiceUnreachableError."""
         return _read(self.request("GET", path, query=query), model)
 
@@ -126,3 +126,8 @@ def _read(answer: httpx.Response, model: type[_Model]) -> _Model:
             f"{answer.request.url} answered something else than this client expects; use the client of the service's "
             f"version: {error.errors()[0]['msg']}"
         ) from error
+
+
+def plain(model: BaseModel | None) -> Mapping[str, Any] | None:
+    """A model as JSON has it, without fields that are not set."""
+    return None if model is None else model.model_dump(mode="json", exclude_none=True)

@@ -138,6 +138,18 @@ class DiskOut(BaseModel):
     recording_of: Annotated[str, Field(description="That camera.")]
 
 
+class FrameRangeOut(BaseModel):
+    """
+    Frames `first` to `first + count - 1`, by absolute index.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    first: int
+    count: int
+
+
 class Gap(BaseModel):
     """
     Frames of the capture that are missing from the file.
@@ -234,6 +246,76 @@ class Layout(StrEnum):
     row_tagged = "row_tagged"
 
 
+class LocaliseRequest(BaseModel):
+    """
+    A recording to look for in the map of the reconstruction of the path.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    capture_id: str
+    first_frame: Annotated[int, Field(description="First frame to use, absolute index.")] = 0
+    frames: Annotated[
+        int | None,
+        Field(description="Number of frames to use; 1,000 suffice. Default: all."),
+    ] = None
+    intrinsics: Annotated[
+        IntrinsicsModel | None,
+        Field(description="Lens of the recording, if it does not state it. Default: that of the map."),
+    ] = None
+    threads: Annotated[int | None, Field(description="All cores if not given.")] = None
+    priority: Annotated[int, Field(description="Higher ones run earlier; live captures go before all.")] = 0
+
+
+class LocalisedViewOut(BaseModel):
+    """
+    Where the camera was in one window of frames, in the frame of reference and the unit of the map.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    frame: Annotated[int, Field(description="In the middle of the window.")]
+    time_s: float
+    rotation: Annotated[list[list[float]], Field(description="Camera to world, [3, 3].")]
+    position: list[float]
+    inliers: Annotated[int, Field(description="Points of the map that agree within 1.5 px.")]
+    inlier_share: Annotated[float, Field(description="Of those in view.")]
+    correlation: Annotated[
+        float,
+        Field(description="Of the details of the image with those of the map rendered there."),
+    ]
+    sigma: Annotated[float, Field(description="Predicted standard deviation of the position.")]
+    sigma_px: Annotated[float, Field(description="The same in the image.")]
+
+
+class MapRefOut(BaseModel):
+    """
+    A version of a reconstruction that is used as a map.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    reconstruction_id: str
+    version: int
+
+
+class MergeRequest(BaseModel):
+    """
+    Another reconstruction of the same place, to be merged with the one of the path.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    other: Annotated[str, Field(description="A finished reconstruction.")]
+    seed: Annotated[int, Field(description="Of all random choices.")] = 0
+    threads: Annotated[int | None, Field(description="All cores if not given.")] = None
+    priority: Annotated[int, Field(description="Higher ones run earlier; live captures go before all.")] = 0
+
+
 class Mosaic(StrEnum):
     """
     Colour of the sites (0,0) (0,1) (1,0) (1,1) of the upright image, row-major.
@@ -276,6 +358,34 @@ class PathModel(BaseModel):
     count: int
     from_s: Annotated[float | None, Field(description="From its beginning if not given.")] = None
     to_s: Annotated[float | None, Field(description="To its end if not given.")] = None
+
+
+class PathOut(BaseModel):
+    """
+    The path of one recording through the scene of a version.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    path: Annotated[
+        int,
+        Field(description="To be given as `path` of the trajectory; 0 is that of the reconstruction's capture."),
+    ]
+    capture_id: Annotated[str, Field(description="Its capture, which may have been removed since.")]
+    poses: int
+
+
+class PathsOut(BaseModel):
+    """
+    The paths of a version, more than one if its map is of several recordings.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    version: int
+    items: list[PathOut]
 
 
 class PictureKind(StrEnum):
@@ -429,6 +539,12 @@ class ReconstructionRequest(BaseModel):
     capture_id: str
     options: ReconstructionOptions | None = None
     priority: Annotated[int, Field(description="Higher ones run earlier; live captures go before all.")] = 0
+    map: Annotated[
+        str | None,
+        Field(
+            description="A finished reconstruction of the same place: its map is extended by the recording, and the result is in its frame of reference."
+        ),
+    ] = None
 
 
 class RecordingOut(BaseModel):
@@ -556,6 +672,19 @@ class SettingsOut(BaseModel):
     items: list[SettingOut]
 
 
+class SimilarityOut(BaseModel):
+    """
+    x in the first map is scale * rotation * x in the other, plus translation.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    scale: float
+    rotation: list[list[float]]
+    translation: list[float]
+
+
 class SourceKindOut(BaseModel):
     """
     A kind of source, and what can follow its question mark.
@@ -599,6 +728,7 @@ class Stage(StrEnum):
     tracking = "tracking"
     mapping = "mapping"
     refining = "refining"
+    joining = "joining"
     done = "done"
 
 
@@ -667,6 +797,17 @@ class Status(StrEnum):
     ok = "ok"
     warning = "warning"
     problem = "problem"
+
+
+class Task(StrEnum):
+    """
+    What a job in the queue of reconstructions does.
+    """
+
+    reconstruct = "reconstruct"
+    extend = "extend"
+    merge = "merge"
+    localise = "localise"
 
 
 class TimelineOut(BaseModel):
@@ -1113,16 +1254,54 @@ class HealthOut(BaseModel):
     checks: list[FindingOut]
 
 
+class LocalisationOut(BaseModel):
+    """
+    Where a camera was in a map, and how sure that is.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    recognised: bool
+    reason: Annotated[str, Field(description="Why it was or was not recognised.")]
+    searches: Annotated[int, Field(description="Views that were searched for in the whole map.")]
+    agreeing: Annotated[int, Field(description="Searches that found the pose that the path has there.")]
+    references: Annotated[int, Field(description="Reference views of the map.")]
+    best_inliers: Annotated[int, Field(description="Most points that agreed with one pose in a search.")]
+    views: Annotated[
+        list[LocalisedViewOut],
+        Field(description="In order of time; empty if the place was not recognised."),
+    ]
+
+
 class ReconstructionOut(BaseModel):
     """
-    A reconstruction, live from a capture or from its recording.
+    A job: a reconstruction, live from a capture or from its recording, an extended or merged map, a localisation.
     """
 
     model_config = ConfigDict(
         extra="ignore",
     )
     id: Annotated[str, Field(description="UUID version 7: ids sort by time.")]
-    capture_id: str
+    capture_id: Annotated[
+        str,
+        Field(description="The capture that its trajectory belongs to; of a merge that of the first map."),
+    ]
+    task: Annotated[
+        Task,
+        Field(description="A localisation has the scene of the map, and the path of the recording in it."),
+    ]
+    maps: Annotated[
+        list[MapRefOut],
+        Field(description="What it uses; the result is in the frame of reference of the first."),
+    ]
+    recognised: Annotated[
+        bool | None,
+        Field(
+            description="Whether all show one place; null before that is known, and without maps. If false and the task is `extend`, the versions show the recording alone, in a frame of reference of their own."
+        ),
+    ]
+    part: Annotated[FrameRangeOut | None, Field(description="Frames that are localised; null: all.")]
     live: bool
     state: JobState
     stage: Stage
@@ -1175,6 +1354,53 @@ class ReconstructionPage(BaseModel):
     next_cursor: Annotated[
         str | None,
         Field(description="To be given as `cursor` for those that follow; null: there are no more."),
+    ]
+
+
+class RegistrationOut(BaseModel):
+    """
+    How two maps, or a map and a recording, were brought together.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    joined: bool
+    reason: Annotated[
+        str,
+        Field(description="Why they were not; empty if they were. Then there are figures."),
+    ]
+    similarity: SimilarityOut | None
+    scale_range: Annotated[
+        list[float] | None,
+        Field(description="Smallest and largest scale along the second way."),
+    ]
+    scale_sigma: Annotated[
+        float | None,
+        Field(description="Predicted relative standard deviation of the scale."),
+    ]
+    turn_sigma_deg: float | None
+    shift_sigma: float | None
+    residual_px: Annotated[float | None, Field(description="Median distance of common points.")]
+    searched: Annotated[
+        int | None,
+        Field(description="Views of the second that were searched for in the first."),
+    ]
+    recognised: Annotated[int | None, Field(description="Of these, views that were found.")]
+    agreeing: Annotated[
+        int | None,
+        Field(description="Views that agree on how the two lie to each other."),
+    ]
+    views_alike: int | None
+    views_different: int | None
+    brightness: Annotated[
+        float | None,
+        Field(description="Radiance of the first over that of the second."),
+    ]
+    splats_kept: Annotated[list[int] | None, Field(description="Of the first and of the second.")]
+    psnr_db: Annotated[
+        list[float] | None,
+        Field(description="How well the result shows what each of them showed."),
     ]
 
 

@@ -21,6 +21,7 @@ from spiked_service.api.routes.docs import mount_docs
 from spiked_service.api.routes.doctor import doctor_routes
 from spiked_service.api.routes.events import event_routes
 from spiked_service.api.routes.health import health_routes, metrics_routes
+from spiked_service.api.routes.maps import map_routes
 from spiked_service.api.routes.options import option_routes
 from spiked_service.api.routes.page import mount_page
 from spiked_service.api.routes.previews import preview_routes
@@ -70,6 +71,7 @@ def _api(services: Services) -> APIRouter:
     api.include_router(preview_routes(captures, folder, results, views, once))
     api.include_router(capture_result_routes(results, views, once))
     api.include_router(reconstruction_routes(reconstructions, once))
+    api.include_router(map_routes(reconstructions, results, once))
     api.include_router(reconstruction_result_routes(reconstructions.rows, results, views, once))
     api.include_router(reconstruction_record_routes(reconstructions.rows, once))
     api.include_router(doctor_routes(folder.path))

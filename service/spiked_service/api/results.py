@@ -24,7 +24,8 @@ from spiked_service.captures.captures import Captures
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.results.shown_scene import ShownScene
 from spiked_service.results.versions import Published, at
-from spiked_service.store.rows import ReconstructionRow
+from spiked_service.store.catalogue import UnknownIdError
+from spiked_service.store.rows import ReconstructionRow, Task
 
 _ENCODED = 8
 """SPZ files, samples and changes in memory, so that each is encoded once for many viewers."""
@@ -146,7 +147,7 @@ class Results:
         Raises UnknownIdError, NotReadyError, NothingError.
         """
         capture = self._captures.get(capture_id)
-        rows = capture.reconstructions
+        rows = [row for row in capture.reconstructions if row.task is not Task.LOCALISE]
         if not rows and capture.row.state.acquiring and capture.row.plan.reconstruct:
             raise NotReadyError(f"the reconstruction of capture {capture_id} has not begun yet")
         if not rows:
@@ -171,7 +172,27 @@ class Results:
             sensor = replace(sensor, intrinsics=Intrinsics(*published.intrinsics))
         return Result(folder, published, sensor, self._rows.timeline(row.id))
 
-    def trajectory(self, request: Request, result: Result, kind: TrajectoryFormat, part: Range) -> Response:
-        """A part of the trajectory of a version. Raises GoneError, NoPoseError, ConfigurationError, OverloadedError."""
-        version = result.published.version
-        return trajectory_response(request, result.poses(), version, result.sensor, kind, part, self._trajectories)
+    def trajectory(
+        self, request: Request, result: Result, kind: TrajectoryFormat, part: Range, path: int = 0
+    ) -> Response:
+        """A part of the trajectory of a version, or of another path through its scene.
+
+        Raises GoneError, NoPoseError, NothingError, ConfigurationError, OverloadedError.
+        """
+        version, poses, sensor = result.published.version, result.poses, result.sensor
+        if path:
+            poses, sensor = self._path(result, path)
+        return trajectory_response(request, poses(), version, sensor, kind, part, self._trajectories)
+
+    def _path(self, result: Result, path: int) -> tuple[Callable[[], PoseFile], Sensor | None]:
+        """The poses of another recording in the map of a version, and its sensor."""
+        others = result.published.paths
+        if path > len(others):
+            raise NothingError(f"version {result.published.version} has no path {path}; GET paths lists what it has")
+        other = others[path - 1]
+        try:
+            sensor = self._captures.get(other.capture_id).row.sensor
+        except UnknownIdError:  # it was removed, but not its path
+            rate_hz = other.frame_rate_hz
+            sensor = result.sensor and replace(result.sensor, frame_rate_hz=rate_hz, intrinsics=None)
+        return lambda: PoseFile(result.folder / other.trajectory), sensor

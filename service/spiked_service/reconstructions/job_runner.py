@@ -1,6 +1,6 @@
 """Runs one reconstruction in a worker process.
 
-The only module of the package that starts processes. Another executor has to take a `ReconstructionCommand`, deliver
+The only module of the package that starts processes. Another executor has to take a `JobCommand`, deliver
 `WorkerEvent`s and one exit, and support `stop`, `dismiss` and `kill_after`, as `WorkerProcess` does.
 """
 
@@ -12,11 +12,13 @@ from datetime import UTC, datetime
 from spiked.recon import State
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.repository import ReconstructionRepository
-from spiked_service.store.rows import JobState, ReconstructionRow, Stage
+from spiked_service.settings.reconstruction_options import ReconstructionOptions
+from spiked_service.store.rows import JobState, ReconstructionRow, Stage, Task
 from spiked_service.workers.messages import (
     FramesSkipped,
+    JobCommand,
+    PlaceCompared,
     PoseEstimated,
-    ReconstructionCommand,
     ReconstructionStatus,
     VersionPublished,
     WorkerError,
@@ -58,6 +60,8 @@ class JobRunner:
         self._early = False
         self._yielded = False
         self._error: str | None = None
+        self._mismatch = ""
+        """Why map and recording, or two maps, do not show one place."""
         self._frames_skipped: FramesSkipped | None = None
         self._again_of: int | None = None
         self._saved_s = time.monotonic()
@@ -67,7 +71,7 @@ class JobRunner:
         """Process id of the worker, None before it runs."""
         return None if self._worker is None else self._worker.pid
 
-    def start(self, command: ReconstructionCommand, standby: StandbyWorker | None) -> None:
+    def start(self, command: JobCommand, standby: StandbyWorker | None) -> None:
         """Save the row and start the worker, or use a standby worker. Raises OSError."""
         command.folder.mkdir(exist_ok=True)
         self._rows.save(self.row)
@@ -82,7 +86,10 @@ class JobRunner:
     def cancel(self) -> None:
         """Stop the worker; published versions are kept."""
         self._cancelled = True
-        self._stop()
+        if self.row.task.reconstructs:
+            self._stop()
+        else:
+            self.dismiss()  # it publishes at its end only
 
     def finish_early(self) -> None:
         """End the refinement; the reconstruction counts as complete."""
@@ -112,7 +119,9 @@ class JobRunner:
             return queued_again(row, reason)
         if self._yielded and row.progress < 1 and not self._early:
             return queued_again(row, "")
-        if not row.frames:
+        if row.recognised is False:
+            return replace(row, state=JobState.FAILED, stage=Stage.DONE, reason=self._not_one_place())
+        if not row.frames and row.task.reads_recording:
             reason = "no frames were received, so there is nothing to reconstruct"
             return replace(row, state=JobState.CANCELLED, stage=Stage.DONE, reason=reason)
         if not row.poses:
@@ -134,6 +143,9 @@ class JobRunner:
                 self._publish(event)
             case FramesSkipped():
                 self._frames_skipped = event
+            case PlaceCompared():
+                self.row = replace(self.row, recognised=event.recognised)
+                self._mismatch = event.reason
             case WorkerError():
                 self._error = event.reason
 
@@ -177,6 +189,12 @@ class JobRunner:
         self._saved_s = time.monotonic()
         self._rows.save(self.row)
 
+    def _not_one_place(self) -> str:
+        if self.row.task is Task.EXTEND:
+            used = self.row.maps[0].reconstruction_id
+            return f"the map {used} was not extended: {self._mismatch}; the versions show the recording alone"
+        return self._mismatch
+
     def _remarks(self) -> str:
         """Remarks on a complete reconstruction; empty if it tracked and refined all frames."""
         remarks = [] if self.row.tracking_state is State.TRACK else [self.row.reason]
@@ -199,4 +217,24 @@ def queued_again(row: ReconstructionRow, reason: str) -> ReconstructionRow:
         progress=0.0,
         reason=reason,
         ended_at=None,
+    )
+
+
+def begun_anew(row: ReconstructionRow, options: ReconstructionOptions) -> ReconstructionRow:
+    """The row of a reconstruction that a user restarts; version numbers continue."""
+    return ReconstructionRow(
+        row.id,
+        row.capture_id,
+        False,
+        JobState.QUEUED,
+        row.created_at,
+        options=options,
+        priority=row.priority,
+        version=row.version,
+        white=row.white,
+        poses=row.poses,
+        splats=row.splats,
+        task=row.task,
+        maps=row.maps,
+        part=row.part,
     )

@@ -1,23 +1,23 @@
 """All reconstructions: live ones start at once, others from a queue; failed workers are retried."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 
-from spiked.errors import ConfigurationError
-from spiked.sensor import Intrinsics
 from spiked_service.base.errors import BusyError
 from spiked_service.base.ids import new_id
-from spiked_service.reconstructions.job_runner import JobRunner, queued_again
+from spiked_service.reconstructions.admission import check, intrinsics_of
+from spiked_service.reconstructions.job_commands import command_of
+from spiked_service.reconstructions.job_runner import JobRunner, begun_anew, queued_again
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue_policy import QueuePolicy
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.catalogue import Catalogue, StoreError
 from spiked_service.store.folder import DataFolder
-from spiked_service.store.rows import CaptureRow, JobState, ReconstructionRow, Stage
-from spiked_service.workers.messages import ReconstructionCommand, RingOpened
+from spiked_service.store.rows import CaptureRow, FrameRange, JobState, MapRef, ReconstructionRow, Stage, Task
+from spiked_service.workers.messages import JobCommand, ReconstructionCommand, RingOpened
 from spiked_service.workers.process import StandbyWorker
 
 _LOOK_S = 0.5
@@ -85,7 +85,7 @@ class Reconstructions:
             folder=self._folder.reconstruction(row.id),
             can_block=opened.can_block,
             options=options,
-            intrinsics=_intrinsics(options, capture),
+            intrinsics=intrinsics_of(options, capture),
             calibration=opened.calibration,
             first_frame=first_frame,
             stop_frame=stop_frame,
@@ -96,20 +96,41 @@ class Reconstructions:
         return row
 
     def submit(
-        self, capture_id: str, options: ReconstructionOptions | None = None, priority: int = 0
+        self,
+        capture_id: str,
+        options: ReconstructionOptions | None = None,
+        priority: int = 0,
+        *,
+        task: Task = Task.RECONSTRUCT,
+        map_ids: Sequence[str] = (),
+        part: FrameRange | None = None,
     ) -> ReconstructionRow:
-        """Queue a reconstruction from the recording of a capture; it waits while the capture runs.
+        """Queue a job of a capture; one that needs the recording waits while the capture runs.
 
-        Raises UnknownIdError, and ConfigurationError for a capture without a recording.
+        `map_ids` are the reconstructions whose newest versions the `task` uses, two of a merge; they lie in the folder
+        of the job from now on, whatever becomes of them. `part` are the frames to localise.
+        Raises UnknownIdError, BusyError for a map that is not finished, StoreError, and ConfigurationError for a
+        capture without a recording, what is no map, and another camera whose lens is not known.
         """
-        capture = self._catalogue.captures.get(capture_id)
-        chosen = options or ReconstructionOptions()
-        _check(capture)
         row = ReconstructionRow(
-            new_id(), capture_id, False, JobState.QUEUED, datetime.now(UTC), options=chosen, priority=priority
+            new_id(),
+            capture_id,
+            False,
+            JobState.QUEUED,
+            datetime.now(UTC),
+            options=options or ReconstructionOptions(),
+            priority=priority,
+            task=task,
+            maps=tuple(MapRef(map_id) for map_id in map_ids),
+            part=part,
         )
         with self._lock:
-            added = self.rows.add(row)
+            check(row, self._catalogue, self.rows)
+            try:
+                added = self.rows.add(self.rows.pin_maps(row))
+            except BaseException:
+                self._folder.remove(self._folder.reconstruction(row.id))
+                raise
             self._wake.notify_all()
         return added
 
@@ -141,22 +162,10 @@ class Reconstructions:
             row = self.rows.get(reconstruction_id)
             if not row.state.over:
                 raise BusyError(f"reconstruction {row.id} is {row.state}: cancel it, or wait for its end")
-            _check(self._catalogue.captures.get(row.capture_id))
+            check(row, self._catalogue, self.rows)
+            begun = self.rows.pin_maps(begun_anew(row, options or row.options))
             self.policy.reset_retries(row.id)
             self.rows.drop_checkpoint(row.id)
-            begun = ReconstructionRow(
-                row.id,
-                row.capture_id,
-                False,
-                JobState.QUEUED,
-                row.created_at,
-                options=options or row.options,
-                priority=row.priority,
-                version=row.version,
-                white=row.white,
-                poses=row.poses,
-                splats=row.splats,
-            )
             self.rows.save(begun)
             self._wake.notify_all()
             return begun
@@ -211,7 +220,9 @@ class Reconstructions:
 
     def _next_start(self, row: ReconstructionRow) -> str:
         """How an interrupted job goes on, for users."""
-        return "resumed from its checkpoint" if self.rows.has_checkpoint(row.id) else "restarted from the recording"
+        if self.rows.has_checkpoint(row.id):
+            return "resumed from its checkpoint"
+        return "restarted from the recording" if row.task.reads_recording else "restarted"
 
     def _run_queue(self) -> None:
         while True:
@@ -231,25 +242,17 @@ class Reconstructions:
             if not self.policy.due(row.id):
                 continue
             capture = self._catalogue.captures.find(row.capture_id)
-            recorded = capture is not None and capture.recording is not None and capture.recording.frames > 0
-            if capture is None or (capture.state.over and not recorded):
+            ready = not row.task.reads_recording or (
+                capture is not None and capture.recording is not None and capture.recording.frames > 0
+            )
+            if capture is None or (capture.state.over and not ready):
                 why = row.reason or "the capture has no recording"
                 self.rows.save(replace(row, state=JobState.FAILED, reason=why, ended_at=datetime.now(UTC)))
-            elif recorded:
-                self._begin_from_recording(row, capture)
+            elif ready:
+                self._begin_queued(row, capture)
 
-    def _begin_from_recording(self, row: ReconstructionRow, capture: CaptureRow) -> None:
-        command = ReconstructionCommand(
-            capture_id=capture.id,
-            reconstruction_id=row.id,
-            ring=None,
-            recording=self._folder.recording(capture.id),
-            folder=self._folder.reconstruction(row.id),
-            can_block=True,
-            options=row.options,
-            intrinsics=_intrinsics(row.options, capture),
-            least_poses=self._least_poses.pop(row.id, 0),
-        )
+    def _begin_queued(self, row: ReconstructionRow, capture: CaptureRow) -> None:
+        command = command_of(row, capture, self._folder, self._least_poses.pop(row.id, 0))
         now = datetime.now(UTC)
         begun = replace(
             row, state=JobState.RUNNING, stage=Stage.WAITING, started_at=now, ended_at=None, attempts=row.attempts + 1
@@ -259,7 +262,7 @@ class Reconstructions:
     def _begin(
         self,
         row: ReconstructionRow,
-        command: ReconstructionCommand,
+        command: JobCommand,
         standby: StandbyWorker | None = None,
         on_end: Callable[[ReconstructionRow], None] | None = None,
     ) -> None:
@@ -311,21 +314,9 @@ class Reconstructions:
         """The row of a job whose worker died: queued again while retries are left and there is a recording."""
         row = replace(row, ended_at=datetime.now(UTC), eta_s=None)
         capture = self._catalogue.captures.find(row.capture_id)
-        if capture is not None and capture.plan.record and self.policy.retry(row.id):
+        again = capture is not None and (capture.plan.record or not row.task.reads_recording)
+        if again and self.policy.retry(row.id):
             return queued_again(row, f"{trouble}; {self._next_start(row)} (attempt {row.attempts + 1})")
         self.rows.drop_checkpoint(row.id)
         tried = f", the last of {row.attempts} attempts" if row.attempts > 1 else ""
         return replace(row, state=JobState.FAILED, reason=f"{trouble}{tried}")
-
-
-def _check(capture: CaptureRow) -> None:
-    if capture.deleted_at is not None:
-        raise ConfigurationError(f"capture {capture.id} is deleted: restore it first")
-    if not capture.plan.record or (capture.state.over and (capture.recording is None or not capture.recording.frames)):
-        raise ConfigurationError(f"capture {capture.id} has no recording to reconstruct from")
-
-
-def _intrinsics(options: ReconstructionOptions, capture: CaptureRow) -> Intrinsics | None:
-    if options.intrinsics is not None:
-        return options.intrinsics.intrinsics()
-    return capture.plan.intrinsics or (None if capture.sensor is None else capture.sensor.intrinsics)

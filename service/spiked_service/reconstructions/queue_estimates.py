@@ -6,7 +6,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 
 from spiked_service.store.catalogue import Catalogue
-from spiked_service.store.rows import JobState, ReconstructionRow
+from spiked_service.store.rows import JobState, ReconstructionRow, Task
 
 NEXT = "state = ? ORDER BY priority DESC, id"
 """SQL condition and order of the queue; the parameter is a state."""
@@ -14,6 +14,8 @@ _RECENT = 8
 """Complete reconstructions that the pace is estimated from."""
 _STEPS_OF_TRACKING = 200
 """Tracking takes about as long as this many refinement steps."""
+_MERGE_SHARE, _LOCALISATION_SHARE = 0.2, 0.1
+"""Time of a merge, and of localising all frames, over that of reconstructing the capture (decisions 16 and 18)."""
 _CHANGE_S = 5.0
 """Changes of an estimate by less seconds, ..."""
 _CHANGE_SHARE = 0.2
@@ -69,19 +71,27 @@ class QueueEstimates:
         )
         now, found = datetime.now(UTC), []
         for row in (*running, *over):
-            effort = self._effort(row)
+            effort = self._effort(row) if row.task.reconstructs else None
             if row.started_at is not None and effort is not None:
                 left_s = 0.0 if row.ended_at else _remaining_s(row)
                 found.append((((row.ended_at or now) - row.started_at).total_seconds() + left_s) / effort)
         return [pace for pace in found if pace < float("inf")]
 
     def _effort(self, row: ReconstructionRow) -> float | None:
-        """Pixels x frames x steps; None while the recording is not closed."""
+        """Pixels x frames x steps, of a reconstruction; None while the recording is not closed."""
         capture = self._catalogue.captures.find(row.capture_id)
         if capture is None or capture.sensor is None or capture.recording is None or not capture.recording.frames:
             return None
         pixels = capture.sensor.width * capture.sensor.height
-        return pixels * capture.recording.frames * (row.options.steps + _STEPS_OF_TRACKING)
+        frames = capture.recording.frames
+        match row.task:
+            case Task.MERGE:
+                share = _MERGE_SHARE
+            case Task.LOCALISE:
+                share = _LOCALISATION_SHARE * (min(row.part.count, frames) / frames if row.part else 1)
+            case _:
+                share = 1.0
+        return share * pixels * frames * (row.options.steps + _STEPS_OF_TRACKING)
 
 
 def _remaining_s(row: ReconstructionRow) -> float:

@@ -6,15 +6,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from spiked.errors import ConfigurationError
 from spiked.recon.checkpoint import exists
+from spiked.render import Camera
+from spiked.sensor import Sensor
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue_estimates import NEXT, QueueEstimates
 from spiked_service.reconstructions.queue_policy import QueuePolicy
+from spiked_service.results.pinned_map import pin
 from spiked_service.results.timeline_writer import NAME as TIMELINE
-from spiked_service.results.versions import Published, version_row
+from spiked_service.results.versions import Published, newest, version_row
 from spiked_service.store.catalogue import Catalogue, Page, StoreError
 from spiked_service.store.folder import DataFolder
-from spiked_service.store.rows import JobState, ReconstructionRow, VersionRow
+from spiked_service.store.rows import JobState, MapRef, ReconstructionRow, VersionRow
 
 
 class ReconstructionRepository:
@@ -94,6 +98,9 @@ class ReconstructionRepository:
     def save(self, row: ReconstructionRow) -> ReconstructionRow:
         """Save and publish a row. A row that cannot be saved is kept in memory and retried."""
         row = replace(row, queue_place=None)
+        if row.state.over:  # the maps that it used may go
+            for folder in self._folder.maps(row.id, len(row.maps)):
+                shutil.rmtree(folder, ignore_errors=True)
         with self._lock:
             self._set_running(row)
             try:
@@ -129,6 +136,36 @@ class ReconstructionRepository:
     def drop_checkpoint(self, reconstruction_id: str) -> None:
         """Let the next start of a reconstruction begin anew."""
         shutil.rmtree(self._folder.checkpoint(reconstruction_id), ignore_errors=True)
+
+    def pin_maps(self, row: ReconstructionRow) -> ReconstructionRow:
+        """Link the newest versions of the maps of a job into its folder; the row with their numbers.
+
+        Raises UnknownIdError, ConfigurationError for a reconstruction that is no map, and StoreError.
+        """
+        found = []
+        for folder, used in zip(self._folder.maps(row.id, len(row.maps)), row.maps, strict=True):
+            map_row, source, published, sensor = self._map(used.reconstruction_id)
+            try:
+                pin(folder, map_row, source, published, sensor)
+            except FileNotFoundError as error:
+                raise ConfigurationError(f"{error.filename} has just been removed: try again") from error
+            except OSError as error:
+                raise StoreError(f"the map cannot be linked into {folder}: {error.strerror}") from error
+            found.append(MapRef(map_row.id, published.version))
+        return replace(row, maps=tuple(found))
+
+    def map_camera(self, reconstruction_id: str) -> Camera:
+        """The camera that made a map. Raises UnknownIdError, and ConfigurationError for what is no map."""
+        _, _, published, sensor = self._map(reconstruction_id)
+        return Camera(published.optics(sensor), sensor.width, sensor.height)
+
+    def _map(self, reconstruction_id: str) -> tuple[ReconstructionRow, Path, Published, Sensor]:
+        row = self._catalogue.reconstructions.get(reconstruction_id)
+        folder, capture = self._folder.reconstruction(row.id), self._catalogue.captures.get(row.capture_id)
+        published = newest(folder)
+        if published is None or capture.sensor is None:
+            raise ConfigurationError(f"reconstruction {row.id} has no version, so it is no map")
+        return row, folder, published, capture.sensor
 
     def add_version(self, row: ReconstructionRow, published: Published, kept: set[int]) -> None:
         """Save a published version and forget those that are not in `kept`. Errors are logged."""

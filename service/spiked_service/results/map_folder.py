@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, Field
 
-from spiked.errors import SceneError
+from spiked.errors import ConfigurationError, SceneError
 from spiked.recon import KnownMap
 from spiked.render import Camera
 from spiked.scene import Scene
-from spiked.sensor import Intrinsics
+from spiked.sensor import Intrinsics, Sensor
 from spiked.trajectory import Trajectory
 
 MAP_FILES = ("report.json", "scene.ply", "trajectory.tum")
@@ -84,6 +84,19 @@ def names_of_both(first: Sequence[str], second: Sequence[str]) -> list[str]:
 def file_name(name: str) -> str:
     """A name as that of a file: letters, digits, `_`, `.` and `-`, and none that is hidden."""
     return re.sub(r"[^\w.-]", "_", name).lstrip(".")[:100] or "path"
+
+
+def camera_in(sensor: Sensor, known: Camera) -> Camera:
+    """The camera of a recording that is looked for in a map made by `known`, whose lens is assumed if none is stated.
+
+    Raises ConfigurationError if that cannot be, because the images differ in size.
+    """
+    if sensor.intrinsics is None and (sensor.width, sensor.height) != (known.width, known.height):
+        raise ConfigurationError(
+            f"the recording is {sensor.width}x{sensor.height} and the map was made with {known.width}x{known.height}, "
+            "so it is another camera: give its intrinsics (--fov or --intrinsics)"
+        )
+    return Camera(sensor.intrinsics or known.intrinsics, sensor.width, sensor.height)
 
 
 def write_map(

@@ -1,6 +1,8 @@
 """Versions of a scene and its trajectory: one process publishes them, others read them at any time."""
 
 import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -9,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from spiked.errors import ConfigurationError
 from spiked.poses import PoseAppender
 from spiked.scene import Scene
-from spiked.sensor import Intrinsics
+from spiked.sensor import Intrinsics, Sensor
 from spiked.trajectory import Trajectory
 from spiked_service.results.shown_scene import TOLERANCE, ShownScene
 from spiked_service.store.rows import VersionRow
@@ -21,6 +24,17 @@ _NEWEST = 3
 _EARLIER = 16
 """Earlier versions kept, spread over time; at twice as many, every second one is removed."""
 _INDEX = "published.json"
+
+
+class OtherPath(BaseModel):
+    """The path of another recording through the scene of a version."""
+
+    capture_id: str
+    """Its capture, which may have been removed since."""
+    frame_rate_hz: float
+    trajectory: str
+    """Name of a pose file."""
+    poses: int
 
 
 class Published(BaseModel):
@@ -44,6 +58,15 @@ class Published(BaseModel):
     """Name of the file of `ShownScene`, which only the newest versions have."""
     slots_began: int = 0
     """First version of these slots."""
+    paths: list[OtherPath] = []
+    """Of a map of several recordings: the paths of the others."""
+
+    def optics(self, sensor: Sensor) -> Intrinsics:
+        """The lens of the camera `sensor` that made it. Raises ConfigurationError for a version of an old release."""
+        found = sensor.intrinsics if self.intrinsics is None else Intrinsics(*self.intrinsics)
+        if found is None:
+            raise ConfigurationError(f"version {self.version} was published without a lens: :restart makes a new one")
+        return found
 
 
 class _Index(BaseModel):
@@ -59,6 +82,36 @@ def write_atomically(path: Path, content: bytes) -> None:
         file.flush()
         os.fdatasync(file.fileno())
     part.replace(path)
+
+
+@dataclass(frozen=True)
+class RecordedPath:
+    """The path of the recording of a capture through a scene."""
+
+    capture_id: str
+    frame_rate_hz: float
+    trajectory: Trajectory
+
+    def published(self, name: str) -> OtherPath:
+        """Its metadata, with the name of its file."""
+        return OtherPath(
+            capture_id=self.capture_id,
+            frame_rate_hz=self.frame_rate_hz,
+            trajectory=name,
+            poses=len(self.trajectory),
+        )
+
+
+def moved_paths(paths: Sequence[RecordedPath], moved: Trajectory) -> list[RecordedPath]:
+    """Paths with other poses: `moved` has those of all, one path after the other."""
+    begins = np.cumsum([0, *(len(one.trajectory) for one in paths)])
+    return [
+        replace(
+            one,
+            trajectory=Trajectory(one.trajectory.times_s, moved.rotations[begin:end], moved.centres[begin:end]),
+        )
+        for one, begin, end in zip(paths, begins, begins[1:], strict=False)
+    ]
 
 
 class Publisher:
@@ -117,9 +170,11 @@ class Publisher:
         states: NDArray[np.bytes_] | None = None,
         tolerance: float = TOLERANCE,
         posed_frames: int | None = None,
+        others: Sequence[RecordedPath] = (),
     ) -> Published:
         """Publish the next version and remove old ones; `states` [n] is the tracking state at each pose, `tolerance`
-        that of `ShownScene.update`. `posed_frames` have a pose, if the trajectory has only some of them.
+        that of `ShownScene.update`. `posed_frames` have a pose, if the trajectory has only some of them. `others` are
+        paths of other recordings through the scene.
 
         Raises OSError if it cannot be written.
         """
@@ -137,7 +192,10 @@ class Publisher:
             psnr_db=psnr_db,
             intrinsics=None if intrinsics is None else (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy),
             **self._write_slots(scene, white, version, tolerance),
+            paths=[one.published(f"path-{version:06d}-{number}.poses") for number, one in enumerate(others, 1)],
         )
+        for path, one in zip(published.paths, others, strict=True):
+            _write_poses(self._folder / path.trajectory, one.trajectory, None)
         write_atomically(self._folder / published.scene, content)
         _write_poses(self._folder / published.trajectory, trajectory, states)
         self._list(published)
@@ -164,6 +222,8 @@ class Publisher:
                 (self._folder / one.scene).unlink(missing_ok=True)
                 (self._folder / one.trajectory).unlink(missing_ok=True)
                 pose_file(self._folder, one).unlink(missing_ok=True)
+                for path in one.paths:
+                    (self._folder / path.trajectory).unlink(missing_ok=True)
         self._versions = kept
 
 

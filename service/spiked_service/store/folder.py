@@ -97,6 +97,10 @@ class DataFolder:
         """Folder of the checkpoint of a reconstruction that has not ended; it may not exist."""
         return self.reconstruction(reconstruction_id) / CHECKPOINT
 
+    def maps(self, reconstruction_id: str, count: int) -> list[Path]:
+        """Folders of the maps that a job uses, linked; they exist until it has ended."""
+        return [self.reconstruction(reconstruction_id) / f"map-{number}" for number in range(1, count + 1)]
+
     def upload(self, upload_id: str) -> Path:
         """Received bytes of an upload."""
         return self._uploads / f"{_checked(upload_id)}.part"

@@ -110,7 +110,8 @@ def _size(folder: Path) -> int:
     total = 0
     for path in folder.rglob("*"):
         try:
-            total += path.lstat().st_blocks * 512
+            stat = path.lstat()
+            total += stat.st_blocks * 512 // stat.st_nlink  # a job links the maps that it uses
         except FileNotFoundError:
             continue  # a running reconstruction lets go of versions
     return total

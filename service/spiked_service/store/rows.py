@@ -20,7 +20,31 @@ class Stage(StrEnum):
     TRACKING = "tracking"
     MAPPING = "mapping"
     REFINING = "refining"
+    JOINING = "joining"
+    """Two maps become one."""
     DONE = "done"
+
+
+class Task(StrEnum):
+    """What a job in the queue of reconstructions does."""
+
+    RECONSTRUCT = "reconstruct"
+    EXTEND = "extend"
+    """Reconstruct a recording and join it with a map."""
+    MERGE = "merge"
+    """Make one map of two, without recordings."""
+    LOCALISE = "localise"
+    """Find where the camera of a recording was in a map."""
+
+    @property
+    def reads_recording(self) -> bool:
+        """Whether it needs the recording of its capture."""
+        return self is not Task.MERGE
+
+    @property
+    def reconstructs(self) -> bool:
+        """Whether it tracks and maps a recording."""
+        return self in (Task.RECONSTRUCT, Task.EXTEND)
 
 
 class Origin(StrEnum):
@@ -213,8 +237,24 @@ class CaptureRow:
 
 
 @dataclass(frozen=True)
+class MapRef:
+    """A version of a reconstruction that a job uses as a map."""
+
+    reconstruction_id: str
+    version: int = 0
+
+
+@dataclass(frozen=True)
+class FrameRange:
+    """Frames `first` to `first + count - 1` of a capture, by absolute index."""
+
+    first: int
+    count: int
+
+
+@dataclass(frozen=True)
 class ReconstructionRow:
-    """A reconstruction of a capture: live from its ring, or from its recording."""
+    """A job of a capture: a reconstruction, live from its ring or from its recording, or another `Task`."""
 
     id: str
     capture_id: str
@@ -247,6 +287,13 @@ class ReconstructionRow:
     """Seconds to completion, waiting time included; None if unknown."""
     started_at: datetime | None = None
     ended_at: datetime | None = None
+    task: Task = Task.RECONSTRUCT
+    maps: tuple[MapRef, ...] = ()
+    """One, of a merge two; the result is in the frame of reference of the first."""
+    part: FrameRange | None = None
+    """Frames to localise; None: all."""
+    recognised: bool | None = None
+    """Whether all show one place; None before that is known, and without maps."""
 
 
 @dataclass(frozen=True)

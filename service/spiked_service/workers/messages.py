@@ -14,7 +14,7 @@ from spiked.sensor import Intrinsics, Sensor
 from spiked_service.events.payloads import PosePayload
 from spiked_service.results.versions import Published
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
-from spiked_service.store.rows import Stage
+from spiked_service.store.rows import FrameRange, Stage
 
 
 class Role(StrEnum):
@@ -25,6 +25,8 @@ class Role(StrEnum):
     RECONSTRUCTION = "reconstruction"
     PREVIEW = "preview"
     UPLOAD = "upload"
+    LOCALISATION = "localisation"
+    MERGE = "merge"
 
 
 class _Command(BaseModel):
@@ -100,6 +102,32 @@ class ReconstructionCommand(_Command):
     """The capture is recorded, so that it can be reconstructed again with all frames."""
     least_poses: int = 0
     """Trajectories with fewer poses are published only at the end, because a longer one exists."""
+    map: Path | None = None
+    """Folder of a `PinnedMap` that is extended in the end."""
+
+
+class LocalisationCommand(_Command):
+    """Find where the camera of a recording was in a map; publish its path in the map's scene in a folder."""
+
+    role: Literal[Role.LOCALISATION] = Role.LOCALISATION
+    recording: Path
+    folder: Path
+    map: Path
+    """Folder of a `PinnedMap`."""
+    intrinsics: Intrinsics | None
+    part: FrameRange | None
+    threads: int | None
+
+
+class MergeCommand(_Command):
+    """Make one map of two and publish it in a folder."""
+
+    role: Literal[Role.MERGE] = Role.MERGE
+    folder: Path
+    maps: tuple[Path, Path]
+    """Folders of `PinnedMap`s."""
+    seed: int
+    threads: int | None
 
 
 class PreviewCommand(_Command):
@@ -123,9 +151,17 @@ class UploadCommand(_Command):
 
 
 Command = Annotated[
-    AcquisitionCommand | RecorderCommand | ReconstructionCommand | PreviewCommand | UploadCommand,
+    AcquisitionCommand
+    | RecorderCommand
+    | ReconstructionCommand
+    | LocalisationCommand
+    | MergeCommand
+    | PreviewCommand
+    | UploadCommand,
     Field(discriminator="role"),
 ]
+JobCommand = ReconstructionCommand | LocalisationCommand | MergeCommand
+"""Commands of the queue of reconstructions."""
 STOP = "stop\n"
 """Line that asks a worker to finish and exit. The end of its stdin asks it to exit at once."""
 
@@ -204,6 +240,15 @@ class FramesSkipped(BaseModel):
     type: Literal["frames_skipped"] = "frames_skipped"
     frames: int
     skipped: int
+
+
+class PlaceCompared(BaseModel):
+    """Whether a map and a recording, or two maps, show the same place."""
+
+    type: Literal["place_compared"] = "place_compared"
+    recognised: bool
+    reason: str
+    """Why they do not, in one sentence."""
 
 
 class VersionPublished(BaseModel):
@@ -289,6 +334,7 @@ WorkerEvent = Annotated[
     | ReconstructionStatus
     | PoseEstimated
     | FramesSkipped
+    | PlaceCompared
     | VersionPublished
     | PreviewTaken
     | Logged

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from spiked_service.results.versions import Publisher, at, newest, versions
+from spiked_service.results.versions import Publisher, RecordedPath, at, newest, versions
 
 from spiked.scene import Scene
 from spiked.trajectory import Trajectory
@@ -29,6 +29,21 @@ def test_files_of_the_last_three_versions_are_kept_and_old_versions_thinned(tmp_
     assert all(one.slots is None for one in kept[:-3]) and None not in slots
     assert files == {name for one in kept for name in (one.scene, one.trajectory)} | slots | {"published.json"}
     assert Publisher(tmp_path).publish(Scene.empty(1), trajectory, 0.1).version == 61
+
+
+def test_paths_of_other_recordings_go_with_their_version(tmp_path: Path) -> None:
+    publisher = Publisher(tmp_path)
+    trajectory = Trajectory(np.array([0.5, 1.5]), np.eye(3)[None].repeat(2, 0), np.ones((2, 3)))
+    others = [RecordedPath("one", 100.0, trajectory), RecordedPath("other", 200.0, trajectory)]
+    for _ in range(60):
+        publisher.publish(Scene.empty(1), trajectory, 0.1, others=others)
+    kept = versions(tmp_path)
+    assert [(path.capture_id, path.frame_rate_hz, path.poses) for path in kept[-1].paths] == [
+        ("one", 100.0, 2),
+        ("other", 200.0, 2),
+    ]
+    listed = {path.trajectory for one in kept for path in one.paths}
+    assert {path.name for path in tmp_path.glob("path-*")} == listed and len(listed) == 2 * len(kept) < 80
 
 
 def test_a_held_version_outlasts_many_and_can_be_made_the_newest_again(tmp_path: Path) -> None:

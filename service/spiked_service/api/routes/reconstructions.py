@@ -26,7 +26,7 @@ from spiked_service.api.schemas.reconstructions import (
 from spiked_service.reconstructions.queue import Reconstructions
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.results.timeline import STATES, Timeline, Timelines, known
-from spiked_service.store.rows import JobState
+from spiked_service.store.rows import JobState, ReconstructionRow, Task
 
 Points = Annotated[
     int | None,
@@ -46,10 +46,10 @@ def reconstruction_routes(reconstructions: Reconstructions, route_class: type[AP
     def start_reconstruction(
         body: ReconstructionRequest, request: Request, response: Response, idempotency_key: IdempotencyKey = None
     ) -> ReconstructionOut:
-        """Queue a reconstruction of a recording; live captures precede the queue."""
-        row = reconstructions.submit(body.capture_id, body.options, body.priority)
-        response.headers["Location"] = request.url_for("get_reconstruction", reconstruction_id=row.id).path
-        return ReconstructionOut.of(row)
+        """Queue a reconstruction of a recording; live captures precede the queue. With `map` it extends that map."""
+        task, map_ids = (Task.RECONSTRUCT, ()) if body.map is None else (Task.EXTEND, (body.map,))
+        row = reconstructions.submit(body.capture_id, body.options, body.priority, task=task, map_ids=map_ids)
+        return accepted(row, request, response)
 
     @router.get("", responses=problems())
     def list_reconstructions(
@@ -87,6 +87,12 @@ def reconstruction_routes(reconstructions: Reconstructions, route_class: type[AP
         reconstructions.remove(reconstruction_id)
 
     return router
+
+
+def accepted(row: ReconstructionRow, request: Request, response: Response) -> ReconstructionOut:
+    """The answer to the request for a new job."""
+    response.headers["Location"] = request.url_for("get_reconstruction", reconstruction_id=row.id).path
+    return ReconstructionOut.of(row)
 
 
 def reconstruction_record_routes(rows: ReconstructionRepository, route_class: type[APIRoute]) -> APIRouter:

@@ -32,6 +32,11 @@ from spiked_service.settings.tokens import Scope
 from spiked_service.store.rows import ReconstructionRow
 
 Step = Annotated[int, Query(ge=1, le=1_000_000, description="Every n-th pose."), IN_DIGITS]
+PathNumber = Annotated[
+    int,
+    Query(ge=0, le=10_000, description="Of a map of several recordings, another one's path; `GET paths` lists them."),
+    IN_DIGITS,
+]
 MaxSplats = Annotated[
     int | None,
     Query(ge=1, le=10_000_000, description="Most splats: a fixed sample is returned. Default: all."),
@@ -178,8 +183,9 @@ def _result_routes(
         from_s: FromS = None,
         to_s: ToS = None,
         step: Step = 1,
+        path: PathNumber = 0,
     ) -> Response:
-        return results.trajectory(request, results.of(row, version), format, Range(from_s, to_s, step))
+        return results.trajectory(request, results.of(row, version), format, Range(from_s, to_s, step), path)
 
     @router.get(
         "/scene",

@@ -1,13 +1,28 @@
 """Reconstructions and what they publish."""
 
 from datetime import datetime
+from typing import Annotated
 
 from pydantic import Field, StrictInt
 
 from spiked.recon import State
-from spiked_service.api.schemas.base import ID_EXAMPLE, Id, In, Out, PageOut, example
+from spiked_service.api.schemas.base import (
+    ID_EXAMPLE,
+    LARGEST_INTEGER,
+    Id,
+    In,
+    IntrinsicsModel,
+    Out,
+    PageOut,
+    example,
+)
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
-from spiked_service.store.rows import JobState, ReconstructionRow, Stage, VersionRow
+from spiked_service.store.rows import FrameRange, JobState, ReconstructionRow, Stage, Task, VersionRow
+
+Priority = Annotated[
+    StrictInt, Field(ge=-100, le=100, description="Higher ones run earlier; live captures go before all.")
+]
+Threads = Annotated[StrictInt | None, Field(ge=1, le=256, description="All cores if not given.")]
 
 
 class ReconstructionRequest(In):
@@ -17,7 +32,48 @@ class ReconstructionRequest(In):
 
     capture_id: str = Field(min_length=1, max_length=64)
     options: ReconstructionOptions = Field(default_factory=ReconstructionOptions)
-    priority: StrictInt = Field(0, ge=-100, le=100, description="Higher ones run earlier; live captures go before all.")
+    priority: Priority = 0
+    map: str | None = Field(
+        None,
+        min_length=1,
+        max_length=64,
+        description="A finished reconstruction of the same place: its map is extended by the recording, and the result "
+        "is in its frame of reference.",
+    )
+
+
+class MergeRequest(In):
+    """Another reconstruction of the same place, to be merged with the one of the path."""
+
+    model_config = example(other=ID_EXAMPLE, seed=0)
+
+    other: str = Field(min_length=1, max_length=64, description="A finished reconstruction.")
+    seed: StrictInt = Field(0, ge=0, le=2**32 - 1, description="Of all random choices.")
+    threads: Threads = None
+    priority: Priority = 0
+
+
+class LocaliseRequest(In):
+    """A recording to look for in the map of the reconstruction of the path."""
+
+    model_config = example(capture_id=ID_EXAMPLE, first_frame=20_000, frames=1000)
+
+    capture_id: str = Field(min_length=1, max_length=64)
+    first_frame: StrictInt = Field(0, ge=0, le=LARGEST_INTEGER, description="First frame to use, absolute index.")
+    frames: StrictInt | None = Field(
+        None, ge=1, le=LARGEST_INTEGER, description="Number of frames to use; 1,000 suffice. Default: all."
+    )
+    intrinsics: IntrinsicsModel | None = Field(
+        None, description="Lens of the recording, if it does not state it. Default: that of the map."
+    )
+    threads: Threads = None
+    priority: Priority = 0
+
+    def part(self) -> FrameRange | None:
+        """The frames to use; None: all."""
+        if self.frames is None and self.first_frame == 0:
+            return None
+        return FrameRange(self.first_frame, self.frames or LARGEST_INTEGER)
 
 
 class RestartRequest(In):
@@ -28,11 +84,32 @@ class RestartRequest(In):
     options: ReconstructionOptions | None = None
 
 
+class MapRefOut(Out):
+    """A version of a reconstruction that is used as a map."""
+
+    reconstruction_id: str
+    version: int
+
+
+class FrameRangeOut(Out):
+    """Frames `first` to `first + count - 1`, by absolute index."""
+
+    first: int
+    count: int
+
+
 class ReconstructionOut(Out):
-    """A reconstruction, live from a capture or from its recording."""
+    """A job: a reconstruction, live from a capture or from its recording, an extended or merged map, a localisation."""
 
     id: Id
-    capture_id: str
+    capture_id: str = Field(description="The capture that its trajectory belongs to; of a merge that of the first map.")
+    task: Task = Field(description="A localisation has the scene of the map, and the path of the recording in it.")
+    maps: list[MapRefOut] = Field(description="What it uses; the result is in the frame of reference of the first.")
+    recognised: bool | None = Field(
+        description="Whether all show one place; null before that is known, and without maps. If false and the task is "
+        "`extend`, the versions show the recording alone, in a frame of reference of their own."
+    )
+    part: FrameRangeOut | None = Field(description="Frames that are localised; null: all.")
     live: bool
     state: JobState
     stage: Stage
@@ -59,7 +136,7 @@ class ReconstructionOut(Out):
     @classmethod
     def of(cls, row: ReconstructionRow) -> "ReconstructionOut":
         """A row as it is shown."""
-        return cls.model_validate({name: getattr(row, name) for name in cls.model_fields})
+        return cls.model_validate({name: getattr(row, name) for name in cls.model_fields}, from_attributes=True)
 
 
 class ReconstructionPage(PageOut[ReconstructionOut]):
@@ -98,6 +175,76 @@ class TrajectoryOut(Out):
     positions: list[list[float]] = Field(description="[n, 3], length unit of the scene.")
     quaternions_wxyz: list[list[float]] = Field(description="[n, 4]")
     states: list[State | None] = Field(description="State of the tracking then; null where it is not known.")
+
+
+class PathOut(Out):
+    """The path of one recording through the scene of a version."""
+
+    path: int = Field(description="To be given as `path` of the trajectory; 0 is that of the reconstruction's capture.")
+    capture_id: str = Field(description="Its capture, which may have been removed since.")
+    poses: int
+
+
+class PathsOut(Out):
+    """The paths of a version, more than one if its map is of several recordings."""
+
+    version: int
+    items: list[PathOut]
+
+
+class LocalisedViewOut(Out):
+    """Where the camera was in one window of frames, in the frame of reference and the unit of the map."""
+
+    frame: int = Field(description="In the middle of the window.")
+    time_s: float
+    rotation: list[list[float]] = Field(description="Camera to world, [3, 3].")
+    position: list[float]
+    inliers: int = Field(description="Points of the map that agree within 1.5 px.")
+    inlier_share: float = Field(description="Of those in view.")
+    correlation: float = Field(description="Of the details of the image with those of the map rendered there.")
+    sigma: float = Field(description="Predicted standard deviation of the position.")
+    sigma_px: float = Field(description="The same in the image.")
+
+
+class LocalisationOut(Out):
+    """Where a camera was in a map, and how sure that is."""
+
+    recognised: bool
+    reason: str = Field(description="Why it was or was not recognised.")
+    searches: int = Field(description="Views that were searched for in the whole map.")
+    agreeing: int = Field(description="Searches that found the pose that the path has there.")
+    references: int = Field(description="Reference views of the map.")
+    best_inliers: int = Field(description="Most points that agreed with one pose in a search.")
+    views: list[LocalisedViewOut] = Field(description="In order of time; empty if the place was not recognised.")
+
+
+class SimilarityOut(Out):
+    """x in the first map is scale * rotation * x in the other, plus translation."""
+
+    scale: float
+    rotation: list[list[float]]
+    translation: list[float]
+
+
+class RegistrationOut(Out):
+    """How two maps, or a map and a recording, were brought together."""
+
+    joined: bool
+    reason: str = Field(description="Why they were not; empty if they were. Then there are figures.")
+    similarity: SimilarityOut | None = None
+    scale_range: list[float] | None = Field(None, description="Smallest and largest scale along the second way.")
+    scale_sigma: float | None = Field(None, description="Predicted relative standard deviation of the scale.")
+    turn_sigma_deg: float | None = None
+    shift_sigma: float | None = None
+    residual_px: float | None = Field(None, description="Median distance of common points.")
+    searched: int | None = Field(None, description="Views of the second that were searched for in the first.")
+    recognised: int | None = Field(None, description="Of these, views that were found.")
+    agreeing: int | None = Field(None, description="Views that agree on how the two lie to each other.")
+    views_alike: int | None = None
+    views_different: int | None = None
+    brightness: float | None = Field(None, description="Radiance of the first over that of the second.")
+    splats_kept: list[int] | None = Field(None, description="Of the first and of the second.")
+    psnr_db: list[float] | None = Field(None, description="How well the result shows what each of them showed.")
 
 
 class GapOut(Out):

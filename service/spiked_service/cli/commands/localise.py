@@ -5,20 +5,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
-from numpy.typing import NDArray
 from rich.progress import track
 
-from spiked.errors import ConfigurationError, RecordingError
+from spiked.errors import RecordingError
 from spiked.recon import Localisation, Localiser, MapIndex
 from spiked.recording import Recording, RecordingGeometry
-from spiked.render import Camera
-from spiked.sensor import Intrinsics, Sensor
+from spiked.sensor import Sensor
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import messages, output, report_warning
-from spiked_service.results.map_folder import MapFolder
+from spiked_service.results.map_folder import MapFolder, camera_in
+from spiked_service.results.map_reports import localisation_figures
 from spiked_service.results.recording_feed import pieces
 
 NOT_RECOGNISED = 1
@@ -69,7 +67,7 @@ def localise(
         report_warning(warning)
     end = _end(recording, start, frames)
     sensor = g.with_optics(recording.sensor, fov, intrinsics)
-    index = MapIndex(known.scene, known.known.trajectory, Camera(_optics(sensor, known), sensor.width, sensor.height))
+    index = MapIndex(known.scene, known.known.trajectory, camera_in(sensor, known.camera))
     localiser = Localiser(index, sensor, measured)
     for first_frame, part in track(
         list(_parts(recording, start, end)), "localising", console=messages, transient=True,
@@ -80,7 +78,7 @@ def localise(
     _show(found, sensor)
     if json_out is not None:
         with outputs.writing("--json", json_out):
-            json_out.write_text(json.dumps(_figures(found, sensor), indent=1), encoding="utf-8")
+            json_out.write_text(json.dumps(localisation_figures(found, sensor), indent=1), encoding="utf-8")
     if not found.recognised:
         raise typer.Exit(NOT_RECOGNISED)
     if out is not None:
@@ -97,18 +95,6 @@ def _end(recording: Recording, start: int, frames: int | None) -> int:
     if end > recording.frames:
         raise RecordingError(f"--start {start} --frames {frames} is beyond the {recording.frames} frames there are")
     return end
-
-
-def _optics(sensor: Sensor, known: MapFolder) -> Intrinsics:
-    """The recording's intrinsics, or the map's if they are not known and the images are of the same size."""
-    if sensor.intrinsics is not None:
-        return sensor.intrinsics
-    if (sensor.width, sensor.height) != (known.width, known.height):
-        raise ConfigurationError(
-            f"the recording is {sensor.width}x{sensor.height} and the map was made with {known.width}x{known.height}, "
-            "so it is another camera: give its --fov or --intrinsics"
-        )
-    return known.intrinsics
 
 
 def _parts(recording: Recording, start: int, end: int) -> Iterator[tuple[int, tuple[int, int]]]:
@@ -130,32 +116,3 @@ def _show(found: Localisation, sensor: Sensor) -> None:
             f"{view.fit.inliers} points agree ({view.fit.share:.0%}), correlation {view.correlation:.2f}",
             markup=False,
         )
-
-
-def _figures(found: Localisation, sensor: Sensor) -> dict[str, object]:
-    views = [
-        {
-            "time_s": sensor.seconds(view.time),
-            "rotation": _rounded(view.pose.rotation),
-            "position": _rounded(view.pose.centre),
-            "inliers": view.fit.inliers,
-            "inlier_share": round(view.fit.share, 4),
-            "correlation": round(view.correlation, 4),
-            "sigma": round(view.fit.sigma, 9),
-            "sigma_px": round(view.fit.sigma_px, 4),
-        }
-        for view in found.views
-    ]
-    return {
-        "recognised": found.recognised,
-        "reason": found.reason,
-        "searches": found.searches,
-        "agreeing": found.agreeing,
-        "references": found.references,
-        "best_inliers": found.best_inliers,
-        "views": views,
-    }
-
-
-def _rounded(values: NDArray[np.float64]) -> list[object]:
-    return list(np.round(values, 9).tolist())

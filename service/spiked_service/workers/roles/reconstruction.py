@@ -2,9 +2,9 @@
 
 import logging
 import os
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,31 +12,18 @@ from numpy.typing import NDArray
 
 from spiked.calibration import Calibration
 from spiked.errors import CheckpointError, SceneError
-from spiked.pose import quaternion
-from spiked.poses import PoseFile
-from spiked.recon import Options, Reconstructor, State, Status, Tracked
+from spiked.recon import NotOnePlaceError, Options, Reconstructor, State, extend
 from spiked.recon.checkpoint import CHECKPOINT, CheckpointSaver, Interrupted, exists
 from spiked.recon.frontend.windowing import SEARCH_FRAMES
 from spiked.recording import Recording, open_recording, recorded_calibration
 from spiked.ring import End, Frames, Gap, Policy, RingReader
-from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
-from spiked_service.events.payloads import PosePayload
+from spiked_service.results.pinned_map import PinnedMap
 from spiked_service.results.recording_feed import pieces
-from spiked_service.results.shown_scene import TOLERANCE
-from spiked_service.results.timeline import frames_at
-from spiked_service.results.timeline_writer import TimelineWriter
-from spiked_service.results.versions import Published, Publisher, pose_file
-from spiked_service.store.rows import Stage
 from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.frame_skipping import LATE_FRAMES, LatestFrames, next_window
-from spiked_service.workers.messages import (
-    FramesSkipped,
-    PoseEstimated,
-    ReconstructionCommand,
-    ReconstructionStatus,
-    VersionPublished,
-)
+from spiked_service.workers.messages import ReconstructionCommand
+from spiked_service.workers.progress_reporter import ProgressReporter
 
 _log = logging.getLogger("spiked.reconstruction")
 _WAIT_S = 0.05
@@ -47,12 +34,6 @@ _UNPACED_FRAMES = 32
 """Frames between two times of mapping, of a source that can block."""
 _UNPACED_MAPPING_S = 0.3
 """Mapping time after every `_UNPACED_FRAMES` frames of a source that can block."""
-_PUBLISH_S = 1.5
-"""Least time between two published versions, seconds."""
-_PUBLISH_SHARE = 0.1
-"""Largest share of the time spent on publishing: trajectories of minutes take seconds to write."""
-_STATUS_S = 0.2
-"""Interval of status events, seconds."""
 _PUNCTUAL_S = 0.04
 """Lateness up to which the mapper runs after every window of a skipping tracker, ..."""
 _MOST_UNMAPPED = 4
@@ -93,12 +74,15 @@ def run_reconstruction(command: ReconstructionCommand, channel: WorkerChannel) -
         work.reporter.expect(recording.capture_index(recording.frames - 1) + 1)
         _read(recording, work)
     work.finish()
+    if command.map is not None:
+        work.extend(command.map)
+    work.end()
 
 
 @dataclass(frozen=True)
 class _Work:
     reconstructor: Reconstructor
-    reporter: "ProgressReporter"
+    reporter: ProgressReporter
     channel: WorkerChannel
     checkpoints: CheckpointSaver | None = None
     """Of a reconstruction from a recording."""
@@ -129,8 +113,27 @@ class _Work:
         )
         if not leave.is_set():
             self.reporter.last(cut_short=stop.is_set())
-            if self.checkpoints is not None:
-                self.checkpoints.remove()
+
+    def extend(self, folder: Path) -> None:
+        """Join the map in a folder with what was reconstructed, unless the worker is to stop or found no path."""
+        stop = self.channel.stop
+        if stop.is_set() or self.reconstructor.failure is not None:
+            return
+        if self.checkpoints is not None:
+            self.checkpoints.save(self.reconstructor, now=True)  # the refinement is not repeated after a kill
+        about = PinnedMap.read(folder)
+        try:
+            made = extend(about.known(folder), self.reconstructor, self.reporter.joining, stop.is_set)
+        except (NotOnePlaceError, SceneError) as error:
+            self.reporter.not_joined(str(error))
+            return
+        if not stop.is_set():
+            self.reporter.joined(made, about.recorded(folder))
+
+    def end(self) -> None:
+        """The work is complete, unless the worker is to exit: its checkpoint is not needed any more."""
+        if self.checkpoints is not None and not self.channel.leave.is_set():
+            self.checkpoints.remove()
 
     def lose(self, first: int, count: int, cause: str) -> None:
         self.reconstructor.gap(first, count)
@@ -272,222 +275,3 @@ def _read(recording: Recording, work: _Work) -> None:
         work.feed(piece.index, np.array(recording.read(piece.first, piece.count)))
         expected = piece.index + piece.count
         work.reporter.progress(work.reconstructor.status())
-
-
-class ProgressReporter:
-    """Sends progress to the service, publishes versions at limited rates, and writes the timeline."""
-
-    def __init__(
-        self,
-        reconstructor: Reconstructor,
-        command: ReconstructionCommand,
-        channel: WorkerChannel,
-        resumed: bool = False,
-    ) -> None:
-        self._reconstructor = reconstructor
-        self._publisher = Publisher(command.folder)
-        views = len(reconstructor.views)
-        self._timeline = TimelineWriter(command.folder, views, reconstructor.frames)
-        self._channel = channel
-        self._sent_s = self._published_s = -np.inf
-        self._seen = 0
-        self._tracked = self._timeline.moments
-        versions = self._publisher.versions if resumed else []
-        self._poses = versions[-1].poses if versions else 0
-        self._pause_s = _PUBLISH_S
-        self._least_poses = command.least_poses
-        self._continues = resumed or command.least_poses > 0
-        """Versions of earlier workers belong to this run of the reconstruction."""
-        self._own = self._publisher.version + 1
-        """First version of this worker."""
-        self._candidates: set[int] = set()
-        """Versions that the last one is compared with, see `_best`."""
-        self._refines = False
-        self._begun_s = time.monotonic()
-        self._refining_s: float | None = None
-        self._expected: int | None = None
-        self._state = State.BOOT
-
-    def expect(self, frames: int) -> None:
-        """Set the number of frames, for the estimate of the remaining time."""
-        self._expected = frames
-
-    def lost(self, first: int, count: int, cause: str) -> None:
-        self._timeline.lost(first, count, cause)
-
-    def tracked(self, latency_frames: int | None) -> None:
-        """Send the poses of the views tracked since the last call."""
-        new = self._reconstructor.tracked(self._tracked)
-        self._tracked += len(new)
-        if not new:
-            return
-        status = self._reconstructor.status()
-        for view in new:
-            self._timeline.tracked(view, status, _psnr_db(status.loss))
-            if view.rotation is not None and view.centre is not None:
-                self._channel.try_send(PoseEstimated(pose=self._pose(view, status, latency_frames)))
-
-    def progress(self, status: Status) -> None:
-        now_s = time.monotonic()
-        if status.state is not self._state:
-            _log.info(
-                "%s after %d frames%s", status.state, status.frames, f": {status.reason}" if status.reason else ""
-            )
-            self._state = status.state
-        if self._refines and status.stage == Stage.REFINING:
-            self._refines = False
-            if status.splats:  # the map and the whole trajectory as tracked
-                self._publish(status)
-                self._hold()
-        if status.version != self._seen and now_s - self._published_s > self._pause_s:
-            self._publish(status)
-            self._pause_s = max(_PUBLISH_S, (time.monotonic() - now_s) / _PUBLISH_SHARE)
-        if now_s - self._sent_s > _STATUS_S:
-            self._timeline.closed(self._reconstructor.closures())
-            self._send_status(status)
-
-    def frames_skipped(self, skipped: int) -> None:
-        """Publish the live result of a capture that is reconstructed again from its recording."""
-        self._least_poses = 0
-        status = self._reconstructor.status()
-        if self._reconstructor.posed_frames:
-            self._publish(status, every_frame=True)
-        self._send_status(status)
-        self._channel.send(FramesSkipped(frames=status.frames, skipped=skipped))
-
-    def refine(self) -> None:
-        """Mark the start of the refinement; its result is compared with the version before it."""
-        self._refines = True
-        self._hold()
-
-    def _hold(self) -> None:
-        self._publisher.protect_newest()
-        self._candidates.add(self._publisher.version)
-
-    def last(self, cut_short: bool) -> None:
-        """Publish the final state, or an earlier version again if that is better."""
-        self.tracked(None)
-        self._timeline.closed(self._reconstructor.closures())
-        self._least_poses = 0
-        status = self._reconstructor.status()
-        if self._reconstructor.posed_frames:
-            self._publish(status, tolerance=0.0, every_frame=True)
-        shown = self._best(cut_short)
-        self._poses = self._poses if shown is None else shown.poses
-        if shown is not None and shown.version != self._publisher.version:
-            _log.info("version %d is better than the end of the refinement", shown.version)
-            try:
-                self._send_version(self._publisher.again(shown), shown.version)
-            except OSError as error:
-                raise _write_error(error) from error
-        self._send_status(status, shown)
-
-    def _best(self, cut_short: bool) -> Published | None:
-        """The version to end with: the newest, unless an earlier one has a higher PSNR against the recording.
-
-        After a restart by the user, versions of the previous run do not compete unless the run was cut short.
-        """
-        versions = self._publisher.versions
-        ours = [one for one in versions if one.version >= (1 if cut_short or self._continues else self._own)]
-        if not ours or not (self._poses or self._continues):
-            return None
-        newest = ours[-1]
-        candidates = [
-            one
-            for one in ours[:-1]
-            if (one.version in self._candidates or _estimated_better(one, newest))
-            and pose_file(self._publisher.folder, one).exists()  # absent if written by an older release
-        ]
-        scene_psnr_db = {one.version: self._scene_psnr_db(one) for one in [newest, *candidates]} if candidates else {}
-        return max([newest, *candidates], key=lambda one: scene_psnr_db.get(one.version, 0.0))
-
-    def _scene_psnr_db(self, one: Published) -> float:
-        scene = Scene.read_ply(self._publisher.folder / one.scene)
-        poses = PoseFile(pose_file(self._publisher.folder, one))
-        trajectory = poses.trajectory(range(len(poses)))
-        optics = self._reconstructor.camera.intrinsics if one.intrinsics is None else Intrinsics(*one.intrinsics)
-        return self._reconstructor.scene_psnr_db(scene, trajectory, optics)
-
-    def _pose(self, view: Tracked, status: Status, latency_frames: int | None) -> PosePayload:
-        assert view.rotation is not None and view.centre is not None
-        rate = self._reconstructor.sensor.frame_rate_hz
-        x, y, z = (float(value) for value in view.centre)
-        qw, qx, qy, qz = (float(value) for value in quaternion(view.rotation[None])[0])
-        return PosePayload(
-            frame=int(view.time),
-            time_s=view.time / rate,
-            position=(x, y, z),
-            quaternion_wxyz=(qw, qx, qy, qz),
-            state=view.state,
-            sigma_px=view.sigma_px,
-            chi2=view.chi2,
-            latency_s=None if latency_frames is None else latency_frames / rate,
-        )
-
-    def _publish(self, status: Status, tolerance: float = TOLERANCE, every_frame: bool = False) -> None:
-        """Publish a version; while a long path is tracked with the poses of its views, or of `every_frame`."""
-        poses = self._reconstructor.posed_frames
-        self._published_s, self._seen = time.monotonic(), status.version
-        if not poses or poses < self._least_poses:
-            return
-        try:
-            trajectory = self._reconstructor.trajectory() if every_frame else self._reconstructor.trajectory_so_far()
-            scene, white = self._reconstructor.scene(), self._reconstructor.white
-            optics = self._reconstructor.camera.intrinsics
-            rate_hz = self._reconstructor.sensor.frame_rate_hz
-            states = self._timeline.states_at(frames_at(trajectory.times_s, rate_hz))
-            psnr_db = _psnr_db(status.loss)
-            published = self._publisher.publish(scene, trajectory, white, psnr_db, optics, states, tolerance, poses)
-        except OSError as error:
-            raise _write_error(error) from error
-        self._send_version(published)
-
-    def _send_version(self, published: Published, again_of: int | None = None) -> None:
-        self._poses = published.poses
-        self._channel.send(VersionPublished(published=published, kept=self._publisher.kept, again_of=again_of))
-
-    def _send_status(self, status: Status, shown: Published | None = None) -> None:
-        """Send the status; `shown` is the final version."""
-        psnr_db = _psnr_db(status.loss) if shown is None else shown.psnr_db
-        self._sent_s = time.monotonic()
-        self._channel.send(
-            ReconstructionStatus(
-                state=status.state,
-                reason=status.reason,
-                stage=Stage(status.stage),
-                frames=status.frames,
-                splats=status.splats if shown is None else shown.splats,
-                loss=status.loss if shown is None or psnr_db is None else 10 ** (-psnr_db / 10),
-                progress=status.progress,
-                poses=self._poses,
-                version=self._publisher.version,
-                psnr_db=psnr_db,
-                eta_s=self._eta_s(status),
-            )
-        )
-
-    def _eta_s(self, status: Status) -> float | None:
-        """Seconds to the end of the current stage; None if unknown."""
-        now_s = time.monotonic()
-        if status.stage == Stage.REFINING:
-            self._refining_s = self._refining_s or now_s
-            done, since_s = status.progress, self._refining_s
-        elif self._expected:
-            done, since_s = status.frames / self._expected, self._begun_s
-        else:
-            return None
-        return (now_s - since_s) * (1 - done) / done if done > 0.02 else None
-
-
-def _estimated_better(one: Published, other: Published) -> bool:
-    """Whether the PSNR estimated from the loss is higher; some views enter it at reduced size."""
-    return one.psnr_db is not None and other.psnr_db is not None and one.psnr_db > other.psnr_db
-
-
-def _write_error(error: OSError) -> SceneError:
-    return SceneError(f"the scene cannot be published: {error.strerror}; free disk space")
-
-
-def _psnr_db(loss: float | None) -> float | None:
-    """PSNR of the mapped views, estimated from the loss, noise included."""
-    return None if loss is None or loss <= 0 else float(-10 * np.log10(loss))

@@ -473,7 +473,7 @@ export interface paths {
         put?: never;
         /**
          * Start Reconstruction
-         * @description Queue a reconstruction of a recording; live captures precede the queue.
+         * @description Queue a reconstruction of a recording; live captures precede the queue. With `map` it extends that map.
          *
          *     Scope of a token: `operate`.
          */
@@ -550,6 +550,120 @@ export interface paths {
          *     Scope of a token: `operate`.
          */
         post: operations["restart_reconstruction_api_v1_reconstructions__reconstruction_id__restart_post"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/reconstructions/{reconstruction_id}:localise": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        get?: never;
+        put?: never;
+        /**
+         * Localise
+         * @description Queue the search for the camera of a recording, or of a part of it, in its map.
+         *
+         *     The result has the scene of the map, and as trajectory the path of the recording in it.
+         *
+         *     Scope of a token: `operate`.
+         */
+        post: operations["localise_api_v1_reconstructions__reconstruction_id__localise_post"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/reconstructions/{reconstruction_id}:merge": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        get?: never;
+        put?: never;
+        /**
+         * Merge
+         * @description Queue one map of it and another reconstruction of the same place, in its frame of reference and unit.
+         *
+         *     The result is a new reconstruction of its capture; both stay as they are. Recordings are not needed.
+         *
+         *     Scope of a token: `operate`.
+         */
+        post: operations["merge_api_v1_reconstructions__reconstruction_id__merge_post"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/reconstructions/{reconstruction_id}/paths": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * List Paths
+         * @description The paths of all recordings through the scene of a version, its own first.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["list_paths_api_v1_reconstructions__reconstruction_id__paths_get"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/reconstructions/{reconstruction_id}/localisation": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Localisation
+         * @description Of a localisation: whether the map was recognised, and the pose of each window of frames.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["get_localisation_api_v1_reconstructions__reconstruction_id__localisation_get"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/reconstructions/{reconstruction_id}/registration": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Registration
+         * @description Of an extended or merged map: how the two were brought together, and how well they agree.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["get_registration_api_v1_reconstructions__reconstruction_id__registration_get"];
+        put?: never;
+        post?: never;
         delete?: never;
         options?: never;
         head?: never;
@@ -1586,6 +1700,16 @@ export interface components {
             finding: string;
         };
         /**
+         * FrameRangeOut
+         * @description Frames `first` to `first + count - 1`, by absolute index.
+         */
+        FrameRangeOut: {
+            /** First */
+            first: number;
+            /** Count */
+            count: number;
+        };
+        /**
          * Gap
          * @description Frames of the capture that are missing from the file.
          */
@@ -1728,6 +1852,168 @@ export interface components {
          */
         Layout: "compact" | "row_tagged";
         /**
+         * LocalisationOut
+         * @description Where a camera was in a map, and how sure that is.
+         */
+        LocalisationOut: {
+            /** Recognised */
+            recognised: boolean;
+            /**
+             * Reason
+             * @description Why it was or was not recognised.
+             */
+            reason: string;
+            /**
+             * Searches
+             * @description Views that were searched for in the whole map.
+             */
+            searches: number;
+            /**
+             * Agreeing
+             * @description Searches that found the pose that the path has there.
+             */
+            agreeing: number;
+            /**
+             * References
+             * @description Reference views of the map.
+             */
+            references: number;
+            /**
+             * Best Inliers
+             * @description Most points that agreed with one pose in a search.
+             */
+            best_inliers: number;
+            /**
+             * Views
+             * @description In order of time; empty if the place was not recognised.
+             */
+            views: components["schemas"]["LocalisedViewOut"][];
+        };
+        /**
+         * LocaliseRequest
+         * @description A recording to look for in the map of the reconstruction of the path.
+         * @example {
+         *       "capture_id": "01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10",
+         *       "first_frame": 20000,
+         *       "frames": 1000
+         *     }
+         */
+        LocaliseRequest: {
+            /** Capture Id */
+            capture_id: string;
+            /**
+             * First Frame
+             * @description First frame to use, absolute index.
+             * @default 0
+             */
+            first_frame?: number;
+            /**
+             * Frames
+             * @description Number of frames to use; 1,000 suffice. Default: all.
+             */
+            frames?: number | null;
+            /** @description Lens of the recording, if it does not state it. Default: that of the map. */
+            intrinsics?: components["schemas"]["IntrinsicsModel"] | null;
+            /**
+             * Threads
+             * @description All cores if not given.
+             */
+            threads?: number | null;
+            /**
+             * Priority
+             * @description Higher ones run earlier; live captures go before all.
+             * @default 0
+             */
+            priority?: number;
+        };
+        /**
+         * LocalisedViewOut
+         * @description Where the camera was in one window of frames, in the frame of reference and the unit of the map.
+         */
+        LocalisedViewOut: {
+            /**
+             * Frame
+             * @description In the middle of the window.
+             */
+            frame: number;
+            /** Time S */
+            time_s: number;
+            /**
+             * Rotation
+             * @description Camera to world, [3, 3].
+             */
+            rotation: number[][];
+            /** Position */
+            position: number[];
+            /**
+             * Inliers
+             * @description Points of the map that agree within 1.5 px.
+             */
+            inliers: number;
+            /**
+             * Inlier Share
+             * @description Of those in view.
+             */
+            inlier_share: number;
+            /**
+             * Correlation
+             * @description Of the details of the image with those of the map rendered there.
+             */
+            correlation: number;
+            /**
+             * Sigma
+             * @description Predicted standard deviation of the position.
+             */
+            sigma: number;
+            /**
+             * Sigma Px
+             * @description The same in the image.
+             */
+            sigma_px: number;
+        };
+        /**
+         * MapRefOut
+         * @description A version of a reconstruction that is used as a map.
+         */
+        MapRefOut: {
+            /** Reconstruction Id */
+            reconstruction_id: string;
+            /** Version */
+            version: number;
+        };
+        /**
+         * MergeRequest
+         * @description Another reconstruction of the same place, to be merged with the one of the path.
+         * @example {
+         *       "other": "01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10",
+         *       "seed": 0
+         *     }
+         */
+        MergeRequest: {
+            /**
+             * Other
+             * @description A finished reconstruction.
+             */
+            other: string;
+            /**
+             * Seed
+             * @description Of all random choices.
+             * @default 0
+             */
+            seed?: number;
+            /**
+             * Threads
+             * @description All cores if not given.
+             */
+            threads?: number | null;
+            /**
+             * Priority
+             * @description Higher ones run earlier; live captures go before all.
+             * @default 0
+             */
+            priority?: number;
+        };
+        /**
          * Mosaic
          * @description Colour of the sites (0,0) (0,1) (1,0) (1,1) of the upright image, row-major.
          * @enum {string}
@@ -1770,6 +2056,34 @@ export interface components {
              * @description To its end if not given.
              */
             to_s?: number | null;
+        };
+        /**
+         * PathOut
+         * @description The path of one recording through the scene of a version.
+         */
+        PathOut: {
+            /**
+             * Path
+             * @description To be given as `path` of the trajectory; 0 is that of the reconstruction's capture.
+             */
+            path: number;
+            /**
+             * Capture Id
+             * @description Its capture, which may have been removed since.
+             */
+            capture_id: string;
+            /** Poses */
+            poses: number;
+        };
+        /**
+         * PathsOut
+         * @description The paths of a version, more than one if its map is of several recordings.
+         */
+        PathsOut: {
+            /** Version */
+            version: number;
+            /** Items */
+            items: components["schemas"]["PathOut"][];
         };
         /**
          * PictureKind
@@ -1978,7 +2292,7 @@ export interface components {
         };
         /**
          * ReconstructionOut
-         * @description A reconstruction, live from a capture or from its recording.
+         * @description A job: a reconstruction, live from a capture or from its recording, an extended or merged map, a localisation.
          */
         ReconstructionOut: {
             /**
@@ -1987,8 +2301,25 @@ export interface components {
              * @example 01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10
              */
             id: string;
-            /** Capture Id */
+            /**
+             * Capture Id
+             * @description The capture that its trajectory belongs to; of a merge that of the first map.
+             */
             capture_id: string;
+            /** @description A localisation has the scene of the map, and the path of the recording in it. */
+            task: components["schemas"]["Task"];
+            /**
+             * Maps
+             * @description What it uses; the result is in the frame of reference of the first.
+             */
+            maps: components["schemas"]["MapRefOut"][];
+            /**
+             * Recognised
+             * @description Whether all show one place; null before that is known, and without maps. If false and the task is `extend`, the versions show the recording alone, in a frame of reference of their own.
+             */
+            recognised: boolean | null;
+            /** @description Frames that are localised; null: all. */
+            part: components["schemas"]["FrameRangeOut"] | null;
             /** Live */
             live: boolean;
             state: components["schemas"]["JobState"];
@@ -2092,6 +2423,11 @@ export interface components {
              * @default 0
              */
             priority?: number;
+            /**
+             * Map
+             * @description A finished reconstruction of the same place: its map is extended by the recording, and the result is in its frame of reference.
+             */
+            map?: string | null;
         };
         /**
          * RecordingOut
@@ -2121,6 +2457,73 @@ export interface components {
             };
             /** Sha256 */
             sha256: string | null;
+        };
+        /**
+         * RegistrationOut
+         * @description How two maps, or a map and a recording, were brought together.
+         */
+        RegistrationOut: {
+            /** Joined */
+            joined: boolean;
+            /**
+             * Reason
+             * @description Why they were not; empty if they were. Then there are figures.
+             */
+            reason: string;
+            similarity: components["schemas"]["SimilarityOut"] | null;
+            /**
+             * Scale Range
+             * @description Smallest and largest scale along the second way.
+             */
+            scale_range: number[] | null;
+            /**
+             * Scale Sigma
+             * @description Predicted relative standard deviation of the scale.
+             */
+            scale_sigma: number | null;
+            /** Turn Sigma Deg */
+            turn_sigma_deg: number | null;
+            /** Shift Sigma */
+            shift_sigma: number | null;
+            /**
+             * Residual Px
+             * @description Median distance of common points.
+             */
+            residual_px: number | null;
+            /**
+             * Searched
+             * @description Views of the second that were searched for in the first.
+             */
+            searched: number | null;
+            /**
+             * Recognised
+             * @description Of these, views that were found.
+             */
+            recognised: number | null;
+            /**
+             * Agreeing
+             * @description Views that agree on how the two lie to each other.
+             */
+            agreeing: number | null;
+            /** Views Alike */
+            views_alike: number | null;
+            /** Views Different */
+            views_different: number | null;
+            /**
+             * Brightness
+             * @description Radiance of the first over that of the second.
+             */
+            brightness: number | null;
+            /**
+             * Splats Kept
+             * @description Of the first and of the second.
+             */
+            splats_kept: number[] | null;
+            /**
+             * Psnr Db
+             * @description How well the result shows what each of them showed.
+             */
+            psnr_db: number[] | null;
         };
         /**
          * ReloadedOut
@@ -2216,6 +2619,18 @@ export interface components {
             items: components["schemas"]["SettingOut"][];
         };
         /**
+         * SimilarityOut
+         * @description x in the first map is scale * rotation * x in the other, plus translation.
+         */
+        SimilarityOut: {
+            /** Scale */
+            scale: number;
+            /** Rotation */
+            rotation: number[][];
+            /** Translation */
+            translation: number[];
+        };
+        /**
          * SourceKindOut
          * @description A kind of source, and what can follow its question mark.
          */
@@ -2269,7 +2684,7 @@ export interface components {
          * @description The phase of a reconstruction.
          * @enum {string}
          */
-        Stage: "waiting" | "tracking" | "mapping" | "refining" | "done";
+        Stage: "waiting" | "tracking" | "mapping" | "refining" | "joining" | "done";
         /**
          * State
          * @description State of the tracker.
@@ -2387,6 +2802,12 @@ export interface components {
             /** @description Scope of the token of this request; admin where no token is required. */
             scope: components["schemas"]["Scope"];
         };
+        /**
+         * Task
+         * @description What a job in the queue of reconstructions does.
+         * @enum {string}
+         */
+        Task: "reconstruct" | "extend" | "merge" | "localise";
         /**
          * TimelineOut
          * @description How a reconstruction went, arrays of the same length; null where a value is not known.
@@ -4858,6 +5279,8 @@ export interface operations {
                 to_s?: number | null;
                 /** @description Every n-th pose. */
                 step?: number;
+                /** @description Of a map of several recordings, another one's path; `GET paths` lists them. */
+                path?: number;
             };
             header?: never;
             path: {
@@ -5952,6 +6375,539 @@ export interface operations {
             };
         };
     };
+    localise_api_v1_reconstructions__reconstruction_id__localise_post: {
+        parameters: {
+            query?: never;
+            header?: {
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                "idempotency-key"?: string;
+            };
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["LocaliseRequest"];
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            202: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["ReconstructionOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It conflicts with the current state. */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    merge_api_v1_reconstructions__reconstruction_id__merge_post: {
+        parameters: {
+            query?: never;
+            header?: {
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                "idempotency-key"?: string;
+            };
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["MergeRequest"];
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            202: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["ReconstructionOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It conflicts with the current state. */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    list_paths_api_v1_reconstructions__reconstruction_id__paths_get: {
+        parameters: {
+            query?: {
+                /** @description Default: the newest; `GET versions` lists them. */
+                version?: number | null;
+            };
+            header?: never;
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["PathsOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_localisation_api_v1_reconstructions__reconstruction_id__localisation_get: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            /** @description The content has not changed. */
+            304: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_registration_api_v1_reconstructions__reconstruction_id__registration_get: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            /** @description The content has not changed. */
+            304: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
     get_reconstruction_trajectory_api_v1_reconstructions__reconstruction_id__trajectory_get: {
         parameters: {
             query?: {
@@ -5964,6 +6920,8 @@ export interface operations {
                 to_s?: number | null;
                 /** @description Every n-th pose. */
                 step?: number;
+                /** @description Of a map of several recordings, another one's path; `GET paths` lists them. */
+                path?: number;
             };
             header?: never;
             path: {

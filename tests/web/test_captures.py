@@ -181,3 +181,23 @@ def test_the_reason_of_a_degraded_reconstruction_is_shown_everywhere(
     page.goto(f"{studied.address}?page=scene&capture={studied.capture_id}")
     page.locator(".inspector .reason").wait_for()
     assert reason_in(page, ".inspector") == f"degraded: {reason}"
+
+
+@pytest.mark.slow
+def test_a_recording_is_found_in_a_map_and_shown_in_its_scene(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit(f"{studied.address}?page=captures&capture={studied.capture_id}")
+    page.get_by_role("button", name="Use a map").click()
+    form = page.locator(".panel:has(h2:text-is('Use a map'))")
+    form.get_by_text("Both have to show the same place").wait_for()
+    assert form.locator("select").nth(1).locator("option").count() == 1
+    form.get_by_role("button", name="Start").click()
+    row = page.get_by_role("table", name="Table of reconstructions").get_by_role("row").filter(has_text="found in a map")
+    row.wait_for()
+    jobs = studied.http.get("reconstructions", params={"capture_id": studied.capture_id}).json()["items"]
+    made = next(one for one in jobs if one["task"] == "localise")
+    until(lambda: studied.http.get(f"reconstructions/{made['id']}").json()["state"] == "complete", "it is found", 300)
+    row.get_by_text("complete").wait_for()
+    row.get_by_role("button", name="Scene of reconstruction").click()
+    page.locator("canvas").first.wait_for()
+    until(lambda: made["id"] in address(page), "its scene")
+    studied.http.delete(f"reconstructions/{made['id']}")

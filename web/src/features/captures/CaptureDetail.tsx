@@ -3,7 +3,7 @@
 import { type JSX, useState } from "react";
 
 import * as calls from "../../shared/api/calls";
-import type { Capture, OptionValues, Reconstruction } from "../../shared/api/types";
+import type { Capture, Reconstruction } from "../../shared/api/types";
 import { useDenied } from "../../shared/state/access";
 import { attempt } from "../../shared/state/attempt";
 import { nameOf, sourceOf } from "../../shared/state/capture";
@@ -20,6 +20,7 @@ import { useFetch } from "../../shared/state/useFetch";
 import { ActionButton, ScopeNote } from "../../shared/ui/access";
 import { Icon } from "../../shared/ui/icons";
 import { CaptureBadge, ErrorMessage, Loading, Panel } from "../../shared/ui/parts";
+import { MapPanel, type MapTask } from "./MapPanel";
 import { Plots } from "./Plots";
 import { ReconstructionsPanel, RerunPanel } from "./ReconstructionsPanel";
 import { RecordingPanel } from "./RecordingPanel";
@@ -60,18 +61,28 @@ function Detail({ capture }: { capture: Capture }): JSX.Element {
   const [otherId, setOtherId] = useState<string | null>(null);
   const other = jobs.find((one) => one.id === otherId && one.id !== job?.id) ?? null;
   const nameOfJob = (one: Reconstruction): string => `#${jobs.length - jobs.indexOf(one)}`;
-  const [rerunning, setRerunning] = useState(false);
+  const [form, setForm] = useState<"rerun" | "map" | null>(null);
+  const toggle = (wanted: "rerun" | "map"): void => setForm(form === wanted ? null : wanted);
 
-  const submit = async (options: OptionValues): Promise<void> => {
+  const start = async (begin: () => Promise<Reconstruction>): Promise<void> => {
     await attempt(async () => {
-      const made = await calls.submit(capture.id, options);
+      const made = await begin();
       storeReconstruction(made);
       adjust({ reconstruction: made.id });
-      if (job !== null && job.version > 0) setOtherId(job.id);
-      setRerunning(false);
+      if (made.task === "reconstruct" && job !== null && job.version > 0) setOtherId(job.id);
+      setForm(null);
     });
   };
+  const withMap = (task: MapTask, mapId: string): Promise<void> =>
+    start(() =>
+      task === "localise"
+        ? calls.localise(mapId, capture.id)
+        : task === "extend"
+          ? calls.submit(capture.id, job?.options ?? {}, mapId)
+          : calls.merge(job?.id ?? "", mapId),
+    );
 
+  const canRun = capture.recording !== null && isFinished(capture);
   return (
     <div className="detail">
       <Head capture={capture} />
@@ -84,14 +95,23 @@ function Detail({ capture }: { capture: Capture }): JSX.Element {
             other={other}
             nameOf={nameOfJob}
             onOther={setOtherId}
-            onRerun={() => setRerunning(!rerunning)}
-            rerunning={rerunning}
-            canRun={capture.recording !== null && isFinished(capture)}
+            onRerun={() => toggle("rerun")}
+            rerunning={form === "rerun"}
+            onMap={() => toggle("map")}
+            mapping={form === "map"}
+            canRun={canRun}
           />
-          {rerunning && (
-            <RerunPanel initial={job?.options ?? {}} onSubmit={submit} onCancel={() => setRerunning(false)} />
+          {form === "rerun" && (
+            <RerunPanel
+              initial={job?.options ?? {}}
+              onSubmit={(options) => start(() => calls.submit(capture.id, options))}
+              onCancel={() => setForm(null)}
+            />
           )}
-          {job !== null && <Plots capture={capture} job={job} other={other} nameOf={nameOfJob} />}
+          {form === "map" && (
+            <MapPanel shown={job} canRead={canRun} onSubmit={withMap} onCancel={() => setForm(null)} />
+          )}
+          {job !== null && measured(job) && <Plots capture={capture} job={job} other={other} nameOf={nameOfJob} />}
           {job !== null && <LogPanel job={job} />}
         </div>
         <div>
@@ -104,6 +124,9 @@ function Detail({ capture }: { capture: Capture }): JSX.Element {
     </div>
   );
 }
+
+/** Whether its tracking and its loss were noted over time. */
+const measured = (job: Reconstruction): boolean => job.task === "reconstruct" || job.task === "extend";
 
 function Head({ capture }: { capture: Capture }): JSX.Element {
   const [name, setName] = useState(capture.name);

@@ -3,7 +3,7 @@
 import type { JSX } from "react";
 
 import * as calls from "../../shared/api/calls";
-import type { OptionValues, Reconstruction } from "../../shared/api/types";
+import type { OptionValues, Reconstruction, Task } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
 import { progressText } from "../../shared/state/capture";
 import { count, decibel, when } from "../../shared/state/format";
@@ -28,6 +28,12 @@ const COLUMNS = [
   { name: "Actions", hidden: true },
 ];
 
+const TASKS: Record<Exclude<Task, "reconstruct">, string> = {
+  extend: "extends a map",
+  merge: "two maps merged",
+  localise: "found in a map",
+};
+
 export function ReconstructionsPanel({
   jobs,
   job,
@@ -36,6 +42,8 @@ export function ReconstructionsPanel({
   onOther,
   onRerun,
   rerunning,
+  onMap,
+  mapping,
   canRun,
 }: {
   /** Newest first. */
@@ -48,20 +56,27 @@ export function ReconstructionsPanel({
   onOther: (id: string | null) => void;
   onRerun: () => void;
   rerunning: boolean;
+  onMap: () => void;
+  mapping: boolean;
   canRun: boolean;
 }): JSX.Element {
   return (
     <Panel
       title="Reconstructions"
       aside={
-        <ActionButton
-          aria-expanded={rerunning}
-          disabled={!canRun}
-          title={canRun ? undefined : "Needs a complete recording"}
-          onClick={onRerun}
-        >
-          <Icon name="again" /> {jobs.length === 0 ? "Reconstruct" : "Re-run with other options"}
-        </ActionButton>
+        <span className="buttons">
+          <ActionButton aria-expanded={mapping} disabled={!canRun && job === null} onClick={onMap}>
+            <Icon name="scene" /> Use a map
+          </ActionButton>
+          <ActionButton
+            aria-expanded={rerunning}
+            disabled={!canRun}
+            title={canRun ? undefined : "Needs a complete recording"}
+            onClick={onRerun}
+          >
+            <Icon name="again" /> {jobs.length === 0 ? "Reconstruct" : "Re-run with other options"}
+          </ActionButton>
+        </span>
       }
     >
       {jobs.length === 0 ? (
@@ -119,6 +134,7 @@ function Row({
       </td>
       <td>
         {name} {when(job.created_at)} {job.live && <span className="dim">live</span>}
+        {job.task !== "reconstruct" && <span className="dim">{TASKS[job.task]}</span>}
       </td>
       <td>
         {job.state === "running" ? (

@@ -69,11 +69,30 @@ export const unfinished = async (): Promise<Reconstruction[]> => {
   );
   return (await Promise.all(pages)).flatMap((page) => page.items);
 };
-export const submit = (captureId: string, options: OptionValues): Promise<Reconstruction> =>
+/** The newest complete reconstructions of all captures. */
+export const complete = async (): Promise<Reconstruction[]> =>
+  (await answered(client.GET("/api/v1/reconstructions", { params: { query: { state: "complete", limit: 200 } } })))
+    .items;
+/** With `map`, the map of that reconstruction is extended. */
+export const submit = (captureId: string, options: OptionValues, map: string | null = null): Promise<Reconstruction> =>
   answered(
     client.POST("/api/v1/reconstructions", {
-      body: { capture_id: captureId, options },
+      body: { capture_id: captureId, options, map },
       params: { header: idempotent() },
+    }),
+  );
+export const localise = (map: string, captureId: string): Promise<Reconstruction> =>
+  answered(
+    client.POST("/api/v1/reconstructions/{reconstruction_id}:localise", {
+      body: { capture_id: captureId },
+      params: { path: { reconstruction_id: map }, header: idempotent() },
+    }),
+  );
+export const merge = (first: string, other: string): Promise<Reconstruction> =>
+  answered(
+    client.POST("/api/v1/reconstructions/{reconstruction_id}:merge", {
+      body: { other },
+      params: { path: { reconstruction_id: first }, header: idempotent() },
     }),
   );
 export const cancel = (id: string): Promise<Reconstruction> =>

@@ -8,6 +8,7 @@ export type DeviceState = Schemas["DeviceState"];
 export type CaptureState = Schemas["CaptureState"];
 export type Grade = Schemas["Grade"];
 export type Stage = Schemas["Stage"];
+export type Task = Schemas["Task"];
 export type TrackingState = Schemas["State"];
 export type JobState = Schemas["JobState"];
 export type PreviewKind = Schemas["PictureKind"];

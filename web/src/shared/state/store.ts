@@ -71,7 +71,7 @@ export function newestReconstruction(
   captureId: string | null,
 ): Reconstruction | null {
   const own = Object.values(jobs)
-    .filter((job) => job.capture_id === captureId)
+    .filter((job) => job.capture_id === captureId && job.task !== "localise")
     .sort((a, b) => (a.id < b.id ? 1 : -1));
   return own.find((job) => job.version > 0) ?? own[0] ?? null;
 }

@@ -3,6 +3,7 @@
 import base64
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -18,7 +19,7 @@ from spiked.calibration import Calibration
 from spiked.camera import CameraFiles, CameraOptions, Pinhole
 from spiked.errors import CalibrationError, ConfigurationError, ProfileError
 from spiked.profile import CameraProfile
-from spiked.recording import open_recording, read_sidecar, recorded_calibration, sidecar_path
+from spiked.recording import RecordingWriter, open_recording, read_sidecar, recorded_calibration, sidecar_path
 from spiked.sensor import Intrinsics, Mosaic, Sensor
 from spiked.simulate import SimulatedCamera
 
@@ -68,6 +69,20 @@ def test_a_mosaic_passes_from_the_source_to_recording_and_preview(data_store: Da
         shown = cv2.imdecode(np.frombuffer(base64.b64decode(picture.images[kind]), np.uint8), cv2.IMREAD_UNCHANGED)
         assert shown.shape == (64, 96, 3)
         assert np.ptp(shown.astype(int), axis=2).max() > 30, "the room is not grey"
+
+
+def test_a_mosaic_that_is_not_stated_is_a_warning_of_the_capture(data_store: DataStore, tmp_path: Path) -> None:
+    sensor = Sensor(160, 96, 20_000.0, mosaic=Mosaic.GRBG)
+    frames = SimulatedCamera(sensor, seed=2).next_frames(400)
+    for stated in (None, Mosaic.GRBG):
+        path = tmp_path / f"{stated}.dat"
+        with RecordingWriter(path, replace(sensor, mosaic=stated)) as writer:
+            writer.append(frames)
+        started = data_store.captures.start(Plan(f"replay:{path}?pace=0.1", reconstruct=False))
+        warnings = over(data_store, started.id).row.warnings
+        told = [warning for warning in warnings if "colour mosaic" in warning]
+        assert len(told) == (stated is None), warnings
+        assert not told or "GRBG or GBRG" in told[0]
 
 
 def test_options_of_a_request_win_over_those_of_the_source() -> None:

@@ -1,11 +1,13 @@
 """The Live page: a capture from its start to its verdict, and a daemon or a camera that goes away meanwhile."""
 
+import os
 import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from browsing import Studied, choose, finished, until
@@ -51,6 +53,39 @@ def test_a_capture_is_started_watched_and_judged(daemon: Callable[..., Any], vis
     (capture,) = one.http.get("captures").json()["items"]
     assert (capture["name"], capture["verdict"]["grade"]) == ("first light", "good")
     assert capture["reconstruction_ids"] == []
+
+
+def test_the_options_of_a_camera_are_those_of_its_kind(
+    daemon: Callable[..., Any], visit: Callable[..., Any], tmp_path: Path
+) -> None:
+    """A colour capture by the form: what `GET options/sources` lists is offered, and the picture has colours."""
+    one = daemon("--device", "sim:?width=320&height=200", "--no-capture")
+    page = visit(one.address)
+    page.get_by_text("Camera and options of sim").click()
+    (kind,) = (one for one in one.http.get("options/sources").json()["items"] if one["name"] == "sim")
+    fields = page.locator(".source-options label")
+    assert {"mosaic", "flipped", "fov", "intrinsics", "calibration", "profile", "rate"} <= kind["options"][
+        "properties"
+    ].keys()
+    lists = {name for name, option in kind["options"]["properties"].items() if option.get("type") == "array"}
+    assert fields.count() == len(kind["options"]["properties"]) - len(lists)
+    assert page.get_by_label("width", exact=False).first.input_value() == "320"
+    page.get_by_label("mosaic").select_option("GRBG")
+    page.get_by_label("flipped").select_option("false")
+    page.get_by_label("fov").fill("50")
+    page.get_by_label("Length", exact=True).select_option("frames")
+    page.get_by_label("Length in frames").fill("400")
+    page.get_by_label("Reconstruct").uncheck()
+    page.get_by_role("button", name="Start").click()
+    page.locator("[data-grade]").wait_for()
+    (capture,) = one.http.get("captures").json()["items"]
+    assert capture["sensor"]["mosaic"] == "GRBG"
+    assert capture["sensor"]["intrinsics"]["fx"] == pytest.approx(343.1, abs=0.1)
+    shot = page.locator(".picture img").screenshot()
+    if folder := os.environ.get("SCREENSHOTS"):
+        page.screenshot(path=f"{folder}/camera-options.png")
+    image = cv2.imdecode(np.frombuffer(shot, np.uint8), cv2.IMREAD_COLOR)
+    assert np.ptp(image.astype(int), axis=2).mean() > 10, "the picture is grey"
 
 
 def test_a_capture_without_end_is_stopped(daemon: Callable[..., Any], visit: Callable[..., Any]) -> None:

@@ -49,7 +49,8 @@ class Sources:
 
     def _check(self, source: str) -> None:
         kind, spec = find_kind(source), SourceSpec.parse(source)
-        if kind is not None and kind.takes_path:
+        known = {SourceSpec.parse(device.source).address for device in self.devices()}
+        if kind is not None and kind.takes_path and spec.address not in known:
             self._check_path(spec.target or "", spec.address)
         self._check_files(source)
 

@@ -205,9 +205,12 @@ class AcquisitionSupervisor:
             self._listener.acquisition_finished()
 
     def _handle_preview(self, event: WorkerEvent) -> None:
-        if isinstance(event, PreviewTaken):
-            self._picture = event
-            self._listener.preview_taken(event)
+        match event:
+            case PreviewTaken():
+                self._picture = event
+                self._listener.preview_taken(event)
+            case Warned() if event.text not in self._warnings:  # a restarted preview repeats its warnings
+                self._warn(event.text)
 
     def _preview_exited(self, trouble: str | None) -> None:
         with self._lock:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from spiked.blocks import aligned_window
+from spiked.recording import Recording
 from spiked.sensor import Image, Mosaic
 
 GREEN_RATIO = 1.25
@@ -12,7 +14,16 @@ GREEN_RATIO = 1.25
 MIN_SITE_CONTRAST = 0.03
 """Relative difference of the sites' mean rates below which the sensor or the scene is grey."""
 
+UNDECLARED_RATIO = 2.0
+"""Factor from which a sensor that is said to be grey has a mosaic: 3.9 to 11.4 of the colour streams of decision 22, at
+most 1.03 of the grey ones."""
+CHECKED_FRAMES = 80
+"""Frames at the start of a recording by which its mosaic is checked."""
+LEAST_FRAMES = 16
+"""Frames without which it is not: a preview has as many."""
+
 _ON_MAIN_DIAGONAL = (Mosaic.GRBG, Mosaic.GBRG)
+_BESIDE = (Mosaic.BGGR, Mosaic.RGGB)
 _MIRRORED = {
     Mosaic.BGGR: Mosaic.GRBG,
     Mosaic.GRBG: Mosaic.BGGR,
@@ -95,11 +106,29 @@ def _disagreement(a: Image, b: Image) -> float:
 
 
 def mosaic_warning(stated: Mosaic | None, rate: Image) -> str | None:
-    """A warning where the pixels [H, W] contradict the stated mosaic."""
-    likelier = None if stated is None else contradicts(stated, rate)
+    """A warning where the pixels [H, W] contradict the stated mosaic, or show one where none is stated."""
+    if stated is None:
+        green = find_green(rate)
+        if green is None or green.ratio < UNDECLARED_RATIO:
+            return None
+        first, second = _ON_MAIN_DIAGONAL if green.main else _BESIDE
+        return (
+            "by its pixels the sensor has a colour mosaic, which is not stated, so that it is taken as grey: state "
+            f"mosaic {first} or {second}, which differ in red and blue only"
+        )
+    likelier = contradicts(stated, rate)
     if likelier is None:
         return None
     return (
         f"the colour mosaic is said to be {stated}, but by the pixels green is where {likelier} has it: "
         "colours and fine detail will be wrong; give --mosaic auto, or correct the sidecar's cfa"
     )
+
+
+def recorded_mosaic_warning(recording: Recording) -> str | None:
+    """`mosaic_warning` of a recording, by its first frames; None with fewer than `LEAST_FRAMES`."""
+    sensor, frames = recording.sensor, min(recording.frames, CHECKED_FRAMES)
+    if frames < LEAST_FRAMES:
+        return None
+    window = aligned_window(recording.read(0, frames), sensor, 0, 0, frames)
+    return mosaic_warning(sensor.mosaic, window.rate(fill=True))

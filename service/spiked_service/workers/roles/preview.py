@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from spiked.blocks import Window, aligned_window
 from spiked.recon.frontend.demosaic import fill_mosaic
+from spiked.recon.frontend.mosaic_check import mosaic_warning
 from spiked.ring import End, Frames, Gap, Policy, RingReader
 from spiked.sensor import Sensor
 from spiked_service.results.image_encoding import display_white, thumbnail
 from spiked_service.results.versions import write_atomically
 from spiked_service.workers.channel import WorkerChannel
-from spiked_service.workers.messages import PreviewCommand, PreviewKind, PreviewTaken
+from spiked_service.workers.messages import PreviewCommand, PreviewKind, PreviewTaken, Warned
 
 _BLOCKS = 4
 """Blocks per image; the window excludes one at either end, whose spikes complete the intervals."""
@@ -64,6 +65,8 @@ def run_preview(command: PreviewCommand, channel: WorkerChannel) -> None:
                 frames = np.concatenate(blocks)
                 if len(frames) > 2 * block:
                     channel.send(renderer.render(frames, first, block))
+                    if (warning := renderer.mosaic_warning()) is not None:
+                        channel.send(Warned(text=warning))
                 blocks.clear()
                 channel.leave.wait(_PERIOD_S)
         renderer.keep(replace=True)
@@ -77,6 +80,8 @@ class PreviewRenderer:
         self._accumulated: Image | None = None
         self._newest: Image | None = None
         self._kept_s: float | None = None
+        self._images = 0
+        self._warned = False
 
     def render(self, frames: NDArray[np.uint8], first: int, block: int) -> PreviewTaken:
         """Images of compact frames uint8 [n, frame_bytes] starting at index `first`."""
@@ -105,6 +110,14 @@ class PreviewRenderer:
             rate_histogram=np.histogram(rate, _BINS, (0, 1))[0].tolist(),
             hot_pixels=_hot(window),
         )
+
+    def mosaic_warning(self) -> str | None:
+        """The first contradiction between the stated mosaic and the newest image, which is looked at now and then."""
+        self._images += 1
+        due = not self._warned and self._images.bit_count() == 1  # images 1, 2, 4, 8, ...
+        warning = mosaic_warning(self._sensor.mosaic, self._newest) if due and self._newest is not None else None
+        self._warned |= warning is not None
+        return warning
 
     def keep(self, *, replace: bool) -> None:
         """Write a thumbnail of the first image, and at the end of the last one."""

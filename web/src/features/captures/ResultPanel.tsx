@@ -10,7 +10,7 @@ import { useFetch } from "../../shared/state/useFetch";
 import { Fetched } from "../../shared/ui/Fetched";
 import { Icon } from "../../shared/ui/icons";
 import { Panel, Stat } from "../../shared/ui/parts";
-import { textOf } from "./OptionsForm";
+import { textOf } from "../../shared/ui/options";
 
 const TRAJECTORIES = [
   { format: "tum", label: "TUM" },

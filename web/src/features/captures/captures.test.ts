@@ -1,7 +1,7 @@
 import { expect, it } from "vitest";
 
 import type { Timeline } from "../../shared/api/types";
-import { fieldsOf, valuesOf } from "./OptionsForm";
+import { fieldsOf, optionsOf, valuesOf, withOptions } from "../../shared/ui/options";
 import { flicker, joined } from "./series";
 import { merged } from "../live/Histogram";
 
@@ -32,6 +32,13 @@ it("sends what differs from the defaults, with its type", () => {
     flicker: false,
   });
   expect(valuesOf(fields, { steps: "10", limit_s: "2.5" })).toEqual({ steps: 10, limit_s: 2.5 });
+});
+
+it("writes options into the text of a source", () => {
+  expect(withOptions("sim:?width=96", { mosaic: "BGGR", width: "" })).toBe("sim:?mosaic=BGGR");
+  expect(withOptions("pcie:/dev/card", { intrinsics: "1,2,3,4" })).toBe("pcie:/dev/card?intrinsics=1%2C2%2C3%2C4");
+  expect(withOptions("usb0", {})).toBe("usb0");
+  expect(optionsOf("sim:?width=96&mosaic=BGGR")).toEqual({ width: "96", mosaic: "BGGR" });
 });
 
 it("joins two timelines on one axis", () => {

@@ -3,14 +3,15 @@
 import { type JSX, type SubmitEvent, useId, useState } from "react";
 
 import { sourceKinds, startCapture, stopCapture } from "../../shared/api/calls";
-import type { Capture, CaptureRequest, Device } from "../../shared/api/types";
+import type { Capture, CaptureRequest, Device, SourceKind } from "../../shared/api/types";
 import { useDenied } from "../../shared/state/access";
 import { adjust } from "../../shared/state/route";
 import { isAcquiring, isFinished, storeCapture, useService, errorText } from "../../shared/state/store";
 import { useFetch } from "../../shared/state/useFetch";
 import { ActionButton, ScopeNote } from "../../shared/ui/access";
 import { Icon } from "../../shared/ui/icons";
-import { Badge, deviceTone, Panel, ErrorMessage } from "../../shared/ui/parts";
+import { fieldsOf, OptionInput, optionsOf, textOf, withOptions } from "../../shared/ui/options";
+import { Badge, deviceTone, Markup, Panel, ErrorMessage } from "../../shared/ui/parts";
 
 type Length = "open" | "seconds" | "frames";
 const OTHER = "(other)";
@@ -53,7 +54,10 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
   const ids = useId();
   const running = capture !== null && isAcquiring(capture);
   const refining = capture?.state === "finishing";
+  const [options, setOptions] = useState<Record<string, string>>({});
   const selected = chosen ?? devices[0]?.source ?? OTHER;
+  const source = selected === OTHER ? written : selected;
+  const kind = kinds.find((one) => isOfKind(source, one));
   const device = devices.find((one) => one.source === selected) ?? null;
   const denied = useDenied("operate");
   const fixed = running || denied !== null;
@@ -71,8 +75,8 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
   const start = (event: SubmitEvent): void => {
     event.preventDefault();
     adjust({ capture: null, reconstruction: null, frame: null });
-    const source = selected === OTHER ? written : selected;
-    void act(() => startCapture(planOf({ source, length, amount, name, record, reconstruct })));
+    const text = withOptions(source, options);
+    void act(() => startCapture(planOf({ source: text, length, amount, name, record, reconstruct })));
   };
 
   return (
@@ -83,7 +87,10 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
           id={`${ids}-source`}
           value={selected}
           disabled={fixed}
-          onChange={(event) => setChosen(event.target.value)}
+          onChange={(event) => {
+            setChosen(event.target.value);
+            setOptions({});
+          }}
         >
           {devices.map((one) => (
             <option key={one.source} value={one.source}>
@@ -114,6 +121,15 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
               ))}
             </p>
           </>
+        )}
+        {kind !== undefined && (
+          <SourceOptions
+            kind={kind}
+            stated={optionsOf(source)}
+            texts={options}
+            disabled={fixed}
+            onChange={(key, text) => setOptions((old) => ({ ...old, [key]: text }))}
+          />
         )}
         <label htmlFor={`${ids}-name`}>Name</label>
         <input
@@ -193,6 +209,45 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
       <ScopeNote />
       {problem !== null && <ErrorMessage text={problem} />}
     </Panel>
+  );
+}
+
+/** Whether the text names a source of the kind: its name, perhaps with a number, and a colon, or its options. */
+const isOfKind = (source: string, kind: SourceKind): boolean => new RegExp(`^${kind.name}[0-9]*([:?]|$)`).test(source);
+
+/** What can follow the question mark of a source, by the schema of its kind; closed at first. */
+function SourceOptions({
+  kind,
+  stated,
+  texts,
+  disabled,
+  onChange,
+}: {
+  kind: SourceKind;
+  stated: Record<string, string>;
+  texts: Record<string, string>;
+  disabled: boolean;
+  onChange: (key: string, text: string) => void;
+}): JSX.Element {
+  const fields = fieldsOf(kind.options);
+  return (
+    <details className="source-options">
+      <summary>Camera and options of {kind.name}</summary>
+      {fields.map((field) => (
+        <label key={field.key}>
+          <span>{field.label}</span>
+          <OptionInput
+            field={field}
+            text={texts[field.key] ?? stated[field.key] ?? textOf(field.initial)}
+            disabled={disabled}
+            onChange={(text) => onChange(field.key, text)}
+          />
+          <small className="dim">
+            <Markup>{field.hint}</Markup>
+          </small>
+        </label>
+      ))}
+    </details>
   );
 }
 

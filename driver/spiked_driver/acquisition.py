@@ -224,7 +224,7 @@ class _Timing:
         if now_ns - self._suspect[1] > _STEADY_NS and self._warn is not None:
             self._warn(
                 f"frames come at {rate_hz:,.0f} a second by their count and this machine's clock, not at the stated "
-                f"{self._stated_hz:,.0f}: set the true rate, as in usb0?rate={rate_hz:.0f}, or all times are wrong"
+                f"{self._stated_hz:,.0f}: set the option rate={rate_hz:.0f}, or all times are wrong"
             )
             self._warn = None
 

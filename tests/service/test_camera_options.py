@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from spiked_service.captures.archive import DataStore
 from spiked_service.captures.sources import with_options
-from spiked_service.store.rows import CaptureState, Plan
+from spiked_service.results.versions import versions
+from spiked_service.settings.reconstruction_options import ReconstructionOptions
+from spiked_service.store.rows import CaptureState, JobState, Plan
 from spiked_service.workers.messages import PreviewKind, ReconstructionCommand
 from spiked_service.workers.roles.reconstruction import options_of
 
@@ -20,6 +22,7 @@ from spiked.camera import CameraFiles, CameraOptions, Pinhole
 from spiked.errors import CalibrationError, ConfigurationError, ProfileError
 from spiked.profile import CameraProfile
 from spiked.recording import RecordingWriter, open_recording, read_sidecar, recorded_calibration, sidecar_path
+from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Mosaic, Sensor
 from spiked.simulate import SimulatedCamera
 
@@ -69,6 +72,19 @@ def test_a_mosaic_passes_from_the_source_to_recording_and_preview(data_store: Da
         shown = cv2.imdecode(np.frombuffer(base64.b64decode(picture.images[kind]), np.uint8), cv2.IMREAD_UNCHANGED)
         assert shown.shape == (64, 96, 3)
         assert np.ptp(shown.astype(int), axis=2).max() > 30, "the room is not grey"
+
+
+def test_a_colour_camera_is_mapped_in_colour_live(data_store: DataStore) -> None:
+    source = "sim:?width=160&height=96&mosaic=GRBG&motion=arc&flow_px=0.25&seed=2"
+    options = ReconstructionOptions(steps=30)
+    started = data_store.captures.start(Plan(f"{source}&pace=0", frames=480, record=False, options=options))
+    done = over(data_store, started.id)
+    (job,) = done.reconstructions
+    assert (job.state, job.live) == (JobState.COMPLETE, True), job.reason
+    folder = data_store.folder.reconstruction(job.id)
+    scene = Scene.read_ply(folder / versions(folder)[-1].scene)
+    assert scene.colours.shape[1] == 3
+    assert np.ptp(scene.colours, axis=1).mean() > 0.1 * scene.colours.mean(), "the room has colours"
 
 
 def test_a_mosaic_that_is_not_stated_is_a_warning_of_the_capture(data_store: DataStore, tmp_path: Path) -> None:

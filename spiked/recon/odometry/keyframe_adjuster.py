@@ -19,6 +19,7 @@ from spiked.recon.odometry.initialisation import SCALE_PX
 from spiked.recon.odometry.loop_closure import LoopClosure, LoopSearch, find_closures, spread_drift
 from spiked.recon.odometry.pnp import fit_pose
 from spiked.recon.odometry.sparse_map import MapBundle, Pose, SparseMap, TrackedView
+from spiked.recon.statistics import evenly
 from spiked.sensor import LEAST_DEPTH
 from spiked.spline import Spline
 
@@ -42,6 +43,9 @@ LOOP_ROUNDS = 4
 SPREAD_PX = 2.0
 """Correction by a closure, as image motion, from which on it is spread over the loop; smaller ones are left to the
 adjustments."""
+WHOLE_KEYFRAMES = 1000
+"""Keyframes that are adjusted together, at most: time grows with the cube of their number where a path goes through the
+same places again and again. Of more, these are spread evenly (decision 15)."""
 WHOLE_GROWTH = 1.5
 """Growth of the number of keyframes from one adjustment of all of them while tracking to the next: their cost over a
 recording stays in proportion to its length."""
@@ -178,8 +182,9 @@ class KeyframeAdjuster:
         self._take(made, self.map.views)
 
     def _all_chosen(self) -> list[TrackedView]:
-        """All keyframes and the views of closed loops."""
-        chosen = {view.id: view for view in self.keyframes if view.pose is not None}
+        """All keyframes, or `WHOLE_KEYFRAMES` of them, and the views of closed loops."""
+        posed = [view for view in self.keyframes if view.pose is not None]
+        chosen = {posed[row].id: posed[row] for row in evenly(len(posed), WHOLE_KEYFRAMES)}
         for closure in self._linked.values():
             chosen |= {closure.earlier.id: closure.earlier, closure.later.id: closure.later}
         return _in_order(chosen)

@@ -191,9 +191,7 @@ def test_a_recording_is_found_in_a_map_and_shown_in_its_scene(studied: Studied, 
     form.get_by_text("Both have to show the same place").wait_for()
     assert form.locator("select").nth(1).locator("option").count() == 1
     form.get_by_role("button", name="Start").click()
-    row = (
-        page.get_by_role("table", name="Table of reconstructions").get_by_role("row").filter(has_text="found in a map")
-    )
+    row = page.locator("table.jobs tbody tr").filter(has_text="found in a map")
     row.wait_for()
     jobs = studied.http.get("reconstructions", params={"capture_id": studied.capture_id}).json()["items"]
     made = next(one for one in jobs if one["task"] == "localise")

@@ -163,11 +163,11 @@ def test_maps_of_two_places_are_not_merged_and_stay(place: Place) -> None:
 
 @pytest.mark.slow
 def test_a_map_is_extended_by_a_recording(place: Place, tmp_path: Path) -> None:
-    capture_id = recorded(place.data_store, tmp_path, 2, 500, 0.24)
+    capture_id = recorded(place.data_store, tmp_path, 2, 1200, 0.1)
     row = place.done(capture_id, Task.EXTEND, place.maps["room"])
     assert (row.state, row.reason, row.recognised, row.stage) == (JobState.COMPLETE, "", True, Stage.DONE)
     path = place.path(row)
-    _, centres = visitor(2, flow_px=0.24).truth(path.times_s * SENSOR.frame_rate_hz - 0.5)
+    _, centres = visitor(2, flow_px=0.1).truth(path.times_s * SENSOR.frame_rate_hz - 0.5)
     assert np.linalg.norm(path.centres - centres, axis=1).max() < 0.05, "in the map's frame and unit"
     published = newest(place.folder(row))
     assert published is not None and [one.capture_id for one in published.paths] == [place.again]
@@ -177,7 +177,7 @@ def test_a_map_is_extended_by_a_recording(place: Place, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_map_of_another_room_is_not_extended_and_the_recording_alone_is_kept(place: Place, tmp_path: Path) -> None:
-    capture_id = recorded(place.data_store, tmp_path, 2, 500, 0.24)
+    capture_id = recorded(place.data_store, tmp_path, 2, 1200, 0.1)
     row = place.done(capture_id, Task.EXTEND, place.maps["other"])
     assert (row.state, row.recognised) == (JobState.FAILED, False) and row.version > 0
     assert row.reason.startswith(f"the map {place.maps['other']} was not extended: these two do not show the same")
@@ -203,7 +203,7 @@ def test_a_job_whose_worker_is_killed_is_begun_again(place: Place, task: Task) -
 @pytest.mark.slow
 def test_an_extension_whose_worker_is_killed_while_it_joins_goes_on(place: Place, tmp_path: Path) -> None:
     data_store = place.data_store
-    capture_id = recorded(data_store, tmp_path, 2, 500, 0.24)
+    capture_id = recorded(data_store, tmp_path, 2, 1200, 0.1)
     job = place.submit(capture_id, Task.EXTEND, place.maps["room"])
     wait_for(lambda: data_store.reconstructions.rows.get(job.id).stage is Stage.JOINING, "it joins")
     os.kill(data_store.reconstructions.processes()[job.id], signal.SIGKILL)

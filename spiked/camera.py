@@ -20,6 +20,9 @@ from pydantic import (
     model_validator,
 )
 
+from spiked.distortion import Distortion
+from spiked.errors import ConfigurationError
+from spiked.lens import Lens, lens_of
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
 
 __all__ = ["CameraFiles", "CameraOptions", "LocalPath", "Pinhole", "PinholeText", "Rate", "Side", "StoredCameraOptions"]
@@ -37,8 +40,12 @@ LocalPath = Annotated[Path, Strict(False), WithJsonSchema({"type": "string", "mi
 """A path on this machine."""
 
 
+def _none(value: object) -> bool:
+    return value is None
+
+
 class Pinhole(BaseModel):
-    """A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5)."""
+    """A pinhole camera behind a lens; pixels, the centre of the first pixel is (0.5, 0.5)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -46,35 +53,45 @@ class Pinhole(BaseModel):
     fy: StrictFloat = Field(gt=0)
     cx: StrictFloat
     cy: StrictFloat
+    distortion: Lens | None = Field(
+        default=None, exclude_if=_none, description="Of the lens, as OpenCV has it; null: none."
+    )
 
     def intrinsics(self) -> Intrinsics:
         """The same for the library."""
-        return Intrinsics(self.fx, self.fy, self.cx, self.cy)
+        lens = None if self.distortion is None else self.distortion.distortion()
+        return Intrinsics(self.fx, self.fy, self.cx, self.cy, lens)
 
     @classmethod
     def of(cls, intrinsics: Intrinsics | None) -> Self | None:
         """The same from the library."""
         if intrinsics is None:
             return None
-        return cls(fx=intrinsics.fx, fy=intrinsics.fy, cx=intrinsics.cx, cy=intrinsics.cy)
+        k = intrinsics
+        return cls(fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy, distortion=lens_of(k.distortion))
 
 
-def _four_numbers(value: Any) -> Any:
+def _numbers(value: Any) -> Any:
     if not isinstance(value, str):
         return value
+    parts = value.split(",")
     try:
-        fx, fy, cx, cy = (float(part) for part in value.split(","))
+        fx, fy, cx, cy = (float(part) for part in parts[:4])
     except ValueError as error:
         raise ValueError("it must be four numbers of pixels, fx,fy,cx,cy") from error
-    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    try:
+        lens = lens_of(Distortion.parse(",".join(parts[4:]))) if parts[4:] else None
+    except ConfigurationError as error:
+        raise ValueError(str(error)) from error
+    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "distortion": lens}
 
 
 PinholeText = Annotated[
     Pinhole,
-    BeforeValidator(_four_numbers),
-    WithJsonSchema({"type": "string", "pattern": r"^[^,]+(,[^,]+){3}$"}),
+    BeforeValidator(_numbers),
+    WithJsonSchema({"type": "string", "pattern": r"^[^,]+(,[^,]+){3,8}$"}),
 ]
-"""Intrinsics that are written `fx,fy,cx,cy`."""
+"""Intrinsics that are written `fx,fy,cx,cy`, with the distortion after them if there is any, see `Distortion.parse`."""
 
 
 class CameraOptions(BaseModel):
@@ -91,7 +108,8 @@ class CameraOptions(BaseModel):
     fov: float | None = Field(default=None, ge=1, le=170)
     """Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated."""
     intrinsics: PinholeText | None = None
-    """Pinhole model fx,fy,cx,cy in pixels, instead of a field of view; the first pixel's centre is (0.5, 0.5)."""
+    """fx,fy,cx,cy in pixels, instead of a field of view; the first pixel's centre is (0.5, 0.5). Coefficients of the
+    lens's distortion may follow: k1,k2,p1,p2,k3 or fisheye:k1,k2,k3,k4."""
 
     @model_validator(mode="after")
     def _one_kind_of_optics(self) -> Self:
@@ -102,10 +120,12 @@ class CameraOptions(BaseModel):
     def sensor(self, base: Sensor) -> Sensor:
         """`base` with what is stated here in place of its own. Raises ConfigurationError for an impossible sensor."""
         optics = base.intrinsics
+        lens = None if optics is None else optics.distortion
         if self.intrinsics is not None:
             optics = self.intrinsics.intrinsics()
+            optics = replace(optics, distortion=optics.distortion or lens)
         elif self.fov is not None:
-            optics = Intrinsics.from_fov(base.width, base.height, self.fov)
+            optics = Intrinsics.from_fov(base.width, base.height, self.fov, lens)
         return replace(
             base,
             frame_rate_hz=base.frame_rate_hz if self.rate is None else self.rate,

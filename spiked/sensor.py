@@ -1,4 +1,4 @@
-"""What a camera is: geometry, frame layout, orientation, colour mosaic, and pinhole intrinsics."""
+"""What a camera is: geometry, frame layout, orientation, colour mosaic, and intrinsics with the lens's distortion."""
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -6,6 +6,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from spiked.distortion import Distortion
 from spiked.errors import ConfigurationError
 
 __all__ = ["BitOrder", "Intrinsics", "Layout", "Mosaic", "Sensor"]
@@ -55,20 +56,27 @@ class Mosaic(StrEnum):
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera without distortion; lengths in pixels, the centre of the first pixel is (0.5, 0.5)."""
+    """A pinhole camera behind a lens; lengths in pixels, the centre of the first pixel is (0.5, 0.5)."""
 
     fx: float
     fy: float
     cx: float
     cy: float
+    distortion: Distortion | None = None
+    """None: the lens has none."""
 
     @classmethod
-    def from_fov(cls, width: int, height: int, horizontal_deg: float) -> "Intrinsics":
-        """Square pixels, centred principal point, and the given horizontal field of view in degrees."""
+    def from_fov(
+        cls, width: int, height: int, horizontal_deg: float, distortion: Distortion | None = None
+    ) -> "Intrinsics":
+        """Square pixels, centred principal point, and the horizontal field of view in degrees that the lens shows."""
         if not 1.0 <= horizontal_deg <= 170.0:
             raise ConfigurationError(f"field of view {horizontal_deg:g} degrees is outside 1 to 170")
         focal = 0.5 * width / float(np.tan(np.radians(horizontal_deg) / 2))
-        return cls(focal, focal, width / 2, height / 2)
+        if distortion is not None:
+            edge = np.array([np.tan(np.radians(horizontal_deg) / 2), 0.0])
+            focal = 0.5 * width / float(distortion.bend(edge)[0])
+        return cls(focal, focal, width / 2, height / 2, distortion)
 
     def matrix(self) -> NDArray[np.float64]:
         """K, float64 [3, 3]."""
@@ -76,17 +84,51 @@ class Intrinsics:
 
     def scaled(self, factor: float) -> "Intrinsics":
         """The intrinsics of the same image at `factor` times its size."""
-        return Intrinsics(self.fx * factor, self.fy * factor, self.cx * factor, self.cy * factor)
+        return Intrinsics(self.fx * factor, self.fy * factor, self.cx * factor, self.cy * factor, self.distortion)
 
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Pixels [..., 2] of points [..., 3] in camera axes; a depth below `LEAST_DEPTH` counts as that."""
         slope = points[..., :2] / np.maximum(points[..., 2:], LEAST_DEPTH)
+        if self.distortion is not None:
+            slope = self.distortion.bend(slope)
         return np.asarray(slope * [self.fx, self.fy] + [self.cx, self.cy], np.float64)
 
     def unproject(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Directions [..., 3] with z = 1, in camera axes, of pixels [..., 2]."""
         slope = (pixels - [self.cx, self.cy]) / [self.fx, self.fy]
+        if self.distortion is not None:
+            slope = self.distortion.straighten(slope)
         return np.concatenate([slope, np.ones((*slope.shape[:-1], 1))], -1)
+
+    def by_slope(self, slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivative [..., 2, 2] of pixels by slopes (x/z, y/z), [..., 2]."""
+        focal = np.array([self.fx, self.fy])
+        if self.distortion is None:
+            return np.broadcast_to(np.diag(focal), (*slopes.shape[:-1], 2, 2))
+        return np.asarray(focal[:, None] * self.distortion.derivative(slopes))
+
+    def focal_at(self, pixels: NDArray[np.float64]) -> float | NDArray[np.float64]:
+        """Pixels for a slope of 1 near pixels [..., 2]: `fx`, through a lens [...] the mean of both directions."""
+        if self.distortion is None:
+            return self.fx
+        return np.asarray(np.sqrt(np.linalg.det(self.by_slope(self.unproject(pixels)[..., :2]))))
+
+    @property
+    def pinhole(self) -> "Intrinsics":
+        """The same camera without distortion."""
+        return self if self.distortion is None else replace(self, distortion=None)
+
+    def undistorted(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where `pinhole` sees what this camera sees at pixels [..., 2]; without distortion the same array."""
+        return pixels if self.distortion is None else self.pinhole.project(self.unproject(pixels))
+
+    def distorted(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The inverse of `undistorted`, for pixels [..., 2]."""
+        return pixels if self.distortion is None else self.project(self.pinhole.unproject(pixels))
+
+    def lens(self) -> dict[str, NDArray[np.float64]]:
+        """Keyword arguments of compiled functions: `lens` [7] as `Distortion.arguments`; none without distortion."""
+        return {} if self.distortion is None else {"lens": self.distortion.arguments()}
 
 
 @dataclass(frozen=True)

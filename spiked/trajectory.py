@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spiked.distortion import Distortion, LensModel
 from spiked.errors import SceneError
 from spiked.pose import Array, quaternion, rotation_of
 from spiked.sensor import Sensor
@@ -153,12 +154,30 @@ def colmap_lines(parts: Iterable[Trajectory]) -> Iterator[str]:
 
 
 def colmap_camera(sensor: Sensor) -> str:
-    """The text of COLMAP's `cameras.txt`. Raises SceneError without intrinsics."""
+    """The text of COLMAP's `cameras.txt`: PINHOLE, OPENCV, FULL_OPENCV if k3 is not 0, or OPENCV_FISHEYE.
+
+    Raises SceneError without intrinsics.
+    """
     if sensor.intrinsics is None:
         raise SceneError("a COLMAP model needs intrinsics; give --intrinsics or --fov")
     k = sensor.intrinsics
-    camera = f"1 PINHOLE {sensor.width} {sensor.height} {k.fx!r} {k.fy!r} {k.cx!r} {k.cy!r}\n"
-    return "# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY\n" + camera
+    model, coefficients = _colmap_lens(k.distortion)
+    numbers = [sensor.width, sensor.height, k.fx, k.fy, k.cx, k.cy, *coefficients.values()]
+    names = " ".join(["# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY", *(name.upper() for name in coefficients)])
+    return f"{names}\n1 {model} {' '.join(map(repr, numbers))}\n"
+
+
+def _colmap_lens(lens: Distortion | None) -> tuple[str, dict[str, float]]:
+    """COLMAP's name of a camera model, and its coefficients after the focal lengths and the centre."""
+    if lens is None:
+        return "PINHOLE", {}
+    named = lens.named()
+    if lens.model is LensModel.FISHEYE:
+        return "OPENCV_FISHEYE", named
+    k3 = named.pop("k3")
+    if k3 == 0:
+        return "OPENCV", named
+    return "FULL_OPENCV", named | {"k3": k3, "k4": 0.0, "k5": 0.0, "k6": 0.0}
 
 
 def nerfstudio_lines(parts: Iterable[Trajectory], sensor: Sensor) -> Iterator[str]:
@@ -166,8 +185,10 @@ def nerfstudio_lines(parts: Iterable[Trajectory], sensor: Sensor) -> Iterator[st
     if sensor.intrinsics is None:
         raise SceneError("nerfstudio's transforms.json needs intrinsics; give --intrinsics or --fov")
     k = sensor.intrinsics
-    camera = {"camera_model": "OPENCV", "w": sensor.width, "h": sensor.height}
-    yield json.dumps({**camera, "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy})[:-1] + ', "frames": ['
+    fisheye = k.distortion is not None and k.distortion.model is LensModel.FISHEYE
+    camera = {"camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV", "w": sensor.width, "h": sensor.height}
+    lens = {} if k.distortion is None else k.distortion.named()
+    yield json.dumps({**camera, "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, **lens})[:-1] + ', "frames": ['
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     begin = "\n"
     for part in parts:

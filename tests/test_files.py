@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from spiked.distortion import Distortion, LensModel
 from spiked.errors import SceneError
 from spiked.pose import exp_so3
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
-from spiked.trajectory import Trajectory
+from spiked.trajectory import Trajectory, colmap_camera
 
 
 @pytest.fixture
@@ -46,6 +47,38 @@ def test_kitti_and_nerfstudio_hold_every_pose(path: Trajectory) -> None:
     frames = json.loads(path.nerfstudio(sensor))["frames"]
     first = np.array(frames[0]["transform_matrix"])
     np.testing.assert_allclose(first[:3, 2], -path.rotations[0][:, 2])  # OpenGL looks along -z
+
+
+@pytest.mark.parametrize(
+    ("lens", "colmap", "nerfstudio"),
+    [
+        (None, "PINHOLE 400 250 300.0 310.0 200.0 125.0", {"camera_model": "OPENCV"}),
+        (
+            Distortion(LensModel.OPENCV, (-0.3, 0.1, 0.01, 0.02)),
+            "OPENCV 400 250 300.0 310.0 200.0 125.0 -0.3 0.1 0.01 0.02",
+            {"camera_model": "OPENCV", "k1": -0.3, "k2": 0.1, "p1": 0.01, "p2": 0.02, "k3": 0.0},
+        ),
+        (
+            Distortion(LensModel.OPENCV, (-0.3, 0.1, 0.01, 0.02, 0.05)),
+            "FULL_OPENCV 400 250 300.0 310.0 200.0 125.0 -0.3 0.1 0.01 0.02 0.05 0.0 0.0 0.0",
+            {"camera_model": "OPENCV", "k1": -0.3, "k2": 0.1, "p1": 0.01, "p2": 0.02, "k3": 0.05},
+        ),
+        (
+            Distortion(LensModel.FISHEYE, (0.1, 0.02, 0.03, 0.04)),
+            "OPENCV_FISHEYE 400 250 300.0 310.0 200.0 125.0 0.1 0.02 0.03 0.04",
+            {"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k2": 0.02, "k3": 0.03, "k4": 0.04},
+        ),
+    ],
+)
+def test_cameras_are_exported_with_their_lens(
+    path: Trajectory, lens: Distortion | None, colmap: str, nerfstudio: dict[str, object]
+) -> None:
+    sensor = Sensor(400, 250, 20000, intrinsics=Intrinsics(300.0, 310.0, 200.0, 125.0, lens))
+    names, camera = colmap_camera(sensor).splitlines()
+    assert camera == f"1 {colmap}"
+    assert len(names.split()) == len(camera.split()) + 1  # and the hash
+    said = json.loads(path.nerfstudio(sensor))
+    assert nerfstudio.items() <= said.items() and ("k1" in said) == (lens is not None)
 
 
 def test_nerfstudio_without_intrinsics_says_what_to_give(path: Trajectory) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 
@@ -138,6 +138,21 @@ class DiskOut(BaseModel):
     recording_of: Annotated[str, Field(description="That camera.")]
 
 
+class FisheyeLens(BaseModel):
+    """
+    Distortion by OpenCV's fisheye model.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    model: Literal["fisheye"] = "fisheye"
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+
+
 class FrameRangeOut(BaseModel):
     """
     Frames `first` to `first + count - 1`, by absolute index.
@@ -197,34 +212,6 @@ class ImageFormat(StrEnum):
     exr = "exr"
 
 
-class IntrinsicsModel(BaseModel):
-    """
-    A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5).
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-
-class IntrinsicsOption(BaseModel):
-    """
-    A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5).
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-
 class JobState(StrEnum):
     """
     State of a reconstruction.
@@ -244,28 +231,6 @@ class Layout(StrEnum):
 
     compact = "compact"
     row_tagged = "row_tagged"
-
-
-class LocaliseRequest(BaseModel):
-    """
-    A recording to look for in the map of the reconstruction of the path.
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    capture_id: str
-    first_frame: Annotated[int, Field(description="First frame to use, absolute index.")] = 0
-    frames: Annotated[
-        int | None,
-        Field(description="Number of frames to use; 1,000 suffice. Default: all."),
-    ] = None
-    intrinsics: Annotated[
-        IntrinsicsModel | None,
-        Field(description="Lens of the recording, if it does not state it. Default: that of the map."),
-    ] = None
-    threads: Annotated[int | None, Field(description="All cores if not given.")] = None
-    priority: Annotated[int, Field(description="Higher ones run earlier; live captures go before all.")] = 0
 
 
 class LocalisedViewOut(BaseModel):
@@ -325,6 +290,22 @@ class Mosaic(StrEnum):
     BGGR = "BGGR"
     GRBG = "GRBG"
     GBRG = "GBRG"
+
+
+class OpencvLens(BaseModel):
+    """
+    Distortion by OpenCV's polynomial: radial k1, k2, k3 and tangential p1, p2.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    model: Literal["opencv"] = "opencv"
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
 
 
 class Origin(StrEnum):
@@ -401,7 +382,7 @@ class PictureKind(StrEnum):
 
 class Pinhole(BaseModel):
     """
-    A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5).
+    A pinhole camera behind a lens; pixels, the centre of the first pixel is (0.5, 0.5).
     """
 
     model_config = ConfigDict(
@@ -411,6 +392,10 @@ class Pinhole(BaseModel):
     fy: float
     cx: float
     cy: float
+    distortion: Annotated[
+        OpencvLens | FisheyeLens | None,
+        Field(description="Of the lens, as OpenCV has it; null: none."),
+    ] = None
 
 
 class Policy(StrEnum):
@@ -439,53 +424,6 @@ class Problem(BaseModel):
     what_to_do: Annotated[str | None, Field(description="How to correct it, if known.")]
 
 
-class ProfileModel(BaseModel):
-    """
-    What is known of one camera; options of a source or request win over it.
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    rate: Annotated[float | None, Field(description="Frames per second.")] = None
-    mosaic: Annotated[
-        Mosaic | None,
-        Field(description="Colour mosaic of the upright image; none: a grey sensor."),
-    ] = None
-    flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
-    fov: Annotated[
-        float | None,
-        Field(
-            description="Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated."
-        ),
-    ] = None
-    intrinsics: IntrinsicsModel | None = None
-    model: Annotated[str, Field(description="Name of the product.")] = ""
-    serial: Annotated[
-        str | None,
-        Field(description="Serial number of the camera that the profile is of; null: of any."),
-    ] = None
-    width: Annotated[int | None, Field(description="Pixels in a row.")] = None
-    height: Annotated[int | None, Field(description="Rows.")] = None
-    calibration: Annotated[
-        str | None,
-        Field(description="File of gains, dark rates and dead pixels, relative to the profile."),
-    ] = None
-    note: str = ""
-
-
-class ProfileOut(BaseModel):
-    """
-    The profile of a device.
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    file: Annotated[str, Field(description="Its file in the folder `profiles` of the data folder.")]
-    profile: ProfileModel
-
-
 class RateHistogram(BaseModel):
     """
     How many pixels fire how often.
@@ -496,55 +434,6 @@ class RateHistogram(BaseModel):
     )
     edges: Annotated[list[float], Field(description="Spikes a frame; one more than counts.")]
     counts: list[int]
-
-
-class ReconstructionOptions(BaseModel):
-    """
-    A reconstruction's options; the defaults suit a hand-held camera.
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    steps: Annotated[int, Field(description="Gradient steps of the refinement after the last frame.")] = 2000
-    seed: Annotated[int, Field(description="Same input, options and seed: same result.")] = 0
-    window_frames: Annotated[
-        int | None,
-        Field(description="Frames of a view; follows the motion (4 to 64) if not given."),
-    ] = None
-    threads: Annotated[
-        int | None,
-        Field(description="Threads of the rasteriser; all cores if not given."),
-    ] = None
-    max_views: Annotated[int, Field(description="Views kept for mapping; beyond it older ones thin out.")] = 400
-    memory_mb: Annotated[
-        int,
-        Field(description="MiB of images held in memory; the others are built anew from the recording."),
-    ] = 512
-    refine_poses: Annotated[bool, Field(description="Whether the map corrects the trajectory.")] = True
-    intrinsics: Annotated[
-        IntrinsicsOption | None,
-        Field(description="Optics, where neither the capture nor its recording says them, or to overrule them."),
-    ] = None
-
-
-class ReconstructionRequest(BaseModel):
-    """
-    A recording to reconstruct.
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    capture_id: str
-    options: ReconstructionOptions | None = None
-    priority: Annotated[int, Field(description="Higher ones run earlier; live captures go before all.")] = 0
-    map: Annotated[
-        str | None,
-        Field(
-            description="A finished reconstruction of the same place: its map is extended by the recording, and the result is in its frame of reference."
-        ),
-    ] = None
 
 
 class RecordingOut(BaseModel):
@@ -584,17 +473,6 @@ class ReloadedOut(BaseModel):
     ]
 
 
-class RestartRequest(BaseModel):
-    """
-    Begin a reconstruction anew, with other options if they are given.
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    options: ReconstructionOptions | None = None
-
-
 class SceneFormat(StrEnum):
     """
     How a scene is written.
@@ -612,24 +490,6 @@ class Scope(StrEnum):
     read = "read"
     operate = "operate"
     admin = "admin"
-
-
-class SensorOut(BaseModel):
-    """
-    The camera of a capture.
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    width: int
-    height: int
-    frame_rate_hz: float
-    intrinsics: IntrinsicsModel | None
-    mosaic: Annotated[
-        Mosaic | None,
-        Field(description="Colour pattern of the upright image; null for a grey camera."),
-    ]
 
 
 class SettingOrigin(StrEnum):
@@ -742,37 +602,6 @@ class State(StrEnum):
     degraded = "degraded"
     lost = "lost"
     reloc = "reloc"
-
-
-class StatedCameraModel(BaseModel):
-    """
-    What is stated of a camera; it wins over the options of the source, its profile and its sidecar.
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    calibration: Annotated[
-        str | None,
-        Field(description="File of gains, dark rates and dead pixels, from `spiked calibrate`."),
-    ] = None
-    profile: Annotated[
-        str | None,
-        Field(description="Camera profile, a JSON file; options that are stated win over it."),
-    ] = None
-    rate: Annotated[float | None, Field(description="Frames per second.")] = None
-    mosaic: Annotated[
-        Mosaic | None,
-        Field(description="Colour mosaic of the upright image; none: a grey sensor."),
-    ] = None
-    flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
-    fov: Annotated[
-        float | None,
-        Field(
-            description="Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated."
-        ),
-    ] = None
-    intrinsics: IntrinsicsModel | None = None
 
 
 class StatsOut(BaseModel):
@@ -997,40 +826,6 @@ class VersionsOut(BaseModel):
     items: list[VersionOut]
 
 
-class ViewRequest(BaseModel):
-    """
-    One camera gives a picture; several, or a path, give a ZIP of pictures.
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    camera: CameraModel | None = None
-    cameras: list[CameraModel] | None = None
-    path: PathModel | None = None
-    width: Annotated[int | None, Field(description="Pixels; the sensor's own if not given.")] = None
-    height: int | None = None
-    intrinsics: Annotated[
-        IntrinsicsModel | None,
-        Field(
-            description="Optics of the pictures; if not given the capture's own, scaled to the width, the height taken from or added to the middle."
-        ),
-    ] = None
-    background: list[float] | None = None
-    output: Annotated[
-        Output,
-        Field(
-            description="color; depth along the camera's axis in the scene's unit of length, 0 where nothing is; alpha, 0 to 1."
-        ),
-    ] = Output.color
-    white: Annotated[
-        float | None,
-        Field(
-            description="Value shown as white in all formats but EXR. If not given: for color the scene's own, for alpha 1, for depth the largest of the picture. The header X-White says what was used."
-        ),
-    ] = None
-
-
 class ZmqOut(BaseModel):
     """
     Addresses of the ZeroMQ sockets, on this machine.
@@ -1045,48 +840,6 @@ class ZmqOut(BaseModel):
         Field(description="REP: the newest message of each kind, or those after a number."),
     ]
     previews: Annotated[str, Field(description="PUB: pictures.")]
-
-
-class CaptureRequest(BaseModel):
-    """
-    A capture to start.
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    source: Annotated[
-        str | None,
-        Field(
-            description="usb0, pcie:PATH, sim: or replay:FILE, with options after a question mark. A file or simulation without `pace` waits for its readers."
-        ),
-    ] = None
-    device: Annotated[
-        str | None,
-        Field(description="Id of a device, instead of a source; `GET devices`."),
-    ] = None
-    frames: Annotated[
-        int | None,
-        Field(description="Length; until the source ends or is stopped if not given."),
-    ] = None
-    seconds: Annotated[
-        float | None,
-        Field(description="Length in seconds of the camera, instead of frames."),
-    ] = None
-    pretrigger_s: Annotated[float, Field(description="Begin so much earlier, from an armed device's ring.")] = 0.0
-    name: str = ""
-    notes: str = ""
-    record: Annotated[bool, Field(description="Keep the frames in the data folder.")] = True
-    reconstruct: Annotated[bool, Field(description="Reconstruct while it runs.")] = True
-    options: ReconstructionOptions | None = None
-    camera: Annotated[
-        StatedCameraModel | None,
-        Field(description="The same as options of the source's text."),
-    ] = None
-    intrinsics: Annotated[
-        IntrinsicsModel | None,
-        Field(description="If the source does not know its own."),
-    ] = None
 
 
 class ConsumerOut(BaseModel):
@@ -1208,40 +961,6 @@ class FindingOut(BaseModel):
     finding: str
 
 
-class GeometryModel(BaseModel):
-    """
-    What the recording holds, where there is no sidecar.
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    rate: Annotated[float | None, Field(description="Frames per second.")] = None
-    mosaic: Annotated[
-        Mosaic | None,
-        Field(description="Colour mosaic of the upright image; none: a grey sensor."),
-    ] = None
-    flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
-    fov: Annotated[
-        float | None,
-        Field(
-            description="Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated."
-        ),
-    ] = None
-    intrinsics: IntrinsicsModel | None = None
-    width: Annotated[int | None, Field(description="Pixels in a row, a multiple of 8.")] = None
-    height: Annotated[int | None, Field(description="Rows.")] = None
-    layout: Annotated[
-        Layout | None,
-        Field(description="How a frame is stored: rows only, or each row followed by its number."),
-    ] = None
-    bit_order: Annotated[
-        BitOrder | None,
-        Field(description="Which bit of a byte is the leftmost of its eight pixels."),
-    ] = None
-    frame_rate_hz: Annotated[float | None, Field(deprecated=True, description="Deprecated: use rate.")] = None
-
-
 class HealthOut(BaseModel):
     """
     Health of the service.
@@ -1252,6 +971,42 @@ class HealthOut(BaseModel):
     )
     status: Annotated[Verdict, Field(description="The worst of the checks.")]
     checks: list[FindingOut]
+
+
+class IntrinsicsModel(BaseModel):
+    """
+    A pinhole camera behind a lens; pixels, the centre of the first pixel is (0.5, 0.5).
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: Annotated[
+        OpencvLens | FisheyeLens | None,
+        Field(description="Of the lens, as OpenCV has it; null: none."),
+    ] = None
+
+
+class IntrinsicsOption(BaseModel):
+    """
+    A pinhole camera behind a lens; pixels, the centre of the first pixel is (0.5, 0.5).
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: Annotated[
+        OpencvLens | FisheyeLens | None,
+        Field(description="Of the lens, as OpenCV has it; null: none."),
+    ] = None
 
 
 class LocalisationOut(BaseModel):
@@ -1272,6 +1027,105 @@ class LocalisationOut(BaseModel):
         list[LocalisedViewOut],
         Field(description="In order of time; empty if the place was not recognised."),
     ]
+
+
+class LocaliseRequest(BaseModel):
+    """
+    A recording to look for in the map of the reconstruction of the path.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    capture_id: str
+    first_frame: Annotated[int, Field(description="First frame to use, absolute index.")] = 0
+    frames: Annotated[
+        int | None,
+        Field(description="Number of frames to use; 1,000 suffice. Default: all."),
+    ] = None
+    intrinsics: Annotated[
+        IntrinsicsModel | None,
+        Field(description="Lens of the recording, if it does not state it. Default: that of the map."),
+    ] = None
+    threads: Annotated[int | None, Field(description="All cores if not given.")] = None
+    priority: Annotated[int, Field(description="Higher ones run earlier; live captures go before all.")] = 0
+
+
+class ProfileModel(BaseModel):
+    """
+    What is known of one camera; options of a source or request win over it.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    rate: Annotated[float | None, Field(description="Frames per second.")] = None
+    mosaic: Annotated[
+        Mosaic | None,
+        Field(description="Colour mosaic of the upright image; none: a grey sensor."),
+    ] = None
+    flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
+    fov: Annotated[
+        float | None,
+        Field(
+            description="Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated."
+        ),
+    ] = None
+    intrinsics: IntrinsicsModel | None = None
+    model: Annotated[str, Field(description="Name of the product.")] = ""
+    serial: Annotated[
+        str | None,
+        Field(description="Serial number of the camera that the profile is of; null: of any."),
+    ] = None
+    width: Annotated[int | None, Field(description="Pixels in a row.")] = None
+    height: Annotated[int | None, Field(description="Rows.")] = None
+    calibration: Annotated[
+        str | None,
+        Field(description="File of gains, dark rates and dead pixels, relative to the profile."),
+    ] = None
+    note: str = ""
+
+
+class ProfileOut(BaseModel):
+    """
+    The profile of a device.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    file: Annotated[str, Field(description="Its file in the folder `profiles` of the data folder.")]
+    profile: ProfileModel
+
+
+class ReconstructionOptions(BaseModel):
+    """
+    A reconstruction's options; the defaults suit a hand-held camera.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    steps: Annotated[int, Field(description="Gradient steps of the refinement after the last frame.")] = 2000
+    seed: Annotated[int, Field(description="Same input, options and seed: same result.")] = 0
+    window_frames: Annotated[
+        int | None,
+        Field(description="Frames of a view; follows the motion (4 to 64) if not given."),
+    ] = None
+    threads: Annotated[
+        int | None,
+        Field(description="Threads of the rasteriser; all cores if not given."),
+    ] = None
+    max_views: Annotated[int, Field(description="Views kept for mapping; beyond it older ones thin out.")] = 400
+    memory_mb: Annotated[
+        int,
+        Field(description="MiB of images held in memory; the others are built anew from the recording."),
+    ] = 512
+    refine_poses: Annotated[bool, Field(description="Whether the map corrects the trajectory.")] = True
+    intrinsics: Annotated[
+        IntrinsicsOption | None,
+        Field(description="Optics, where neither the capture nor its recording says them, or to overrule them."),
+    ] = None
 
 
 class ReconstructionOut(BaseModel):
@@ -1357,6 +1211,25 @@ class ReconstructionPage(BaseModel):
     ]
 
 
+class ReconstructionRequest(BaseModel):
+    """
+    A recording to reconstruct.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    capture_id: str
+    options: ReconstructionOptions | None = None
+    priority: Annotated[int, Field(description="Higher ones run earlier; live captures go before all.")] = 0
+    map: Annotated[
+        str | None,
+        Field(
+            description="A finished reconstruction of the same place: its map is extended by the recording, and the result is in its frame of reference."
+        ),
+    ] = None
+
+
 class RegistrationOut(BaseModel):
     """
     How two maps, or a map and a recording, were brought together.
@@ -1404,6 +1277,66 @@ class RegistrationOut(BaseModel):
     ]
 
 
+class RestartRequest(BaseModel):
+    """
+    Begin a reconstruction anew, with other options if they are given.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    options: ReconstructionOptions | None = None
+
+
+class SensorOut(BaseModel):
+    """
+    The camera of a capture.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    width: int
+    height: int
+    frame_rate_hz: float
+    intrinsics: IntrinsicsModel | None
+    mosaic: Annotated[
+        Mosaic | None,
+        Field(description="Colour pattern of the upright image; null for a grey camera."),
+    ]
+
+
+class StatedCameraModel(BaseModel):
+    """
+    What is stated of a camera; it wins over the options of the source, its profile and its sidecar.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    calibration: Annotated[
+        str | None,
+        Field(description="File of gains, dark rates and dead pixels, from `spiked calibrate`."),
+    ] = None
+    profile: Annotated[
+        str | None,
+        Field(description="Camera profile, a JSON file; options that are stated win over it."),
+    ] = None
+    rate: Annotated[float | None, Field(description="Frames per second.")] = None
+    mosaic: Annotated[
+        Mosaic | None,
+        Field(description="Colour mosaic of the upright image; none: a grey sensor."),
+    ] = None
+    flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
+    fov: Annotated[
+        float | None,
+        Field(
+            description="Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated."
+        ),
+    ] = None
+    intrinsics: IntrinsicsModel | None = None
+
+
 class SystemOut(BaseModel):
     """
     The running service.
@@ -1434,20 +1367,42 @@ class SystemOut(BaseModel):
     ]
 
 
-class UploadRequest(BaseModel):
+class ViewRequest(BaseModel):
     """
-    A recording that is about to come.
+    One camera gives a picture; several, or a path, give a ZIP of pictures.
     """
 
     model_config = ConfigDict(
         extra="ignore",
     )
-    name: Annotated[str, Field(description="What the capture will be called.")]
-    notes: str = ""
-    bytes: Annotated[int, Field(description="Size of the whole `.dat`.")]
-    sidecar: UploadSidecar | None = None
-    geometry: Annotated[GeometryModel | None, Field(description="Wins over the sidecar.")] = None
-    sha256: Annotated[str | None, Field(description="Of the whole file, in hex; checked at the end.")] = None
+    camera: CameraModel | None = None
+    cameras: list[CameraModel] | None = None
+    path: PathModel | None = None
+    width: Annotated[int | None, Field(description="Pixels; the sensor's own if not given.")] = None
+    height: int | None = None
+    intrinsics: Annotated[
+        IntrinsicsModel | None,
+        Field(
+            description="Optics of the pictures; if not given the capture's own, scaled to the width, the height taken from or added to the middle."
+        ),
+    ] = None
+    undistorted: Annotated[
+        bool,
+        Field(description="Without the distortion of the lens that these optics have."),
+    ] = False
+    background: list[float] | None = None
+    output: Annotated[
+        Output,
+        Field(
+            description="color; depth along the camera's axis in the scene's unit of length, 0 where nothing is; alpha, 0 to 1."
+        ),
+    ] = Output.color
+    white: Annotated[
+        float | None,
+        Field(
+            description="Value shown as white in all formats but EXR. If not given: for color the scene's own, for alpha 1, for depth the largest of the picture. The header X-White says what was used."
+        ),
+    ] = None
 
 
 class CaptureOut(BaseModel):
@@ -1502,3 +1457,95 @@ class CapturePage(BaseModel):
         str | None,
         Field(description="To be given as `cursor` for those that follow; null: there are no more."),
     ]
+
+
+class CaptureRequest(BaseModel):
+    """
+    A capture to start.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    source: Annotated[
+        str | None,
+        Field(
+            description="usb0, pcie:PATH, sim: or replay:FILE, with options after a question mark. A file or simulation without `pace` waits for its readers."
+        ),
+    ] = None
+    device: Annotated[
+        str | None,
+        Field(description="Id of a device, instead of a source; `GET devices`."),
+    ] = None
+    frames: Annotated[
+        int | None,
+        Field(description="Length; until the source ends or is stopped if not given."),
+    ] = None
+    seconds: Annotated[
+        float | None,
+        Field(description="Length in seconds of the camera, instead of frames."),
+    ] = None
+    pretrigger_s: Annotated[float, Field(description="Begin so much earlier, from an armed device's ring.")] = 0.0
+    name: str = ""
+    notes: str = ""
+    record: Annotated[bool, Field(description="Keep the frames in the data folder.")] = True
+    reconstruct: Annotated[bool, Field(description="Reconstruct while it runs.")] = True
+    options: ReconstructionOptions | None = None
+    camera: Annotated[
+        StatedCameraModel | None,
+        Field(description="The same as options of the source's text."),
+    ] = None
+    intrinsics: Annotated[
+        IntrinsicsModel | None,
+        Field(description="If the source does not know its own."),
+    ] = None
+
+
+class GeometryModel(BaseModel):
+    """
+    What the recording holds, where there is no sidecar.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    rate: Annotated[float | None, Field(description="Frames per second.")] = None
+    mosaic: Annotated[
+        Mosaic | None,
+        Field(description="Colour mosaic of the upright image; none: a grey sensor."),
+    ] = None
+    flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
+    fov: Annotated[
+        float | None,
+        Field(
+            description="Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated."
+        ),
+    ] = None
+    intrinsics: IntrinsicsModel | None = None
+    width: Annotated[int | None, Field(description="Pixels in a row, a multiple of 8.")] = None
+    height: Annotated[int | None, Field(description="Rows.")] = None
+    layout: Annotated[
+        Layout | None,
+        Field(description="How a frame is stored: rows only, or each row followed by its number."),
+    ] = None
+    bit_order: Annotated[
+        BitOrder | None,
+        Field(description="Which bit of a byte is the leftmost of its eight pixels."),
+    ] = None
+    frame_rate_hz: Annotated[float | None, Field(deprecated=True, description="Deprecated: use rate.")] = None
+
+
+class UploadRequest(BaseModel):
+    """
+    A recording that is about to come.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    name: Annotated[str, Field(description="What the capture will be called.")]
+    notes: str = ""
+    bytes: Annotated[int, Field(description="Size of the whole `.dat`.")]
+    sidecar: UploadSidecar | None = None
+    geometry: Annotated[GeometryModel | None, Field(description="Wins over the sidecar.")] = None
+    sha256: Annotated[str | None, Field(description="Of the whole file, in hex; checked at the end.")] = None

@@ -46,7 +46,8 @@ _SHARED = "odometry", "views", "_windows"
 _PACKAGES = ("recon", "render", "native")
 """Packages whose code decides whether a state fits, with the modules of `spiked` itself."""
 _MODULES = tuple(
-    f"spiked.{name}" for name in ("recon.", "render.", "calibration", "pose", "scene", "sensor", "spline", "trajectory")
+    f"spiked.{name}"
+    for name in ("recon.", "render.", "calibration", "distortion", "pose", "scene", "sensor", "spline", "trajectory")
 )
 """Beginnings of the names of modules whose classes a state may contain."""
 _ALLOWED = {

@@ -210,9 +210,11 @@ def closures_section(closures: list[tuple[float, float]]) -> list[dict[str, floa
 def focal_section(mapper: Mapper, focal: Focal | None) -> dict[str, object]:
     """The focal length in use; `focal` where it was estimated."""
     sigma = None if focal is None or not np.isfinite(focal.relative_sigma) else focal.relative_sigma
+    lens = mapper.camera.intrinsics.distortion
     return {
         "focal_px": [mapper.camera.intrinsics.fx, mapper.camera.intrinsics.fy],
         "principal_point_px": [mapper.camera.intrinsics.cx, mapper.camera.intrinsics.cy],
+        **({} if lens is None else {"distortion": {"model": str(lens.model), **lens.named()}}),
         "focal_estimated": focal is not None,
         "focal_relative_sigma": sigma,
     }

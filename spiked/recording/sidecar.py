@@ -3,6 +3,7 @@
 import os
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, Stri
 
 from spiked.camera import Pinhole
 from spiked.errors import ConfigurationError, RecordingError
-from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
+from spiked.sensor import BitOrder, Layout, Mosaic, Sensor
 
 RESERVED_BYTES = 256 << 10
 """Disk space reserved for the final sidecar: enough for some thousand gaps."""
@@ -106,7 +107,7 @@ class Sidecar(BaseModel):
             self.bit_order,
             self.flipped,
             self.cfa,
-            None if k is None else Intrinsics(k.fx, k.fy, k.cx + shift, k.cy + shift),
+            None if k is None else replace(k.intrinsics(), cx=k.cx + shift, cy=k.cy + shift),
         )
 
 

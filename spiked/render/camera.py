@@ -1,4 +1,4 @@
-"""The camera that the renderers see: pinhole intrinsics and an image size."""
+"""The camera that the renderers see: intrinsics, distortion included, and an image size."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ MAX_SIDE = 4096
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera without distortion."""
+    """A camera; `intrinsics.pinhole` renders undistorted images."""
 
     intrinsics: Intrinsics
     width: int

@@ -100,8 +100,11 @@ def choice_for(wanted: str) -> Choice:
 
 
 def rasteriser_for(camera: Camera, threads: int | None = None) -> AnyRasteriser:
-    """A rasteriser of the kind that is `chosen`; threads are the CPU's. Raises ConfigurationError as that does."""
-    if chosen().renderer == "cpu":
+    """A rasteriser of the kind that is `chosen`; threads are the CPU's. Raises ConfigurationError as that does.
+
+    Images with distortion are rendered by the CPU.
+    """
+    if chosen().renderer == "cpu" or camera.intrinsics.distortion is not None:
         return Rasteriser(camera, threads)
     from spiked.render import cuda
 

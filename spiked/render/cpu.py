@@ -27,7 +27,8 @@ class Rasteriser:
     The image is the weighted sum over sub-poses of alpha-composited elliptical Gaussians (EWA splatting as in 3DGS,
     with gsplat's constants): pixel centres at +0.5, 0.3 px^2 added to the projected covariance, alpha at most 0.99,
     nothing below 1/255, the Jacobian taken at x/z and y/z clamped to 1.3 times the half field of view. A block of 4x4
-    pixels is finished when none of them lets 1e-4 of the light through. The number of threads changes no bit.
+    pixels is finished when none of them lets 1e-4 of the light through. Through a lens with distortion, means and
+    Jacobian are those of the bent image. The number of threads changes no bit.
 
     One object serves one thread at a time, and does not survive a fork. SPIKED_SIMD (avx512, avx2, baseline) forces an
     instruction set, for tests and comparisons.
@@ -52,6 +53,7 @@ class Rasteriser:
                 height=camera.height,
                 near=near,
                 threads=threads,
+                **k.lens(),
             )
         except ValueError as error:
             raise ConfigurationError(str(error)) from error

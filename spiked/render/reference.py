@@ -14,6 +14,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from spiked.distortion import Distortion, LensModel
 from spiked.render.camera import Camera
 from spiked.scene import Scene
 
@@ -167,14 +168,56 @@ def _project(parameters: Parameters, camera: Camera, pose: tuple[Tensor, Tensor]
     rotation, centre = pose
     k = camera.intrinsics
     x, y, z = ((parameters.means - centre) @ rotation).unbind(1)
-    limit_x = SLOPE_LIMIT * 0.5 * camera.width / k.fx
-    limit_y = SLOPE_LIMIT * 0.5 * camera.height / k.fy
+    limit_x, limit_y, reach = _limits(camera)
     zero = torch.zeros_like(z)
     slope_x = (x / z).clamp(-limit_x, limit_x)
     slope_y = (y / z).clamp(-limit_y, limit_y)
     jacobian = torch.stack([k.fx / z, zero, -k.fx * slope_x / z, zero, k.fy / z, -k.fy * slope_y / z], 1).view(-1, 2, 3)
     spread = _rotations(parameters.quats) * torch.exp(parameters.log_scales)[:, None, :]
-    return _Projection(torch.stack([k.fx * x / z + k.cx, k.fy * y / z + k.cy], 1), jacobian @ rotation.T @ spread, z)
+    seen_x, seen_y = x / z, y / z
+    if k.distortion is not None:
+        z = torch.where(seen_x**2 + seen_y**2 <= reach**2, z, zero)  # beyond its reach a lens would fold the image
+        seen_x, seen_y, bend = _bent(k.distortion, seen_x, seen_y)
+        focal = torch.tensor([k.fx, k.fy], dtype=torch.float64)
+        jacobian = (focal[:, None] * bend / focal) @ jacobian
+    centres = torch.stack([k.fx * seen_x + k.cx, k.fy * seen_y + k.cy], 1)
+    return _Projection(centres, jacobian @ rotation.T @ spread, z)
+
+
+def _limits(camera: Camera) -> tuple[float, float, float]:
+    """Largest |x/z| and |y/z| at which the Jacobian is taken, and through a lens the largest slope that is drawn."""
+    k, width, height = camera.intrinsics, camera.width, camera.height
+    if k.distortion is None:
+        return SLOPE_LIMIT * 0.5 * width / k.fx, SLOPE_LIMIT * 0.5 * height / k.fy, np.inf
+    border = [(x, y) for x in range(width) for y in (0, height)] + [(x, y) for y in range(height) for x in (0, width)]
+    slopes = k.unproject(np.array(border, np.float64))[:, :2]
+    across, down = SLOPE_LIMIT * np.abs(slopes).max(0)
+    farthest = SLOPE_LIMIT * np.linalg.norm(slopes, axis=1).max()
+    return float(across), float(down), min(k.distortion.reach, float(farthest))
+
+
+def _bent(lens: Distortion, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Slopes [N] and [N] bent by a lens, and their derivative [N, 2, 2] by the slopes."""
+    square = x * x + y * y
+    p1 = p2 = 0.0
+    if lens.model is LensModel.OPENCV:
+        k1, k2, p1, p2, k3 = lens.coefficients
+        scale = 1 + square * (k1 + square * (k2 + square * k3))
+        growth = k1 + square * (2 * k2 + 3 * square * k3)
+    else:
+        r = torch.sqrt(square)
+        angle = torch.atan(r)
+        t = angle**2
+        k = lens.coefficients
+        scale = angle * (1 + t * (k[0] + t * (k[1] + t * (k[2] + t * k[3])))) / r
+        by_angle = 1 + t * (3 * k[0] + t * (5 * k[1] + t * (7 * k[2] + t * 9 * k[3])))
+        growth = (by_angle / (1 + square) - scale) / (2 * square)
+    mixed = 2 * x * y * growth + 2 * p1 * x + 2 * p2 * y
+    xx = scale + 2 * x * x * growth + 2 * p1 * y + 6 * p2 * x
+    yy = scale + 2 * y * y * growth + 6 * p1 * y + 2 * p2 * x
+    seen_x = x * scale + 2 * p1 * x * y + p2 * (square + 2 * x * x)
+    seen_y = y * scale + p1 * (square + 2 * y * y) + 2 * p2 * x * y
+    return seen_x, seen_y, torch.stack([xx, mixed, mixed, yy], 1).view(-1, 2, 2)
 
 
 def render_pose(

@@ -114,14 +114,17 @@ class SimulatedCamera:
         """Camera-to-world rotations [n, 3, 3] and centres [n, 3] at the middle of each frame [n]."""
         return self.motion.poses(np.atleast_1d(np.asarray(frames, np.float64)) + 0.5)
 
-    def view(self, rotation: Array, centre: Array) -> Image:
-        """Noise-free radiance in expected spikes a frame, without the dark: [H, W], on a mosaic sensor [H, W, 3]."""
-        intensity = self._radiance.intensity(self._radiance.view(rotation, centre))
+    def view(self, rotation: Array, centre: Array, undistorted: bool = False) -> Image:
+        """Noise-free radiance in expected spikes a frame, without the dark: [H, W], on a mosaic sensor [H, W, 3].
+
+        `undistorted`: as `intrinsics.pinhole` sees it.
+        """
+        intensity = self._radiance.intensity(self._radiance.view(rotation, centre, undistorted))
         return np.asarray(self.gain * intensity, np.float32)
 
-    def depth(self, rotation: Array, centre: Array) -> Image:
+    def depth(self, rotation: Array, centre: Array, undistorted: bool = False) -> Image:
         """The exact depth [H, W] of the same picture, in the scene's length unit."""
-        return self._radiance.view(rotation, centre).depth
+        return self._radiance.view(rotation, centre, undistorted).depth
 
     def interpolation_error(self, frames: int) -> InterpolationError | None:
         """Error of the interpolation over the first `frames` frames, measured; None if `step_px` is None."""

@@ -76,8 +76,9 @@ def simulate(
 
     The folder, which must be new or empty, then holds NAME.dat, its sidecar NAME.json, groundtruth.tum (a pose for the
     middle of each frame), and `views` held-out noise-free pictures in views/ with their poses in views.json, evenly
-    spread over time; every other one lies beside the path, drawn by `seed`. If the camera interpolates between exact
-    pictures, `simulation.interpolation` of the sidecar is the error of that, measured as in `InterpolationError`.
+    spread over time; every other one lies beside the path, drawn by `seed`. These pictures have no
+    distortion. If the camera interpolates between exact pictures, `simulation.interpolation` of the sidecar is the
+    error of that, measured as in `InterpolationError`.
     Memory does not grow with `frames`. `progress` is called with the number of frames written. Raises RecordingError
     if the folder cannot be written or holds something, and ConfigurationError for a sensor whose frames are not compact
     and LSB first.
@@ -127,7 +128,7 @@ def _write_views(camera: SimulatedCamera, folder: Path, frames: int, *, views: i
     rotations, centres = camera.truth(chosen)
     path = camera.truth(np.arange(0, frames, _COVERAGE_STRIDE))
     middle_rotations, middle_centres = camera.truth([frames // 2])
-    median_depth = float(np.median(_finite(camera.depth(middle_rotations[0], middle_centres[0]))))
+    median_depth = float(np.median(_finite(camera.depth(middle_rotations[0], middle_centres[0], undistorted=True))))
     entries = []
     for number, frame in enumerate(chosen):
         on_path = number % 2 == 0
@@ -136,7 +137,7 @@ def _write_views(camera: SimulatedCamera, folder: Path, frames: int, *, views: i
         if not on_path:
             pose[:3, 3] += 0.015 * median_depth * rng.standard_normal(3)
             pose[:3, :3] = pose[:3, :3] @ exp_so3(0.015 * rng.standard_normal(3))
-        intensity = camera.view(pose[:3, :3], pose[:3, 3]) / camera.gain
+        intensity = camera.view(pose[:3, :3], pose[:3, 3], undistorted=True) / camera.gain
         picture = np.round(np.clip(intensity, 0, 1) * 255).astype(np.uint8)
         file = f"views/{number:02d}.png"
         (folder / file).write_bytes(
@@ -173,10 +174,10 @@ def _coverage(camera: SimulatedCamera, pose: Array, path: tuple[Array, Array], n
     """
     rotations, centres = path
     sensor, k = camera.sensor, camera.intrinsics
-    depth = camera.depth(pose[:3, :3], pose[:3, 3])[::5, ::5].astype(np.float64)
+    depth = camera.depth(pose[:3, :3], pose[:3, 3], undistorted=True)[::5, ::5].astype(np.float64)
     y, x = (np.mgrid[0 : sensor.height : 5, 0 : sensor.width : 5] + 0.5).reshape(2, *depth.shape)
     seen = np.isfinite(depth)
-    rays = k.unproject(np.stack([x, y], -1))[seen]
+    rays = k.pinhole.unproject(np.stack([x, y], -1))[seen]
     points = pose[:3, 3] + (rays * depth[seen][:, None]) @ pose[:3, :3].T
     unseen, order = points, np.argsort(np.abs(np.arange(len(centres)) - nearest), kind="stable")
     while len(unseen) and len(order):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from spiked.errors import ConfigurationError
 from spiked.sensor import Image, Intrinsics, Sensor
+from spiked.simulate.lens import LensedScene
 from spiked.simulate.motion import Motion
 from spiked.simulate.view import LUMINANCE, View, ViewableScene
 
@@ -53,9 +54,14 @@ class PathRadiance:
             return None
         return mosaic.channels(self.sensor.height, self.sensor.width)[..., None].astype(np.int64)
 
-    def view(self, rotation: Array, centre: Array) -> View:
-        """The scene's picture at a camera-to-world pose."""
-        return self.scene.render(self.intrinsics, self.sensor.width, self.sensor.height, rotation, centre)
+    def view(self, rotation: Array, centre: Array, undistorted: bool = False) -> View:
+        """The scene's picture at a camera-to-world pose; `undistorted`: without the distortion of the lens."""
+        intrinsics = self.intrinsics.pinhole if undistorted else self.intrinsics
+        return self._lensed.render(intrinsics, self.sensor.width, self.sensor.height, rotation, centre)
+
+    @cached_property
+    def _lensed(self) -> LensedScene:
+        return LensedScene(self.scene)
 
     def intensity(self, view: View) -> Image:
         """Its grey [H, W], on a mosaic sensor its colours [H, W, 3]."""

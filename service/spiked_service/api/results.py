@@ -15,7 +15,7 @@ from spiked.errors import SceneError
 from spiked.poses import PoseFile
 from spiked.scene import Scene
 from spiked.scene_changes import SceneChanges
-from spiked.sensor import Intrinsics, Sensor
+from spiked.sensor import Sensor
 from spiked_service.api import files
 from spiked_service.api.problems import GoneError, NothingError, NotReadyError
 from spiked_service.api.trajectories import Range, TrajectoryFormat, open_poses, trajectory_response
@@ -168,8 +168,8 @@ class Results:
                 raise NothingError(f"reconstruction {row.id} is {row.state} and {some if row.version else none}")
             raise NotReadyError(f"reconstruction {row.id} has no version{named} yet; it is at stage {row.stage}")
         sensor = self._captures.get(row.capture_id).row.sensor
-        if sensor is not None and published.intrinsics is not None:
-            sensor = replace(sensor, intrinsics=Intrinsics(*published.intrinsics))
+        if sensor is not None and published.camera is not None:
+            sensor = replace(sensor, intrinsics=published.camera)
         return Result(folder, published, sensor, self._rows.timeline(row.id))
 
     def trajectory(

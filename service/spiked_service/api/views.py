@@ -7,6 +7,7 @@ import zipfile
 import numpy as np
 from fastapi import Response
 
+from spiked.camera import Pinhole
 from spiked.errors import ConfigurationError
 from spiked.pose import quaternion
 from spiked.poses import PoseFile
@@ -56,7 +57,9 @@ def views_response(result: Result, request: ViewRequest, kind: ImageFormat, rend
     ]
     content: dict[str, bytes | str] = {f"{i:03d}.{kind}": picture for i, (picture, _) in enumerate(pictures)}
     k = camera.intrinsics
-    about = {"intrinsics": {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}, "output": request.output, "views": listed}
+    shown_by = Pinhole.of(k)
+    optics = None if shown_by is None else shown_by.model_dump(mode="json")
+    about = {"intrinsics": optics, "output": request.output, "views": listed}
     content["views.json"] = json.dumps(about, indent=1)
     return Response(_zip(content), media_type="application/zip", headers=headers)
 
@@ -77,12 +80,17 @@ def _camera(sensor: Sensor | None, request: ViewRequest) -> Camera:
     width = request.width or (sensor.width if sensor else 0)
     height = request.height or (sensor.height if sensor else 0)
     if request.intrinsics is not None:
-        return Camera(request.intrinsics.intrinsics(), width, height)
+        return Camera(_lens(request.intrinsics.intrinsics(), request), width, height)
     if sensor is None or sensor.intrinsics is None:
         raise ConfigurationError("the optics of this capture are not known; give intrinsics")
     k, scale = sensor.intrinsics, width / sensor.width
     cy = scale * k.cy + (height - scale * sensor.height) / 2
-    return Camera(Intrinsics(scale * k.fx, scale * k.fy, scale * k.cx, cy), width, height)
+    own = Intrinsics(scale * k.fx, scale * k.fy, scale * k.cx, cy, k.distortion)
+    return Camera(_lens(own, request), width, height)
+
+
+def _lens(intrinsics: Intrinsics, request: ViewRequest) -> Intrinsics:
+    return intrinsics.pinhole if request.undistorted else intrinsics
 
 
 def _poses(result: Result, request: ViewRequest) -> list[Pose]:

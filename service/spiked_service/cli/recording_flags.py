@@ -7,9 +7,11 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from pydantic import BaseModel, ValidationError
 
 from spiked.calibration import Calibration
-from spiked.camera import CameraFiles, StoredCameraOptions
+from spiked.camera import CameraFiles, Pinhole, StoredCameraOptions
+from spiked.distortion import Distortion
 from spiked.errors import ConfigurationError
 from spiked.profile import CameraProfile
 from spiked.recording import Recording, RecordingGeometry, open_recording, recorded_calibration, sidecar_path
@@ -65,7 +67,25 @@ ColoursOrAuto = Annotated[
     ),
 ]
 Fov = Annotated[float | None, _flag("fov", "--fov", panel="Optics")]
-IntrinsicsText = Annotated[str | None, _flag("intrinsics", "--intrinsics", metavar="FX,FY,CX,CY", panel="Optics")]
+IntrinsicsText = Annotated[
+    str | None,
+    typer.Option(
+        "--intrinsics",
+        help="fx,fy,cx,cy in pixels, or the .json file of `spiked calibrate --board`.",
+        metavar="FX,FY,CX,CY",
+        rich_help_panel="Optics",
+    ),
+]
+DistortionText = Annotated[
+    str | None,
+    typer.Option(
+        "--distortion",
+        help="Distortion of the lens, as OpenCV has it: k1,k2,p1,p2,k3, or fisheye:k1,k2,k3,k4; those left out at the "
+        "end are 0. none: of a lens without.",
+        metavar="K1,K2,...",
+        rich_help_panel="Optics",
+    ),
+]
 
 
 @dataclass(frozen=True)
@@ -117,17 +137,33 @@ _FIELDS = {
 """Options of a camera, and the fields of `RecordingGeometry`."""
 
 
-def with_optics(sensor: Sensor, fov_deg: float | None, intrinsics: str | None) -> Sensor:
-    """The sensor with the optics given, or its own if none are. Raises ConfigurationError."""
+def with_optics(sensor: Sensor, fov_deg: float | None, intrinsics: str | None, distortion: str | None = None) -> Sensor:
+    """The sensor with the optics given, or its own if none are. Raises ConfigurationError.
+
+    A new focal length keeps the sensor's distortion: that is a function of angles.
+    """
     if fov_deg is not None and intrinsics is not None:
         raise ConfigurationError("--fov and --intrinsics both set the focal length; give one of them")
+    own = sensor.intrinsics
+    lens = None if own is None else own.distortion
+    if intrinsics is not None:
+        own = parse_intrinsics(intrinsics)
+        lens = own.distortion or lens
+    if distortion is not None:
+        lens = Distortion.parse(distortion)
     if fov_deg is not None:
-        return replace(sensor, intrinsics=Intrinsics.from_fov(sensor.width, sensor.height, fov_deg))
-    return sensor if intrinsics is None else replace(sensor, intrinsics=parse_intrinsics(intrinsics))
+        own = Intrinsics.from_fov(sensor.width, sensor.height, fov_deg, lens)
+    if own is None:
+        if lens is not None:
+            raise ConfigurationError("--distortion needs the focal length: give --fov or --intrinsics, too")
+        return sensor
+    return replace(sensor, intrinsics=replace(own, distortion=lens))
 
 
 def parse_intrinsics(text: str) -> Intrinsics:
-    """From `fx,fy,cx,cy`. Raises ConfigurationError."""
+    """From `fx,fy,cx,cy`, or the file of `spiked calibrate --board`. Raises ConfigurationError."""
+    if text.endswith(".json"):
+        return _measured(Path(text))
     try:
         fx, fy, cx, cy = (float(part) for part in text.split(","))
     except ValueError as error:
@@ -135,3 +171,18 @@ def parse_intrinsics(text: str) -> Intrinsics:
     if not (fx > 0 and fy > 0 and np.isfinite([fx, fy, cx, cy]).all()):
         raise ConfigurationError(f"--intrinsics {text!r}: give finite numbers of pixels, and positive focal lengths")
     return Intrinsics(fx, fy, cx, cy)
+
+
+class _Measured(BaseModel):
+    intrinsics: Pinhole
+
+
+def _measured(path: Path) -> Intrinsics:
+    try:
+        return _Measured.model_validate_json(path.read_bytes()).intrinsics.intrinsics()
+    except OSError as error:
+        raise ConfigurationError(f"--intrinsics {path}: the file cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        raise ConfigurationError(
+            f"--intrinsics {path}: not a file of `spiked calibrate --board`: {error.errors()[0]['msg']}"
+        ) from error

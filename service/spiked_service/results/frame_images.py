@@ -12,6 +12,7 @@ from spiked.errors import RecordingError
 from spiked.recon.frontend.demosaic import fill_mosaic
 from spiked.recording import Recording
 from spiked.sensor import Sensor
+from spiked.undistortion import Undistortion
 from spiked_service.results.image_encoding import display_white
 
 _MOMENT_FRAMES = 32
@@ -126,8 +127,11 @@ def frame_window_at(recording: Recording, frame: int | None, first_frame: int = 
     return FrameWindow(recording, row, first_frame)
 
 
-def picture(window: FrameWindow, kind: PictureKind, white: float | None) -> Picture:
-    """An image of recorded frames; `white` is the 99.5th percentile if None."""
+def picture(window: FrameWindow, kind: PictureKind, white: float | None, undistorted: bool = False) -> Picture:
+    """An image of recorded frames; `white` is the 99.5th percentile if None.
+
+    `undistorted`: resampled to a camera of the same focal length without distortion; black where nothing was seen.
+    """
     sensor = window.sensor
     if kind is PictureKind.INTERVAL:
         plane = window.aligned(_MOMENT_FRAMES).rate(fill=True)
@@ -135,6 +139,9 @@ def picture(window: FrameWindow, kind: PictureKind, white: float | None) -> Pict
         plane = _rate(window.aligned(_COUNTED_FRAMES if kind is PictureKind.RATE else _ACCUMULATED_FRAMES))
     channels = sensor.mosaic.channels(sensor.height, sensor.width) if sensor.mosaic else None
     image = fill_mosaic(plane, channels)
+    k = sensor.intrinsics
+    if undistorted and k is not None and k.distortion is not None:
+        image = Undistortion.of(k, sensor.width, sensor.height).straighten(image)
     return Picture(image, white or display_white(image), window.frame)
 
 

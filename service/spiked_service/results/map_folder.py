@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from spiked.errors import ConfigurationError, SceneError
+from spiked.lens import Lens
 from spiked.recon import KnownMap
 from spiked.render import Camera
 from spiked.scene import Scene
@@ -57,7 +58,7 @@ class MapFolder:
         cx, cy = report.principal_point_px or (sensor.width / 2, sensor.height / 2)
         scene, path = Scene.read_ply(folder / "scene.ply"), Trajectory.read_tum(folder / "trajectory.tum")
         paths = {one.name: Trajectory.read_tum(folder / PATHS / f"{one.name}.tum") for one in report.paths}
-        intrinsics = Intrinsics(fx, fy, cx, cy)
+        intrinsics = Intrinsics(fx, fy, cx, cy, None if report.distortion is None else report.distortion.distortion())
         paths = paths or {file_name(folder.resolve().name): path}
         return cls(scene, path, sensor.width, sensor.height, intrinsics, paths, report.versions)
 
@@ -142,5 +143,6 @@ class _Report(BaseModel):
     sensor: _Sensor
     focal_px: tuple[float, float]
     principal_point_px: tuple[float, float] | None = None
+    distortion: Lens | None = None
     paths: list[_Path] = []
     versions: dict[str, str] = {}

@@ -8,6 +8,7 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from spiked.errors import ConfigurationError
+from spiked.lens import Lens, lens_of
 from spiked.poses import PoseFile
 from spiked.recon import KnownMap
 from spiked.render import Camera
@@ -32,6 +33,8 @@ class PinnedMap(BaseModel):
     fy: float
     cx: float
     cy: float
+    distortion: Lens | None = None
+    """Of the lens."""
     paths: list[OtherPath]
     """Of all recordings, that of its own capture first."""
 
@@ -46,7 +49,8 @@ class PinnedMap(BaseModel):
     @property
     def intrinsics(self) -> Intrinsics:
         """Of the camera of its own recording."""
-        return Intrinsics(self.fx, self.fy, self.cx, self.cy)
+        lens = None if self.distortion is None else self.distortion.distortion()
+        return Intrinsics(self.fx, self.fy, self.cx, self.cy, lens)
 
     def recorded(self, folder: Path) -> list[RecordedPath]:
         """The paths of all recordings. Raises SceneError."""
@@ -83,6 +87,7 @@ def pin(folder: Path, row: ReconstructionRow, source: Path, published: Published
         fy=optics.fy,
         cx=optics.cx,
         cy=optics.cy,
+        distortion=lens_of(optics.distortion),
         paths=[own, *published.paths],
     )
     shutil.rmtree(folder, ignore_errors=True)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from spiked.errors import ConfigurationError
+from spiked.lens import Lens, lens_of
 from spiked.poses import PoseAppender
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
@@ -54,6 +55,8 @@ class Published(BaseModel):
     psnr_db: float | None = None
     intrinsics: tuple[float, float, float, float] | None = None
     """fx, fy, cx, cy (px), given or estimated."""
+    distortion: Lens | None = None
+    """Of the lens, with `intrinsics`."""
     slots: str | None = None
     """Name of the file of `ShownScene`, which only the newest versions have."""
     slots_began: int = 0
@@ -63,10 +66,16 @@ class Published(BaseModel):
 
     def optics(self, sensor: Sensor) -> Intrinsics:
         """The lens of the camera `sensor` that made it. Raises ConfigurationError for a version of an old release."""
-        found = sensor.intrinsics if self.intrinsics is None else Intrinsics(*self.intrinsics)
+        found = self.camera or sensor.intrinsics
         if found is None:
             raise ConfigurationError(f"version {self.version} was published without a lens: :restart makes a new one")
         return found
+
+    @property
+    def camera(self) -> Intrinsics | None:
+        """The intrinsics with the distortion."""
+        lens = None if self.distortion is None else self.distortion.distortion()
+        return None if self.intrinsics is None else Intrinsics(*self.intrinsics, lens)
 
 
 class _Index(BaseModel):
@@ -191,6 +200,7 @@ class Publisher:
             scene_bytes=len(content),
             psnr_db=psnr_db,
             intrinsics=None if intrinsics is None else (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy),
+            distortion=None if intrinsics is None else lens_of(intrinsics.distortion),
             **self._write_slots(scene, white, version, tolerance),
             paths=[one.published(f"path-{version:06d}-{number}.poses") for number, one in enumerate(others, 1)],
         )

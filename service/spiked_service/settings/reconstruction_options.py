@@ -12,7 +12,7 @@ _LIBRARY = Options()
 
 
 class IntrinsicsOption(Pinhole):
-    """A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5)."""
+    """A pinhole camera behind a lens; pixels, the centre of the first pixel is (0.5, 0.5)."""
 
 
 class ReconstructionOptions(BaseModel):

@@ -12,7 +12,6 @@ from spiked.pose import quaternion
 from spiked.poses import PoseFile
 from spiked.recon import Merged, Reconstructor, State, Status, Tracked
 from spiked.scene import Scene
-from spiked.sensor import Intrinsics
 from spiked.trajectory import Trajectory
 from spiked_service.events.payloads import PosePayload
 from spiked_service.results.map_reports import REGISTRATION, write_report
@@ -200,7 +199,7 @@ class ProgressReporter:
         scene = Scene.read_ply(self._publisher.folder / one.scene)
         poses = PoseFile(pose_file(self._publisher.folder, one))
         trajectory = poses.trajectory(range(len(poses)))
-        optics = self._reconstructor.camera.intrinsics if one.intrinsics is None else Intrinsics(*one.intrinsics)
+        optics = one.camera or self._reconstructor.camera.intrinsics
         return self._reconstructor.scene_psnr_db(scene, trajectory, optics)
 
     def _pose(self, view: Tracked, status: Status, latency_frames: int | None) -> PosePayload:

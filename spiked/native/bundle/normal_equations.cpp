@@ -1,5 +1,7 @@
 // Normal equations of poses and points with Cauchy weights; the points are eliminated (Schur complement).
 // (B. Triggs et al., "Bundle adjustment - a modern synthesis", 1999.)
+#include <nanobind/stl/optional.h>
+
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -52,9 +54,14 @@ struct Observations {
         }
     }
 
+    template <bool Bent>
+    Projection project_by(const Pinhole& k, int64_t m) const {
+        return spiked::project_by<Bent>(k, {rotations + 9 * camera[m], centres + 3 * camera[m]}, points + 3 * point[m],
+                                        pixels + 2 * m);
+    }
+
     Projection project(const Pinhole& k, int64_t m) const {
-        return spiked::project(k, {rotations + 9 * camera[m], centres + 3 * camera[m]}, points + 3 * point[m],
-                               pixels + 2 * m);
+        return k.lens.model ? project_by<true>(k, m) : project_by<false>(k, m);
     }
 
     // Observation numbers by point: those of p are order[first[p]] to order[first[p + 1] - 1].
@@ -79,11 +86,13 @@ double cauchy_square(const Projection& projection, double scale) {
 }
 
 void residuals(const In3& rotations, const In2& centres, const In2& points, const Index& camera, const Index& point,
-               const In2& pixels, double fx, double fy, double cx, double cy, const Array<double, 2>& out) {
+               const In2& pixels, double fx, double fy, double cx, double cy, const Array<double, 2>& out,
+               const std::optional<Array<const double, 1>>& lens) {
     const Observations observations(rotations, centres, points, camera, point, pixels);
     if (out.shape(0) != camera.shape(0) || out.shape(1) != 2) throw std::invalid_argument("out must be [M, 2]");
+    const Pinhole k = {fx, fy, cx, cy, lens_of(lens)};
     for (int64_t m = 0; m < observations.count; ++m) {
-        const Projection projection = observations.project({fx, fy, cx, cy}, m);
+        const Projection projection = observations.project(k, m);
         for (int i = 0; i < 2; ++i) {
             out.data()[2 * m + i] = projection.in_front ? projection.error[i] : std::numeric_limits<double>::infinity();
         }
@@ -91,11 +100,13 @@ void residuals(const In3& rotations, const In2& centres, const In2& points, cons
 }
 
 double cost(const In3& rotations, const In2& centres, const In2& points, const Index& camera, const Index& point,
-            const In2& pixels, double fx, double fy, double cx, double cy, double scale) {
+            const In2& pixels, double fx, double fy, double cx, double cy, double scale,
+            const std::optional<Array<const double, 1>>& lens) {
     const Observations observations(rotations, centres, points, camera, point, pixels);
+    const Pinhole k = {fx, fy, cx, cy, lens_of(lens)};
     double sum = 0, product = 1;
     for (int64_t m = 0; m < observations.count; ++m) {
-        product *= 1 + cauchy_square(observations.project({fx, fy, cx, cy}, m), scale);
+        product *= 1 + cauchy_square(observations.project(k, m), scale);
         if (product < kProductLimit) continue;
         sum += std::log(product);
         product = 1;
@@ -183,8 +194,9 @@ inline void eliminate(const System& system, int64_t p, PointSums& sums, const st
     for (const int64_t slot : used) std::fill_n(cross + 3 * kPoseStride * slot, 3 * kPoseStride, 0.0);
 }
 
-SPIKED_CLONES void add_landmarks(const Observations& observations, const Pinhole& k, const System& system,
-                                 PoseSums& poses) {
+template <bool Bent>
+[[gnu::always_inline]] inline void add_landmarks_by(const Observations& observations, const Pinhole& k,
+                                                    const System& system, PoseSums& poses) {
     std::vector<double> cross(3 * kPoseStride * (system.unknown / 6 + 1));
     std::vector<char> touched(system.unknown / 6 + 1);
     std::vector<int64_t> used, first, order;
@@ -194,7 +206,7 @@ SPIKED_CLONES void add_landmarks(const Observations& observations, const Pinhole
         used.clear();
         for (int64_t n = first[p]; n < first[p + 1]; ++n) {
             const int64_t m = order[n], c = observations.camera[m];
-            const Projection projection = observations.project(k, m);
+            const Projection projection = observations.project_by<Bent>(k, m);
             if (!projection.in_front) continue;
             const double weight = 1 / (1 + cauchy_square(projection, system.scale));
             double block[3 * kPoseStride] = {};
@@ -223,6 +235,16 @@ SPIKED_CLONES void add_landmarks(const Observations& observations, const Pinhole
         for (const int64_t slot : used) touched[slot] = 0;
         eliminate(system, p, sums, used, cross.data());
     }
+}
+
+SPIKED_CLONES void add_landmarks(const Observations& observations, const Pinhole& k, const System& system,
+                                 PoseSums& poses) {
+    add_landmarks_by<false>(observations, k, system, poses);
+}
+
+SPIKED_CLONES void add_bent_landmarks(const Observations& observations, const Pinhole& k, const System& system,
+                                      PoseSums& poses) {
+    add_landmarks_by<true>(observations, k, system, poses);
 }
 
 // Adds the poses' sums to the slots that they are made of.
@@ -254,7 +276,7 @@ void linearise(const In3& rotations, const In2& centres, const In2& points, cons
                const Index2& slots, const In2& shares, bool focal, const Array<double, 2>& hessian,
                const Array<double, 1>& gradient, const Array<double, 2>& eliminated,
                const Array<double, 2>& whitened_gradient, const Array<double, 3>& roots,
-               const Array<double, 3>& pose_hessian) {
+               const Array<double, 3>& pose_hessian, const std::optional<Array<const double, 1>>& lens) {
     const Observations observations(rotations, centres, points, camera, point, pixels);
     const int64_t size = static_cast<int64_t>(hessian.shape(0)), unknown = size - focal;
     const auto count = static_cast<size_t>(observations.point_count),
@@ -289,12 +311,13 @@ void linearise(const In3& rotations, const In2& centres, const In2& points, cons
                            whitened_gradient.data(),
                            roots.data(),
                            focal};
+    const Pinhole k = {fx, fy, cx, cy, lens_of(lens)};
     nb::gil_scoped_release release;
     std::fill_n(hessian.data(), size * size, 0.0);
     std::fill_n(gradient.data(), size, 0.0);
     std::fill_n(eliminated.data(), 3 * observations.point_count * size, 0.0);
     PoseSums poses(observations.cameras);
-    add_landmarks(observations, {fx, fy, cx, cy}, system, poses);
+    (k.lens.model ? add_bent_landmarks : add_landmarks)(observations, k, system, poses);
     scatter_to_slots(system, observations.cameras, poses);
     for (int64_t n = 0; n < 6 * observations.cameras; ++n) {
         std::copy_n(poses.hessian.data() + n * kPoseStride, 6, pose_hessian.data() + 6 * n);
@@ -304,10 +327,19 @@ void linearise(const In3& rotations, const In2& centres, const In2& points, cons
 }  // namespace
 
 void bind_normal_equations(nb::module_& m) {
-    m.def("residuals", &residuals,
+    m.def("residuals", &residuals, nb::arg("rotations"), nb::arg("centres"), nb::arg("points"), nb::arg("camera"),
+          nb::arg("point"), nb::arg("pixels"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"),
+          nb::arg("out"), nb::arg("lens") = nb::none(),
           "Image minus observation in px, [M, 2]; infinite for a point at or behind its camera.");
-    m.def("cost", &cost, "Mean over observations of the Cauchy loss log(1 + e^2 / scale^2).");
-    m.def("linearise", &linearise,
+    m.def("cost", &cost, nb::arg("rotations"), nb::arg("centres"), nb::arg("points"), nb::arg("camera"),
+          nb::arg("point"), nb::arg("pixels"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"),
+          nb::arg("scale"), nb::arg("lens") = nb::none(),
+          "Mean over observations of the Cauchy loss log(1 + e^2 / scale^2).");
+    m.def("linearise", &linearise, nb::arg("rotations"), nb::arg("centres"), nb::arg("points"), nb::arg("camera"),
+          nb::arg("point"), nb::arg("pixels"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"),
+          nb::arg("scale"), nb::arg("damping"), nb::arg("slots"), nb::arg("shares"), nb::arg("focal"),
+          nb::arg("hessian"), nb::arg("gradient"), nb::arg("eliminated"), nb::arg("whitened_gradient"),
+          nb::arg("roots"), nb::arg("pose_hessian"), nb::arg("lens") = nb::none(),
           "Hessian [D, D] and gradient [D] of what the poses are made of: slots [C, K] of six numbers each, with\n"
           "shares [C, K], and the logarithm of the focal length where it is free. Each point's damped 3x3 Hessian V\n"
           "is taken out: with roots R = chol(V)^-1, `eliminated` holds the rows R cross^T and `whitened_gradient` R "

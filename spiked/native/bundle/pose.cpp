@@ -1,4 +1,6 @@
 // The pose of one view from known points: robust Gauss-Newton.
+#include <nanobind/stl/optional.h>
+
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -52,8 +54,8 @@ void rotate_left(const double* phi, double* rotation) {
 
 void fit_pose(const Array<const double, 2>& points, const Array<const double, 2>& pixels, double fx, double fy,
               double cx, double cy, const Array<const double, 1>& scales, const Array<double, 2>& rotation,
-              const Array<double, 1>& centre, const Array<double, 1>& error, const Array<double, 2>& hessian,
-              bool move) {
+              const Array<double, 1>& centre, const Array<double, 1>& error, const Array<double, 2>& hessian, bool move,
+              const std::optional<Array<const double, 1>>& lens) {
     const size_t count = points.shape(0);
     if (points.shape(1) != 3 || pixels.shape(0) != count || pixels.shape(1) != 2 || error.shape(0) != count ||
         rotation.shape(0) != 3 || rotation.shape(1) != 3 || centre.shape(0) != 3 || hessian.shape(0) != 6 ||
@@ -61,7 +63,7 @@ void fit_pose(const Array<const double, 2>& points, const Array<const double, 2>
         throw std::invalid_argument(
             "expected points [n, 3], pixels [n, 2], rotation [3, 3], centre [3], error [n], hessian [6, 6]");
     }
-    const Pinhole k = {fx, fy, cx, cy};
+    const Pinhole k = {fx, fy, cx, cy, lens_of(lens)};
     const Pose pose = {rotation.data(), centre.data()};
     for (size_t round = 0; round < scales.shape(0); ++round) {
         const double scale = scales.data()[round];
@@ -130,7 +132,9 @@ double displacement(const Array<const double, 2>& hessian, const Array<const dou
 }  // namespace
 
 void bind_pose(nb::module_& m) {
-    m.def("fit_pose", &fit_pose,
+    m.def("fit_pose", &fit_pose, nb::arg("points"), nb::arg("pixels"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"),
+          nb::arg("cy"), nb::arg("scales"), nb::arg("rotation"), nb::arg("centre"), nb::arg("error"),
+          nb::arg("hessian"), nb::arg("move"), nb::arg("lens") = nb::none(),
           "Gauss-Newton with Cauchy weights, a step for each of `scales` (px) until they are small at the last: "
           "changes rotation and centre in place;\n"
           "`error` [n] (px) and `hessian` [6, 6] are those before the last step. Without `move` the pose is not "

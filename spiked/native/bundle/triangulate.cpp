@@ -1,4 +1,6 @@
 // Triangulation of tracks: the point nearest to the rays of all its observations.
+#include <nanobind/stl/optional.h>
+
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -60,7 +62,8 @@ struct Rays {
 void triangulate(const Array<const double, 3>& rotations, const Array<const double, 2>& centres,
                  const Array<const int64_t, 1>& view, const Array<const int64_t, 1>& track,
                  const Array<const double, 2>& pixels, double fx, double fy, double cx, double cy, int64_t min_views,
-                 double min_spread_px, double max_error_px, const Array<double, 2>& points) {
+                 double min_spread_px, double max_error_px, const Array<double, 2>& points,
+                 const std::optional<Array<const double, 1>>& lens) {
     const size_t count = view.shape(0), views = centres.shape(0);
     if (rotations.shape(0) != views || rotations.shape(1) != 3 || rotations.shape(2) != 3 || centres.shape(1) != 3 ||
         track.shape(0) != count || pixels.shape(0) != count || pixels.shape(1) != 2 || points.shape(1) != 3) {
@@ -73,8 +76,8 @@ void triangulate(const Array<const double, 3>& rotations, const Array<const doub
             throw std::invalid_argument("an observation names a view or track that does not exist");
         }
     }
+    const Pinhole k = {fx, fy, cx, cy, lens_of(lens)};
     nb::gil_scoped_release release;
-    const Pinhole k = {fx, fy, cx, cy};
     std::vector<int64_t> index_of(points.shape(0), -1), ids;
     std::vector<Rays> sums;
     std::vector<size_t> used;
@@ -88,7 +91,9 @@ void triangulate(const Array<const double, 3>& rotations, const Array<const doub
         }
         used.push_back(m);
         const double *r = rotations.data() + 9 * view.data()[m], *at = pixels.data() + 2 * m;
-        const double x = (at[0] - cx) / fx, y = (at[1] - cy) / fy, scale = 1 / std::sqrt(x * x + y * y + 1);
+        double x = (at[0] - cx) / fx, y = (at[1] - cy) / fy;
+        straighten(k.lens, x, y);
+        const double scale = 1 / std::sqrt(x * x + y * y + 1);
         const double ray[3] = {scale * (r[0] * x + r[1] * y + r[2]), scale * (r[3] * x + r[4] * y + r[5]),
                                scale * (r[6] * x + r[7] * y + r[8])};
         sums[index_of[id]].add(ray, centres.data() + 3 * view.data()[m]);
@@ -115,6 +120,7 @@ void bind_triangulate(nb::module_& m) {
     m.def("triangulate", &triangulate, nb::arg("rotations"), nb::arg("centres"), nb::arg("view"), nb::arg("track"),
           nb::arg("pixels"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"), nb::arg("min_views"),
           nb::arg("min_spread_px"), nb::arg("max_error_px"), nb::arg("points").noconvert(),
+          nb::arg("lens") = nb::none(),
           "Fills those of `points` [P, 3] that are NaN from the observations of posed views: observation m is of "
           "`track`\n"
           "[m] in `view` [m]. A track is triangulated if at least `min_views` views saw it, its rays spread by more "

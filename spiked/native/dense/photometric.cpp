@@ -1,4 +1,6 @@
 // Normal equations of the photometric error of one view: by its pose and by the landmarks at its pixels.
+#include <nanobind/stl/optional.h>
+
 #include <algorithm>
 #include <cmath>
 #include <stdexcept>
@@ -42,7 +44,7 @@ size_t photometric_normals(const Image& error, const Image& du, const Image& dv,
                            const Image& weight, double fx, double fy, double cx, double cy,
                            const Array<const double, 2>& rotation, const Array<const double, 1>& centre,
                            double width_rad, const Array<double, 2>& pose, const Array<int64_t, 1>& keys,
-                           const Array<double, 3>& landmarks) {
+                           const Array<double, 3>& landmarks, const std::optional<Array<const double, 1>>& given) {
     const size_t height = error.shape(0), width = error.shape(1), room = keys.shape(0);
     for (const Image* one : {&du, &dv, &depth, &weight}) {
         if (one->shape(0) != height || one->shape(1) != width) throw std::invalid_argument("images must be alike");
@@ -53,6 +55,7 @@ size_t photometric_normals(const Image& error, const Image& du, const Image& dv,
         throw std::invalid_argument(
             "expected rotation [3, 3], centre [3], width_rad above 0, pose [6, 7], keys [N], landmarks [N, 3, 10]");
     }
+    const Lens lens = lens_of(given);
     const double* r = rotation.data();
     std::unordered_map<int64_t, size_t> known;
     int64_t last = 0;  // neighbours mostly see the same landmark
@@ -62,9 +65,17 @@ size_t photometric_normals(const Image& error, const Image& du, const Image& dv,
         for (size_t u = 0; u < width; ++u, ++n) {
             const double w = weight.data()[n], z = depth.data()[n];
             if (!(w > 0) || !(z > kNearest)) continue;
-            const double x = (u + 0.5 - cx) / fx * z, y = (v + 0.5 - cy) / fy * z;
+            double x = (u + 0.5 - cx) / fx * z, y = (v + 0.5 - cy) / fy * z;
             // The point carries its colour, so the image at a fixed pixel changes by minus the slope times its motion.
-            const double a = -du.data()[n] * fx / z, b = -dv.data()[n] * fy / z;
+            double a = -du.data()[n] * fx / z, b = -dv.data()[n] * fy / z;
+            if (lens.model) {
+                x = (u + 0.5 - cx) / fx, y = (v + 0.5 - cy) / fy;
+                straighten(lens, x, y);
+                const Bent bent = bend(lens, x, y);
+                const double along = a;
+                a = bent.xx * along + bent.xy * b, b = bent.xy * along + bent.yy * b;
+                x *= z, y *= z;
+            }
             const double slope[3] = {a, b, -(a * x + b * y) / z}, local[3] = {x, y, z};
             double row[kRow], ray[3], point[3];
             to_world(r, slope, row);
@@ -92,7 +103,10 @@ size_t photometric_normals(const Image& error, const Image& du, const Image& dv,
 }  // namespace
 
 void bind_photometric(nb::module_& m) {
-    m.def("photometric_normals", &photometric_normals,
+    m.def("photometric_normals", &photometric_normals, nb::arg("error"), nb::arg("du"), nb::arg("dv"), nb::arg("depth"),
+          nb::arg("weight"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"), nb::arg("rotation"),
+          nb::arg("centre"), nb::arg("width_rad"), nb::arg("pose"), nb::arg("keys"), nb::arg("landmarks"),
+          nb::arg("lens") = nb::none(),
           "Sums over the pixels of a view with `weight` above 0, for `error` = map - view, its slopes `du`, `dv` and "
           "`depth` [h, w].\n"
           "`pose` [6, 7] gets the Hessian by (rotation vector on the left, centre) and the gradient. Pixels that see "

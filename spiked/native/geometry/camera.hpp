@@ -1,6 +1,8 @@
-// Projection of a point by a pinhole camera, with its derivatives by point and pose.
+// Projection of a point by a camera, with its derivatives by point and pose.
 #pragma once
 #include <cmath>
+
+#include "lens.hpp"
 
 namespace spiked {
 
@@ -8,6 +10,7 @@ constexpr double kNearest = 1e-6;  // least depth of a point that counts as in f
 
 struct Pinhole {
     double fx, fy, cx, cy;
+    Lens lens = {};
 };
 
 // Camera-to-world `rotation` (row-major) and `centre`.
@@ -30,7 +33,21 @@ struct Projection {
     bool in_front;
 };
 
-inline Projection project(const Pinhole& k, const Pose& pose, const double* point, const double* pixel) {
+// Makes the projection of a camera without distortion that of one with it; `x` and `y` are the point's slopes.
+inline void bend_projection(const Pinhole& k, double x, double y, const double* pixel, Projection& projection) {
+    const Bent bent = bend(k.lens, x, y);
+    projection.error[0] = k.fx * bent.x + k.cx - pixel[0];
+    projection.error[1] = k.fy * bent.y + k.cy - pixel[1];
+    for (int i = 0; i < 3; ++i) {
+        const double u = projection.by_point[0][i], v = projection.by_point[1][i];
+        projection.by_point[0][i] = bent.xx * u + bent.xy * k.fx / k.fy * v;
+        projection.by_point[1][i] = bent.xy * k.fy / k.fx * u + bent.yy * v;
+    }
+}
+
+// `Bent`: through the camera's lens.
+template <bool Bent>
+inline Projection project_by(const Pinhole& k, const Pose& pose, const double* point, const double* pixel) {
     Projection projection;
     const double* r = pose.rotation;
     for (int i = 0; i < 3; ++i) projection.ray[i] = point[i] - pose.centre[i];
@@ -46,7 +63,12 @@ inline Projection project(const Pinhole& k, const Pose& pose, const double* poin
         projection.by_point[0][i] = k.fx * near * r[3 * i] + along_u * r[3 * i + 2];
         projection.by_point[1][i] = k.fy * near * r[3 * i + 1] + along_v * r[3 * i + 2];
     }
+    if constexpr (Bent) bend_projection(k, x * near, y * near, pixel, projection);
     return projection;
+}
+
+inline Projection project(const Pinhole& k, const Pose& pose, const double* point, const double* pixel) {
+    return k.lens.model ? project_by<true>(k, pose, point, pixel) : project_by<false>(k, pose, point, pixel);
 }
 
 // A row of the derivative by the pose (rotation vector on the left, centre) from the row of the derivative by the

@@ -21,6 +21,10 @@ struct PinholeF {
     float limit_x, limit_y;  // x/z and y/z beyond these are clamped in the Jacobian
     float near;
     int width, height, tiles_x, tiles_y;
+    // Distortion, see spiked/distortion.py: 0 none, 1 OpenCV's polynomial, 2 fisheye.
+    int lens;
+    float coefficients[5];
+    float reach2;  // square of the largest slope that is drawn
 };
 
 // World to camera: p = rotation (mean - centre); the centre is split in two floats to keep the precision of a double.

@@ -1,4 +1,8 @@
 // The rasteriser: checks the shapes of its arguments.
+#include <algorithm>
+#include <cmath>
+
+#include "../geometry/lens.hpp"
 #include "bindings.hpp"
 #include "renderer.hpp"
 
@@ -10,9 +14,30 @@ namespace {
 // published code of 3D Gaussian splatting (Kerbl et al. 2023): beyond, its linearisation of the projection diverges.
 constexpr double kSlopeLimit = 1.3;
 
-PinholeF camera_of(double fx, double fy, double cx, double cy, int width, int height, double near) {
+// Limits the slopes of a lens to what its image shows: all pixels on the border are straightened.
+void set_lens(PinholeF& camera, double fx, double fy, double cx, double cy, const Lens& lens) {
+    camera.lens = lens.model;
+    for (int i = 0; i < 5; ++i) camera.coefficients[i] = static_cast<float>(lens.k[i]);
+    double across = 0, down = 0, farthest = 0;
+    const int around = 2 * (camera.width + camera.height);
+    for (int i = 0; i < around; ++i) {
+        const int j = i / 2;
+        const bool level = j < camera.width;
+        double x = ((level ? j : i % 2 * camera.width) - cx) / fx;
+        double y = ((level ? i % 2 * camera.height : j - camera.width) - cy) / fy;
+        straighten(lens, x, y);
+        across = std::max(across, std::abs(x)), down = std::max(down, std::abs(y));
+        farthest = std::max(farthest, x * x + y * y);
+    }
+    camera.limit_x = static_cast<float>(kSlopeLimit * across);
+    camera.limit_y = static_cast<float>(kSlopeLimit * down);
+    camera.reach2 = static_cast<float>(std::min(lens.reach2, kSlopeLimit * kSlopeLimit * farthest));
+}
+
+PinholeF camera_of(double fx, double fy, double cx, double cy, int width, int height, double near,
+                   const std::optional<Array<const double, 1>>& given) {
     expect(width > 0 && height > 0 && width <= kMaxSide && height <= kMaxSide, "image sides are 1 to 4096 pixels");
-    PinholeF camera;
+    PinholeF camera{};
     camera.fx = static_cast<float>(fx), camera.fy = static_cast<float>(fy);
     camera.cx = static_cast<float>(cx), camera.cy = static_cast<float>(cy);
     camera.limit_x = static_cast<float>(kSlopeLimit * 0.5 * width / fx);
@@ -20,6 +45,7 @@ PinholeF camera_of(double fx, double fy, double cx, double cy, int width, int he
     camera.near = static_cast<float>(near);
     camera.width = width, camera.height = height;
     camera.tiles_x = (width + kTile - 1) / kTile, camera.tiles_y = (height + kTile - 1) / kTile;
+    if (given) set_lens(camera, fx, fy, cx, cy, lens_of(given));
     return camera;
 }
 
@@ -88,9 +114,11 @@ NB_MODULE(_raster, m) {
         .def(
             "__init__",
             [](Renderer* self, double fx, double fy, double cx, double cy, int width, int height, double near,
-               int threads) { new (self) Renderer(camera_of(fx, fy, cx, cy, width, height, near), threads); },
+               int threads, const std::optional<Array<const double, 1>>& lens) {
+                new (self) Renderer(camera_of(fx, fy, cx, cy, width, height, near, lens), threads);
+            },
             nb::kw_only(), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"), nb::arg("width"),
-            nb::arg("height"), nb::arg("near"), nb::arg("threads"))
+            nb::arg("height"), nb::arg("near"), nb::arg("threads"), nb::arg("lens") = nb::none())
         .def("forward", &forward, nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"), nb::arg("opacity_logits"),
              nb::arg("colours"), nb::arg("rotations"), nb::arg("centres"), nb::arg("weights").none(),
              nb::arg("windows").none(), nb::arg("channels").none(), nb::arg("background"), nb::arg("values"),

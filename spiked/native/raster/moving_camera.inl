@@ -68,16 +68,19 @@ struct SubFrameProjection {
     Vec p, q, r;                                                  // of the blurred covariance
 };
 
+template <bool Bent>
 static inline SubFrameProjection project_sub_frame(const Prepared& s, const PinholeF& camera, const SubFrame& sub_frame,
                                                    int base) {
     SubFrameProjection o;
-    o.begin = project_lanes(s, camera, sub_frame.begin, base);
-    o.end = project_lanes(s, camera, sub_frame.end, base);
+    o.begin = project_lanes<Bent>(s, camera, sub_frame.begin, base);
+    o.end = project_lanes<Bent>(s, camera, sub_frame.end, base);
     const ProjectionLanes &b = o.begin, &e = o.end;
-    o.u = 0.5f * camera.fx * (b.raw_x + e.raw_x) + camera.cx;
-    o.v = 0.5f * camera.fy * (b.raw_y + e.raw_y) + camera.cy;
-    o.du = camera.fx * (e.raw_x - b.raw_x);
-    o.dv = camera.fy * (e.raw_y - b.raw_y);
+    const Vec &bx = Bent ? b.seen_x : b.raw_x, &by = Bent ? b.seen_y : b.raw_y;
+    const Vec &ex = Bent ? e.seen_x : e.raw_x, &ey = Bent ? e.seen_y : e.raw_y;
+    o.u = 0.5f * camera.fx * (bx + ex) + camera.cx;
+    o.v = 0.5f * camera.fy * (by + ey) + camera.cy;
+    o.du = camera.fx * (ex - bx);
+    o.dv = camera.fy * (ey - by);
     Vec along{}, across{}, mixed{}, area{}, swept{};
     for (int k = 0; k < 3; ++k) {
         o.m0[k] = 0.5f * (b.m0[k] + e.m0[k]);
@@ -109,11 +112,12 @@ static inline SubFrameProjection project_sub_frame(const Prepared& s, const Pinh
     return o;
 }
 
-static void project_moving(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame, int count,
-                           int first, int last, ProjectedSplat* records, Motion* motions, uint32_t* keys) {
+template <bool Bent>
+static void project_moving_by(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame, int count,
+                              int first, int last, ProjectedSplat* records, Motion* motions, uint32_t* keys) {
     alignas(64) float out[6][kLanes];
     for (int base = first; base < last; base += kLanes) {
-        const SubFrameProjection o = project_sub_frame(splats, camera, sub_frame, base);
+        const SubFrameProjection o = project_sub_frame<Bent>(splats, camera, sub_frame, base);
         const Vec z = 0.5f * (o.begin.z + o.end.z);
         const Vec log2_opacity =
             load(splats.log2_opacity + base) - 0.5f * log2_fine(o.blurred_determinant / o.determinant);
@@ -152,9 +156,16 @@ static void project_moving(const Prepared& splats, const PinholeF& camera, const
     }
 }
 
-static void unproject_moving(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame, int first,
-                             const float* sums, const uint8_t* visible, int colours, const SplatGradients& out,
-                             double pose_begin[6], double pose_end[6]) {
+static void project_moving(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame, int count,
+                           int first, int last, ProjectedSplat* records, Motion* motions, uint32_t* keys) {
+    auto* run = camera.lens ? project_moving_by<true> : project_moving_by<false>;
+    run(splats, camera, sub_frame, count, first, last, records, motions, keys);
+}
+
+template <bool Bent>
+static void unproject_moving_by(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame, int first,
+                                const float* sums, const uint8_t* visible, int colours, const SplatGradients& out,
+                                double pose_begin[6], double pose_end[6]) {
     for (int at = 0; at < kGroup; at += kLanes) {
         const int base = first + at, into = base - out.first;
         Int seen;
@@ -165,7 +176,7 @@ static void unproject_moving(const Prepared& splats, const PinholeF& camera, con
         add(out.share + into, sum(kShare));
         for (int k = 0; k < colours; ++k) add(out.colour[k] + into, sum(kColour0 + k));
 
-        const SubFrameProjection o = project_sub_frame(splats, camera, sub_frame, base);
+        const SubFrameProjection o = project_sub_frame<Bent>(splats, camera, sub_frame, base);
         constexpr float scale = 1.0f / kHalfLog2e;
         const Vec suu = sum(kVuu), suw = sum(kVuw), sww = sum(kVww);
         const Vec g_u = scale * o.p * sum(kVu), g_v = scale * (o.q * sum(kVu) + o.r * sum(kVw));
@@ -184,11 +195,18 @@ static void unproject_moving(const Prepared& splats, const PinholeF& camera, con
             d_m0[k] = 0.5f * (c_xx * o.m0[k] + c_xy * o.m1[k]);
             d_m1[k] = 0.5f * (c_xy * o.m0[k] + c_yy * o.m1[k]);
         }
-        unproject_lanes(splats, camera, sub_frame.begin, o.begin, seen, base, into, 0.5f * g_u - g_du,
-                        0.5f * g_v - g_dv, d_m0, d_m1, out, pose_begin);
-        unproject_lanes(splats, camera, sub_frame.end, o.end, seen, base, into, 0.5f * g_u + g_du, 0.5f * g_v + g_dv,
-                        d_m0, d_m1, out, pose_end);
+        unproject_lanes<Bent>(splats, camera, sub_frame.begin, o.begin, seen, base, into, 0.5f * g_u - g_du,
+                              0.5f * g_v - g_dv, d_m0, d_m1, out, pose_begin);
+        unproject_lanes<Bent>(splats, camera, sub_frame.end, o.end, seen, base, into, 0.5f * g_u + g_du,
+                              0.5f * g_v + g_dv, d_m0, d_m1, out, pose_end);
     }
+}
+
+static void unproject_moving(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame, int first,
+                             const float* sums, const uint8_t* visible, int colours, const SplatGradients& out,
+                             double pose_begin[6], double pose_end[6]) {
+    auto* run = camera.lens ? unproject_moving_by<true> : unproject_moving_by<false>;
+    run(splats, camera, sub_frame, first, sums, visible, colours, out, pose_begin, pose_end);
 }
 
 }  // namespace

@@ -62,17 +62,82 @@ static void prepare(const SplatArrays& splats, int first, int last, float* const
     }
 }
 
+// The distortion at a splat: derivatives of the bent slopes by the slopes, of first and of second order. They are
+// symmetric: the bent slopes are a gradient.
+struct BendLanes {
+    Vec xx, xy, yy;
+    Vec xxx, xxy, xyy, yyy;
+};
+
 struct ProjectionLanes {
     Vec offset[3];  // mu - c, world
     Vec x, y, z, over_z;
     Vec slope_x, slope_y;  // x/z and y/z, clamped
     Vec raw_x, raw_y;      // x/z and y/z
+    Vec seen_x, seen_y;    // x/z and y/z, bent by the lens
+    BendLanes bend;        // only with a lens
     Vec b[9];              // W times spread
     Vec m0[3], m1[3];
     Vec xx, xy, yy, determinant;
     Vec p, q, r;
 };
 
+// The angle to the axis of a slope r >= 0, to 2e-8 (M. Abramowitz and I. Stegun, "Handbook of mathematical functions",
+// 4.4.49).
+static inline Vec arctangent(Vec r) {
+    const Int steep = r > 1.0f;
+    const Vec x = select(steep, 1.0f / max(r, broadcast(1e-6f)), r), t = x * x;
+    constexpr float kTerms[] = {-0.0161657367f, 0.0429096138f, -0.0752896400f, 0.1065626393f,
+                                -0.1420889944f, 0.1999355085f, -0.3333314528f, 1.0f};
+    Vec sum = broadcast(0.0028662257f);
+    for (int i = 0; i < 8; ++i) sum = sum * t + kTerms[i];
+    const Vec angle = sum * x;
+    return select(steep, 1.5707963268f - angle, angle);
+}
+
+// Bends the slopes of a projection.
+static inline void bend_lanes(const PinholeF& camera, ProjectionLanes& o) {
+    const Vec x = o.raw_x, y = o.raw_y, square = x * x + y * y;
+    const float* k = camera.coefficients;
+    Vec scale, growth, curvature;  // the factor of the slopes, and its derivatives by the square
+    float p1 = 0, p2 = 0;
+    if (camera.lens == 1) {
+        scale = 1.0f + square * (k[0] + square * (k[1] + square * k[4]));
+        growth = k[0] + square * (2.0f * k[1] + 3.0f * k[4] * square);
+        curvature = 2.0f * k[1] + 6.0f * k[4] * square;
+        p1 = k[2], p2 = k[3];
+    } else {
+        const Vec s = max(square, broadcast(1e-4f)), r = sqrt(s), angle = arctangent(r), t = angle * angle;
+        const Vec bent = angle * (1.0f + t * (k[0] + t * (k[1] + t * (k[2] + t * k[3]))));
+        const Vec first = 1.0f + t * (3.0f * k[0] + t * (5.0f * k[1] + t * (7.0f * k[2] + t * (9.0f * k[3]))));
+        const Vec second = angle * (6.0f * k[0] + t * (20.0f * k[1] + t * (42.0f * k[2] + t * (72.0f * k[3]))));
+        const Vec turn = 1.0f / (1.0f + s);  // derivative of the angle by r
+        scale = bent / r;
+        growth = (first * turn - scale) / (2.0f * s);
+        curvature = (second * turn * turn / (2.0f * r) - first * turn * turn - 3.0f * growth) / (2.0f * s);
+    }
+    o.seen_x = x * scale + 2.0f * p1 * x * y + p2 * (square + 2.0f * x * x);
+    o.seen_y = y * scale + p1 * (square + 2.0f * y * y) + 2.0f * p2 * x * y;
+    BendLanes& b = o.bend;
+    b.xx = scale + 2.0f * x * x * growth + 2.0f * p1 * y + 6.0f * p2 * x;
+    b.xy = 2.0f * x * y * growth + 2.0f * p1 * x + 2.0f * p2 * y;
+    b.yy = scale + 2.0f * y * y * growth + 6.0f * p1 * y + 2.0f * p2 * x;
+    b.xxx = x * (6.0f * growth + 4.0f * x * x * curvature) + 6.0f * p2;
+    b.xxy = y * (2.0f * growth + 4.0f * x * x * curvature) + 2.0f * p1;
+    b.xyy = x * (2.0f * growth + 4.0f * y * y * curvature) + 2.0f * p2;
+    b.yyy = y * (6.0f * growth + 4.0f * y * y * curvature) + 6.0f * p1;
+    // What lies beyond the lens's reach is not drawn: it would be folded back.
+    const Int drawn = square <= camera.reach2;
+    o.z = select(drawn, o.z, Vec{});
+    const float across = camera.fx / camera.fy, down = camera.fy / camera.fx;
+    for (int i = 0; i < 3; ++i) {
+        const Vec m0 = o.m0[i], m1 = o.m1[i];
+        o.m0[i] = b.xx * m0 + across * b.xy * m1;
+        o.m1[i] = down * b.xy * m0 + b.yy * m1;
+    }
+}
+
+template <bool Bent>
 static inline ProjectionLanes project_lanes(const Prepared& s, const PinholeF& camera, const View& view, int base) {
     ProjectionLanes o;
     for (int k = 0; k < 3; ++k) o.offset[k] = (load(s.mean[k] + base) - view.centre_high[k]) - view.centre_low[k];
@@ -95,6 +160,7 @@ static inline ProjectionLanes project_lanes(const Prepared& s, const PinholeF& c
         o.m0[k] = jx * (o.b[k] - o.slope_x * o.b[6 + k]);
         o.m1[k] = jy * (o.b[3 + k] - o.slope_y * o.b[6 + k]);
     }
+    if constexpr (Bent) bend_lanes(camera, o);
     Vec* a = o.m0;
     Vec* b = o.m1;
     Vec aa = a[0] * a[0] + a[1] * a[1] + a[2] * a[2], bb = b[0] * b[0] + b[1] * b[1] + b[2] * b[2];
@@ -127,11 +193,13 @@ static inline void write_records(const Vec fields[kRecordFields], Int visible, i
     }
 }
 
-static void project(const Prepared& splats, const PinholeF& camera, const View& view, int count, int first, int last,
-                    ProjectedSplat* records, uint32_t* keys) {
+template <bool Bent>
+static void project_by(const Prepared& splats, const PinholeF& camera, const View& view, int count, int first, int last,
+                       ProjectedSplat* records, uint32_t* keys) {
     for (int base = first; base < last; base += kLanes) {
-        ProjectionLanes o = project_lanes(splats, camera, view, base);
-        Vec u = o.raw_x * camera.fx + camera.cx, v = o.raw_y * camera.fy + camera.cy;
+        ProjectionLanes o = project_lanes<Bent>(splats, camera, view, base);
+        const Vec &x = Bent ? o.seen_x : o.raw_x, &y = Bent ? o.seen_y : o.raw_y;
+        Vec u = x * camera.fx + camera.cx, v = y * camera.fy + camera.cy;
         Vec log2_opacity = load(splats.log2_opacity + base);
         Vec reach = log2_opacity + kLog2Cut;  // u^2 + w^2 at the rim
         Vec half_x = sqrt(max(reach, broadcast(0.0f)) * o.xx / kHalfLog2e);
@@ -149,15 +217,47 @@ static void project(const Prepared& splats, const PinholeF& camera, const View& 
     }
 }
 
+static void project(const Prepared& splats, const PinholeF& camera, const View& view, int count, int first, int last,
+                    ProjectedSplat* records, uint32_t* keys) {
+    (camera.lens ? project_by<true> : project_by<false>)(splats, camera, view, count, first, last, records, keys);
+}
+
 static inline void add(float* p, Vec v) { store(p, load(p) + v); }
 
-// Adds the gradients of one projection by the splat and the pose: g_u, g_v by the mean on screen, d_m0, d_m1 by M's
+// From gradients by what the lens shows to gradients by what a camera without distortion would show.
+static inline void straighten_gradients(const PinholeF& camera, const ProjectionLanes& o, Vec& g_u, Vec& g_v,
+                                        Vec d_m0[3], Vec d_m1[3], Vec& d_x, Vec& d_y) {
+    const BendLanes& b = o.bend;
+    const float across = camera.fx / camera.fy, down = camera.fy / camera.fx;
+    const Vec u = g_u, v = g_v;
+    g_u = b.xx * u + down * b.xy * v;
+    g_v = across * b.xy * u + b.yy * v;
+    Vec xx{}, mixed{}, yy{};  // by the derivatives of the lens
+    for (int k = 0; k < 3; ++k) {
+        const Vec n0 = (o.b[k] - o.slope_x * o.b[6 + k]) * o.over_z;
+        const Vec n1 = (o.b[3 + k] - o.slope_y * o.b[6 + k]) * o.over_z;
+        const Vec d0 = d_m0[k], d1 = d_m1[k];
+        xx += camera.fx * d0 * n0;
+        mixed += camera.fx * d0 * n1 + camera.fy * d1 * n0;
+        yy += camera.fy * d1 * n1;
+        d_m0[k] = b.xx * d0 + down * b.xy * d1;
+        d_m1[k] = across * b.xy * d0 + b.yy * d1;
+    }
+    d_x = xx * b.xxx + mixed * b.xxy + yy * b.xyy;
+    d_y = xx * b.xxy + mixed * b.xyy + yy * b.yyy;
+}
+
+// Adds the gradients of one projection by the splat and the pose: g_u, g_v by the mean on screen, by_m0, by_m1 by M's
 // rows.
+template <bool Bent>
 static inline void unproject_lanes(const Prepared& splats, const PinholeF& camera, const View& view,
                                    const ProjectionLanes& o, Int seen, int base, int into, Vec g_u, Vec g_v,
-                                   const Vec d_m0[3], const Vec d_m1[3], const SplatGradients& out, double pose[6]) {
+                                   const Vec by_m0[3], const Vec by_m1[3], const SplatGradients& out, double pose[6]) {
     Vec jx = camera.fx * o.over_z, jy = camera.fy * o.over_z;
     Vec d_spread[9], d_jx{}, d_jy{}, d_jxz{}, d_jyz{};
+    Vec d_m0[3] = {by_m0[0], by_m0[1], by_m0[2]}, d_m1[3] = {by_m1[0], by_m1[1], by_m1[2]};
+    Vec d_x{}, d_y{};  // by the slopes, through the derivatives of the lens
+    if constexpr (Bent) straighten_gradients(camera, o, g_u, g_v, d_m0, d_m1, d_x, d_y);
     for (int k = 0; k < 3; ++k) {
         const Vec d0 = d_m0[k], d1 = d_m1[k];
         d_jx += d0 * o.b[k];
@@ -178,6 +278,11 @@ static inline void unproject_lanes(const Prepared& splats, const PinholeF& camer
     Vec gy = jy * g_v - free_y * camera.fy * over_z2 * d_jyz;
     Vec gz = camera.fx * over_z2 * (o.slope_x * d_jxz + free_x * o.raw_x * d_jxz - d_jx - o.x * g_u) +
              camera.fy * over_z2 * (o.slope_y * d_jyz + free_y * o.raw_y * d_jyz - d_jy - o.y * g_v);
+    if constexpr (Bent) {
+        gx += d_x * o.over_z;
+        gy += d_y * o.over_z;
+        gz -= (d_x * o.raw_x + d_y * o.raw_y) * o.over_z;
+    }
     Vec d_mean[3];
     for (int k = 0; k < 3; ++k) {
         const float* w = view.rotation + k;
@@ -200,8 +305,9 @@ static inline void unproject_lanes(const Prepared& splats, const PinholeF& camer
     }
 }
 
-static void unproject(const Prepared& splats, const PinholeF& camera, const View& view, int first, const float* sums,
-                      const uint8_t* visible, int colours, const SplatGradients& out, double pose[6]) {
+template <bool Bent>
+static void unproject_by(const Prepared& splats, const PinholeF& camera, const View& view, int first, const float* sums,
+                         const uint8_t* visible, int colours, const SplatGradients& out, double pose[6]) {
     for (int at = 0; at < kGroup; at += kLanes) {
         const int base = first + at, into = base - out.first;
         Int seen;
@@ -211,7 +317,7 @@ static void unproject(const Prepared& splats, const PinholeF& camera, const View
         add(out.share + into, sum(kShare));
         for (int k = 0; k < colours; ++k) add(out.colour[k] + into, sum(kColour0 + k));
 
-        ProjectionLanes o = project_lanes(splats, camera, view, base);
+        ProjectionLanes o = project_lanes<Bent>(splats, camera, view, base);
         // Offsets times the conic are (p u, q u + r w) / kHalfLog2e, so nothing has to be inverted.
         constexpr float scale = 1.0f / kHalfLog2e;
         Vec su = sum(kVu), sw = sum(kVw), suu = sum(kVuu), suw = sum(kVuw), sww = sum(kVww);
@@ -225,8 +331,14 @@ static void unproject(const Prepared& splats, const PinholeF& camera, const View
             d_m0[k] = c_xx * o.m0[k] + c_xy * o.m1[k];
             d_m1[k] = c_xy * o.m0[k] + c_yy * o.m1[k];
         }
-        unproject_lanes(splats, camera, view, o, seen, base, into, g_u, g_v, d_m0, d_m1, out, pose);
+        unproject_lanes<Bent>(splats, camera, view, o, seen, base, into, g_u, g_v, d_m0, d_m1, out, pose);
     }
+}
+
+static void unproject(const Prepared& splats, const PinholeF& camera, const View& view, int first, const float* sums,
+                      const uint8_t* visible, int colours, const SplatGradients& out, double pose[6]) {
+    auto* run = camera.lens ? unproject_by<true> : unproject_by<false>;
+    run(splats, camera, view, first, sums, visible, colours, out, pose);
 }
 
 static void finish(const SplatArrays& splats, const Prepared& prepared, const SplatGradients& sums, int first, int last,

@@ -39,8 +39,22 @@ class FrameWarp:
         turn = (k @ rotation.T @ self.rotations @ np.linalg.inv(k)).astype(np.float32)
         shift = ((self.centres - centre) @ rotation @ k.T).astype(np.float32)
         moved = np.empty((len(turn), rows, columns, 2), np.float32)
-        warp_nodes(inverse, shrink, turn, np.ascontiguousarray(shift), WARP_CELL_PX, MIN_RELATIVE_DEPTH, moved)
+        warp_nodes(
+            inverse, shrink, turn, np.ascontiguousarray(shift), WARP_CELL_PX, MIN_RELATIVE_DEPTH, moved, **_lens(camera)
+        )
         return moved
+
+
+def _lens(camera: Camera) -> dict[str, NDArray[np.float64] | NDArray[np.float32]]:
+    """What the warp needs to know of a lens with distortion: its camera, and where a camera without sees the nodes."""
+    k = camera.intrinsics
+    if k.distortion is None:
+        return {}
+    rows, columns = np.mgrid[
+        0 : camera.height + WARP_CELL_PX : WARP_CELL_PX, 0 : camera.width + WARP_CELL_PX : WARP_CELL_PX
+    ]
+    straight = k.undistorted(np.stack([columns, rows], -1).astype(np.float64)).astype(np.float32)
+    return {**k.lens(), "camera": np.array([k.fx, k.fy, k.cx, k.cy]), "straight": straight}
 
 
 def _smooth_inverse(depth: Image, width: int) -> tuple[Image, float]:

@@ -178,6 +178,7 @@ def _view_normals(
         pose,
         keys,
         places,
+        **k.lens(),
     )
     variance = float((weight * error**2).sum() / max(float(weight.sum()), 1e-12))
     return ViewNormals(pose, keys[:count], places[:count].copy(), variance)

@@ -119,7 +119,7 @@ def isotropic_splats(
     The pose is camera to world; colours are [N, C].
     """
     count = len(pixels)
-    log_scale = np.log(deviation_px * depth / intrinsics.fx)
+    log_scale = np.log(deviation_px * depth / intrinsics.focal_at(pixels))
     quats = np.zeros((count, 4), np.float32)
     quats[:, 0] = 1
     return Scene(

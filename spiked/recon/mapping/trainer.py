@@ -10,16 +10,21 @@ from spiked.pose import Array
 from spiked.recon.frontend.windowing import luminance
 from spiked.recon.mapping.mapper import Mapper
 from spiked.recon.mapping.options import MapOptions
-from spiked.recon.mapping.plane_sweep import SWEPT_PIXELS, PosedImage, neighbours, sweep
+from spiked.recon.mapping.plane_sweep import SWEPT_PIXELS, PosedImage, Sweep, neighbours, sweep
 from spiked.recon.mapping.render_requests import RenderPlanner
 from spiked.recon.mapping.seeding import SweptView
 from spiked.recon.view_store import ViewStore
 from spiked.render import Camera
-from spiked.sensor import LEAST_DEPTH, Intrinsics, Sensor
+from spiked.sensor import LEAST_DEPTH, Image, Intrinsics, Sensor
 from spiked.spline import Path, Waypoints
+from spiked.undistortion import Undistortion, widest_undistortion
 
 QUICK_SWEEP = 4
 """Divisor of the swept pixels where views are far apart: 0.1 s, short enough not to lose a fast camera."""
+SWEPT_SIDES = 2.5
+"""Longest side of undistorted images that are swept, in widths of the sensor."""
+UNKNOWN_NOISE = 1e6
+"""Deviation of pixels outside of the image, in spikes a frame: they weigh nothing."""
 VERSION_STEPS = 20
 """Steps from one version of the map to the next."""
 
@@ -114,15 +119,40 @@ class MapTrainer:
         if planes is None:
             return None
 
+        lens = None
+        if self.camera.intrinsics.distortion is not None:  # the sweep's warps are homographies
+            lens = widest_undistortion(self.camera.intrinsics, self.camera.width, self.camera.height, SWEPT_SIDES)
+
         def posed(at: int) -> PosedImage:
             image = luminance(self.views.image(ids[at]).rate, self.sensor.mosaic)
+            image = image if lens is None else lens.straighten(image, np.nan)
             return PosedImage(image, rotations[at], centres[at])
 
         others = [posed(at) for at in neighbours(centres, rotations[:, :, 2], row, seeding.neighbours)]
         pixels = SWEPT_PIXELS // QUICK_SWEEP if quick else SWEPT_PIXELS
         noise = seeding.noise * view.deviation
-        swept = sweep(posed(row), others, self.camera.intrinsics, planes, noise, pixels, self._threads)
+        if lens is None:
+            swept = sweep(posed(row), others, self.camera.intrinsics, planes, noise, pixels, self._threads)
+        else:
+            swept = self._sweep_straight(lens, posed(row), others, planes, noise, pixels)
         return SweptView(view, rotations[row], centres[row], float(np.median(depths[depths > 0])), swept)
+
+    def _sweep_straight(
+        self,
+        lens: Undistortion,
+        reference: PosedImage,
+        others: list[PosedImage],
+        planes: tuple[float, float],
+        noise: Image,
+        pixels: int,
+    ) -> Sweep:
+        """A sweep of undistorted images, bent again. Pixels outside of the reference say nothing."""
+        known = np.isfinite(reference.image)
+        filled = replace(reference, image=np.where(known, reference.image, np.float32(0)))
+        straight = np.where(known, lens.straighten(noise), np.float32(UNKNOWN_NOISE))
+        pixels = round(pixels * known.size / noise.size)
+        swept = sweep(filled, others, lens.straight, planes, straight, pixels, self._threads)
+        return Sweep(lens.bend(swept.inverse_depth), lens.bend(np.where(known, swept.confidence, np.float32(0))))
 
     def step(self, path: Path, decay: float, coarse: float, share: float) -> None:
         """One gradient step on the next view of a random order.

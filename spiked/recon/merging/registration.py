@@ -284,7 +284,10 @@ def _normals(one: Sighting, back: Similarity, middle: Array) -> tuple[Array, Arr
     change = np.concatenate([-hat(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3)), arm[:, :, None]], 2)
     change = one.own.rotation.T @ change
     slope = change[:, :2] / z[:, None, None] - local[:, :2, None] / z[:, None, None] ** 2 * change[:, 2:]
-    slope = slope * np.array([intrinsics.fx, intrinsics.fy])[:, None] / PIXEL_SCALE_PX
+    if intrinsics.distortion is None:
+        slope = slope * np.array([intrinsics.fx, intrinsics.fy])[:, None] / PIXEL_SCALE_PX
+    else:
+        slope = intrinsics.by_slope(local[:, :2] / z[:, None]) @ slope / PIXEL_SCALE_PX
     error = (intrinsics.project(local) - one.pixels) / PIXEL_SCALE_PX
     size = np.linalg.norm(error, axis=1)
     weight = 1 / (1 + size**2)

@@ -78,12 +78,12 @@ class Bundle:
     def residuals(self) -> Array:
         """Reprojection errors [M, 2] in px; a point at or behind its camera has infinite error."""
         out = np.empty((len(self.camera), 2))
-        _bundle.residuals(*self._seen(), out)
+        _bundle.residuals(*self._seen(), out, **self.intrinsics.lens())
         return out
 
     def cost(self, scale_px: float) -> float:
         """Mean over observations of the Cauchy loss log(1 + e^2 / s^2)."""
-        return float(_bundle.cost(*self._seen(), scale_px))
+        return float(_bundle.cost(*self._seen(), scale_px, **self.intrinsics.lens()))
 
     def _seen(self) -> tuple[object, ...]:
         """First arguments of the compiled functions."""
@@ -196,6 +196,7 @@ class Bundle:
             system.whitened_gradient,
             system.roots,
             system.pose_hessian,
+            **self.intrinsics.lens(),
         )
         return system
 

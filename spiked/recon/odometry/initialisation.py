@@ -248,7 +248,8 @@ def parallax_px(views: Views) -> float:
 def _from_five_point(views: Views) -> Bundle | None:
     """Relative pose of the first and last view from the essential matrix, the others by PnP."""
     k = views.intrinsics.matrix()
-    first, last = views.pixels[0], views.pixels[-1]
+    seen = views.intrinsics.undistorted(views.pixels)
+    first, last = seen[0], seen[-1]
     essential, mask = cv2.findEssentialMat(first, last, k, cv2.RANSAC, RANSAC_CONFIDENCE, ESSENTIAL_INLIER_PX)
     if essential is None or essential.shape != (3, 3):
         return None
@@ -262,9 +263,7 @@ def _from_five_point(views: Views) -> Bundle | None:
     points[~ok] = views.rays()[0][~ok] * np.median(points[ok, 2])
     rotations, centres = np.tile(np.eye(3), (len(views.pixels), 1, 1)), np.zeros((len(views.pixels), 3))
     for i in range(1, len(views.pixels)):
-        found, rvec, tvec, _ = cv2.solvePnPRansac(
-            points[ok], views.pixels[i][ok], k, None, reprojectionError=PNP_INLIER_PX
-        )
+        found, rvec, tvec, _ = cv2.solvePnPRansac(points[ok], seen[i][ok], k, None, reprojectionError=PNP_INLIER_PX)
         if not found:
             return None
         rotation = cv2.Rodrigues(rvec)[0].T

@@ -123,7 +123,9 @@ def solve_pose(
     rotation, centre = start.rotation.copy(), start.centre.copy()
     errors, hessian = np.empty(len(points)), np.empty((6, 6))
     scales = np.array(scales_px)
-    _bundle.fit_pose(points, pixels, k.fx, k.fy, k.cx, k.cy, scales, rotation, centre, errors, hessian, move)
+    _bundle.fit_pose(
+        points, pixels, k.fx, k.fy, k.cx, k.cy, scales, rotation, centre, errors, hessian, move, **k.lens()
+    )
     depth = max(median((points - centre) @ rotation[:, 2]), LEAST_DEPTH_SCALE)
     seen_px = _bundle.displacement(hessian, rotation, k.fx, k.fy, k.cx, k.cy, depth)
     return SolvedPose(Pose(rotation, centre), errors, hessian, seen_px)
@@ -135,7 +137,7 @@ def draw_pose(points: Array, pixels: Array, intrinsics: Intrinsics) -> tuple[Pos
     points [n, 3] are seen at pixels [n, 2], many of them wrongly. None if fewer than `LEAST_DRAWN` agree.
     """
     good, turn, shift, inliers = cv2.solvePnPRansac(
-        points, pixels, intrinsics.matrix(), None,
+        points, intrinsics.undistorted(pixels), intrinsics.matrix(), None,
         iterationsCount=DRAWS, reprojectionError=DRAWN_PX, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
     )  # fmt: skip
     if not good or inliers is None or len(inliers) < LEAST_DRAWN:

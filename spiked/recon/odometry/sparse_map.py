@@ -197,6 +197,7 @@ class SparseMap:
             max(TRIANGULATION_MIN_SPREAD_PX, TRIANGULATION_MIN_SPREAD_NOISES * self.noise_px),
             TRIANGULATION_MAX_ERROR_PX,
             self.points,
+            **k.lens(),
         )
 
     def bundle(self, views: list[TrackedView]) -> MapBundle | None:

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from spiked.pose import Array
 from spiked.recon.frontend.feature_tracks import NO_WARPS, Tracks
 from spiked.recon.odometry.sparse_map import Pose, SparseMap
+from spiked.sensor import LEAST_DEPTH
 
 WARP_RANGE = (0.6, 1.7)
 """Singular values of the warps that are used: beyond, a track keeps the template as it is."""
@@ -29,9 +30,14 @@ def template_warps(sparse_map: SparseMap, tracks: Tracks, pose: Pose) -> NDArray
     shift = np.where(known[:, None], (centres - pose.centre) @ pose.rotation, 0.0)
     k = sparse_map.intrinsics
     focal = np.array([k.fx, k.fy])
-    at = depth[:, None] * np.einsum("nij,nj->ni", turn, k.unproject(tracks.birthplace)) + shift
+    rays = k.unproject(tracks.birthplace)
+    at = depth[:, None] * np.einsum("nij,nj->ni", turn, rays) + shift
     warps = _jacobians(turn, depth, at)
-    warps = warps * focal[:, None] / focal
+    if k.distortion is None:
+        warps = warps * focal[:, None] / focal
+    else:
+        seen, before = (k.by_slope(ray[:, :2] / np.maximum(ray[:, 2:], LEAST_DEPTH)) for ray in (at, rays))
+        warps = seen @ warps @ np.linalg.inv(before)
     sizes = np.linalg.svd(warps, compute_uv=False)
     warps[~((sizes > WARP_RANGE[0]) & (sizes < WARP_RANGE[1])).all(1)] = np.eye(2)
     return np.ascontiguousarray(warps, np.float32)

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ValidationError
 from spiked_service.api.routes.options import whole
 from spiked_service.api.schemas.base import In
 
-UNSAID = ("c2w is not a rotation", "quaternion_wxyz is zero")
+UNSAID = ("c2w is not a rotation", "quaternion_wxyz is zero", "folds the image")
 """The rules that JSON Schema cannot say, or only so that no tool understands it."""
 
 

@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 from spiked.client import ApiError, GeometryModel, IntrinsicsModel, ReconstructionOptions
+from spiked.distortion import Distortion, LensModel
 from spiked.recording import RecordingWriter
-from spiked.sensor import Sensor
+from spiked.sensor import Intrinsics, Sensor
+from spiked.undistortion import Undistortion
 
 from ..survival import moving_recording
 from .conftest import write_recording
@@ -187,6 +189,24 @@ def test_geometry_can_be_said_instead_of_a_sidecar(service: Any, recording: Path
     )
     capture = service.client.upload(recording, geometry=geometry)
     assert (capture.sensor.width, capture.sensor.height, capture.sensor.intrinsics.fx) == (96, 64, 90)
+
+
+def test_a_lens_can_be_said_and_is_undone_on_request(service: Any, recording: Path) -> None:
+    recording.with_suffix(".json").unlink()
+    optics = {"fx": 90, "fy": 90, "cx": 48, "cy": 32, "distortion": {"model": "opencv", "k1": -0.3, "k2": 0.1}}
+    geometry = GeometryModel(
+        width=96, height=64, frame_rate_hz=20_000, intrinsics=IntrinsicsModel.model_validate(optics)
+    )
+    capture = service.client.upload(recording, geometry=geometry)
+    assert capture.sensor.intrinsics.distortion.k1 == -0.3
+    url = f"captures/{capture.id}/preview"
+    seen, straight = (
+        cv2.imdecode(np.frombuffer(service.http.get(url, params=query).content, np.uint8), cv2.IMREAD_GRAYSCALE)
+        for query in ({"frame": 100, "format": "png"}, {"frame": 100, "format": "png", "undistorted": True})
+    )
+    k = Intrinsics(90.0, 90.0, 48.0, 32.0, Distortion(LensModel.OPENCV, (-0.3, 0.1)))
+    expected = Undistortion.of(k, 96, 64).straighten(seen.astype(np.float32))
+    assert np.abs(expected - seen).mean() > 3 * np.abs(expected - straight).mean()
 
 
 def test_another_file_than_announced_is_told(service: Any, recording: Path) -> None:

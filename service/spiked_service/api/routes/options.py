@@ -22,6 +22,8 @@ def whole(schema: dict[str, Any]) -> dict[str, Any]:
         name = str(node.get("$ref", "")).removeprefix("#/$defs/")
         if name in definitions:
             node = {**definitions[name], **{key: value for key, value in node.items() if key != "$ref"}}
+        if "propertyName" in node:  # a discriminator, whose mapping has references
+            return {"propertyName": node["propertyName"]}
         return {key: resolved(value) for key, value in node.items()}
 
     found: dict[str, Any] = resolved(schema)

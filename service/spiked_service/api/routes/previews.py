@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.routing import APIRoute
 
+from spiked.errors import ConfigurationError
 from spiked.recording import open_recording
 from spiked_service.api import files
 from spiked_service.api.problems import NotReadyError, problems
@@ -17,7 +18,7 @@ from spiked_service.api.schemas.captures import StatsOut
 from spiked_service.api.schemas.views import ViewRequest
 from spiked_service.api.views import image_format, views_response
 from spiked_service.captures.captures import Captures
-from spiked_service.results.frame_images import FrameWindow, PictureKind, frame_window_at, picture, statistics
+from spiked_service.results.frame_images import FrameWindow, Picture, PictureKind, frame_window_at, picture, statistics
 from spiked_service.results.image_encoding import ImageFormat, encode, thumbnail
 from spiked_service.results.versions import write_atomically
 from spiked_service.results.view_renderer import ViewRenderer
@@ -35,6 +36,9 @@ White = Annotated[
     Query(
         ge=1e-6, le=1e6, description="Value shown as white. Default: determined from the image and returned in X-White."
     ),
+]
+Undistorted = Annotated[
+    bool, Query(description="Without the distortion of the lens: of a recorded frame, or of the scene.")
 ]
 _PICTURE: dict[int | str, dict[str, Any]] = {
     200: {"description": "The image; X-Frame is its middle frame.", "content": PICTURES},
@@ -61,6 +65,7 @@ def preview_routes(
         frame: Frame = None,
         gain: Gain = 1.0,
         white: White = None,
+        undistorted: Undistorted = False,
         format: WishedImage = None,
         accept: Annotated[str, Header(include_in_schema=False)] = "",
     ) -> Response:
@@ -68,10 +73,13 @@ def preview_routes(
         requested = image_format(format, accept)
         if kind is PictureKind.RENDER:
             result = results.of(results.newest(capture_id))
-            return views_response(result, _view_at(result, frame, white, gain), requested, views)
+            return views_response(result, _view_at(result, frame, white, gain, undistorted), requested, views)
         if frame is None and captures.get(capture_id).row.state.acquiring:
+            if undistorted:
+                raise ConfigurationError("the newest frames are shown as the lens images them; give a recorded frame")
             return _live_preview(captures, capture_id, PreviewKind(kind))
-        return _recorded_preview(_frame_window(captures, folder, capture_id, frame), kind, white, gain, requested)
+        window = _frame_window(captures, folder, capture_id, frame)
+        return _recorded_preview(picture(window, kind, white, undistorted), gain, requested)
 
     @router.get("/thumbnail", responses=_THUMBNAIL, response_class=Response)
     def get_thumbnail(capture_id: str, request: Request) -> Response:
@@ -110,11 +118,8 @@ def _live_preview(captures: Captures, capture_id: str, kind: PreviewKind) -> Res
     )
 
 
-def _recorded_preview(
-    window: FrameWindow, kind: PictureKind, white: float | None, gain: float, requested: ImageFormat
-) -> Response:
+def _recorded_preview(shown: Picture, gain: float, requested: ImageFormat) -> Response:
     """An image of recorded frames."""
-    shown = picture(window, kind, white)
     limit = shown.white / gain
     return Response(
         encode(shown.image, requested, limit), media_type=requested.media_type, headers=_headers(limit, shown.frame)
@@ -125,12 +130,12 @@ def _headers(white: float, frame: int) -> dict[str, str]:
     return {"X-White": repr(white), "X-Frame": str(frame), "Cache-Control": "no-store"}
 
 
-def _view_at(result: Result, frame: int | None, white: float | None, gain: float) -> ViewRequest:
+def _view_at(result: Result, frame: int | None, white: float | None, gain: float, undistorted: bool) -> ViewRequest:
     """The view from the pose of a frame, of the newest pose if None."""
     rate = 1.0 if result.sensor is None else result.sensor.frame_rate_hz
     pose = round(result.poses().time_s(-1) * rate - 0.5) if frame is None else frame
     shown_white = (result.published.white if white is None else white) / gain
-    return ViewRequest.model_validate({"camera": {"frame": pose}, "white": shown_white})
+    return ViewRequest.model_validate({"camera": {"frame": pose}, "white": shown_white, "undistorted": undistorted})
 
 
 def _frame_window(captures: Captures, folder: DataFolder, capture_id: str, frame: int | None) -> FrameWindow:

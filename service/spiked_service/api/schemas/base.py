@@ -152,7 +152,7 @@ def camera_example(**fields: Any) -> ConfigDict:
 
 
 class IntrinsicsModel(In, Pinhole):
-    """A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5)."""
+    """A pinhole camera behind a lens; pixels, the centre of the first pixel is (0.5, 0.5)."""
 
     model_config = example(fx=420.0, fy=420.0, cx=200.0, cy=125.0)
 

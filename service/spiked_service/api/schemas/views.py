@@ -4,7 +4,7 @@ from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, StrictFloat, StrictInt, model_validator
+from pydantic import Field, StrictBool, StrictFloat, StrictInt, model_validator
 
 from spiked.pose import rotation_of
 from spiked_service.api.schemas.base import Finite, In, IntrinsicsModel, Quaternion, exactly_one_of, examples, together
@@ -103,6 +103,7 @@ class ViewRequest(In):
         description="Optics of the pictures; if not given the capture's own, scaled to the width, the height taken "
         "from or added to the middle.",
     )
+    undistorted: StrictBool = Field(False, description="Without the distortion of the lens that these optics have.")
     background: tuple[_Light, _Light, _Light] = Field(
         (0.0, 0.0, 0.0), description="Red, green and blue behind the scene; 1 is white."
     )

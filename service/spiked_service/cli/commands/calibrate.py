@@ -1,26 +1,55 @@
-"""`spiked calibrate`: a camera's per-pixel gain, dark rate and defects from two recordings."""
+"""`spiked calibrate`: a camera's per-pixel gain, dark rate and defects, or its lens, from recordings."""
 
+import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
+import cv2
 import numpy as np
 import typer
+from rich.progress import Progress
 
+from spiked.board import Board
 from spiked.calibration import Calibration
 from spiked.camera import Pinhole
+from spiked.distortion import LensModel
+from spiked.lens_calibration import board_views, calibrate_lens
 from spiked.profile import CameraProfile
-from spiked.recording import RecordingGeometry
+from spiked.recording import Recording, RecordingGeometry
 from spiked.sensor import Sensor
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
-from spiked_service.cli.console import output, report_warning
+from spiked_service.cli.console import messages, output, report_warning
+
+_LENS = "Lens"
 
 
 def calibrate(
-    flat: Annotated[Path, typer.Argument(help="A recording of even light, such as a white wall out of focus.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The .npz file to write.")],
+    flat: Annotated[
+        Path,
+        typer.Argument(
+            help="A recording of even light, such as a white wall out of focus; with --board, of the board."
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The .npz file to write; with --board, a .json file.")],
     dark: Annotated[Path | None, typer.Option(help="A recording with the lens cap on.")] = None,
+    board: Annotated[
+        str | None,
+        typer.Option(
+            help="Measure the lens by a ChArUco board of so many squares.",
+            metavar="COLUMNSxROWS",
+            rich_help_panel=_LENS,
+        ),
+    ] = None,
+    markers: Annotated[
+        str, typer.Option(help="OpenCV's set of the board's markers.", rich_help_panel=_LENS)
+    ] = Board.dictionary,
+    model: Annotated[
+        LensModel | None,
+        typer.Option(help="Formula of the distortion. Default: the one that explains more.", rich_help_panel=_LENS),
+    ] = None,
     width: g.Width = None,
     height: g.Height = None,
     rate: g.Rate = None,
@@ -34,10 +63,14 @@ def calibrate(
         typer.Option("--write-profile", help="Camera profile to make, or to complete, with this calibration."),
     ] = None,
 ) -> None:
-    """Measure each pixel's gain and dark rate, and find dead and hot pixels.
+    """Measure each pixel's gain and dark rate, and find dead and hot pixels; or, with --board, measure the lens.
 
     `spiked reconstruct --calibration FILE` corrects rates by the result. One second of each recording is enough. Use
     light at which pixels fire every 3 to 10 frames.
+
+    With --board the recording shows a ChArUco board, held in the hand for two seconds or more: filling most of the
+    image, tilted to all sides, near and far. OUT gets focal length, centre and distortion with standard deviations, for
+    `--intrinsics OUT` of other commands; beside it OUT.png shows the errors.
 
     Examples:
 
@@ -45,12 +78,18 @@ def calibrate(
 
     - `spiked calibrate flat.dat --dark dark.dat -o camera.npz --write-profile camera.json`
 
+    - `spiked calibrate board.dat --board 9x6 -o lens.json --write-profile camera.json`
+
     - `spiked reconstruct rec.dat -o out --profile camera.json`
     """
     outputs.try_file("--out", out)
     if write_profile is not None:
         outputs.try_file("--write-profile", write_profile)
     geometry = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic)
+    if board is not None:
+        shown = g.open_described(flat, geometry, profile).recording
+        _calibrate_lens(shown, Board.parse(board, markers), model, out, write_profile)
+        return
     recordings = [
         None if path is None else g.open_described(path, geometry, profile).recording for path in (flat, dark)
     ]
@@ -72,8 +111,8 @@ def calibrate(
     )
 
 
-def _write_profile(path: Path, calibration: Path, sensor: Sensor) -> None:
-    """What the recording says of its camera, and the calibration, over the profile that is there."""
+def _write_profile(path: Path, calibration: Path | None, sensor: Sensor) -> None:
+    """What the recording says of its camera, and the calibration if there is one, over the profile that is there."""
     before = CameraProfile.read(path) if path.exists() and path.stat().st_size else CameraProfile()
     stated = {
         "width": sensor.width,
@@ -82,8 +121,41 @@ def _write_profile(path: Path, calibration: Path, sensor: Sensor) -> None:
         "mosaic": sensor.mosaic,
         "flipped": sensor.flipped,
         "intrinsics": None if before.fov is not None else Pinhole.of(sensor.intrinsics),
-        "calibration": Path(os.path.relpath(calibration, path.parent)),
+        "calibration": None if calibration is None else Path(os.path.relpath(calibration, path.parent)),
     }
     known = {name: value for name, value in stated.items() if value is not None}
     before.model_copy(update=known).write(path)
     output.print(f"{path}: camera profile with this calibration", markup=False)
+
+
+def _calibrate_lens(
+    recording: Recording, board: Board, model: LensModel | None, out: Path, profile: Path | None
+) -> None:
+    """Write the lens of a recording of a board, and the picture of its errors."""
+    for warning in recording.warnings:
+        report_warning(warning)
+    sensor = recording.sensor
+    with Progress(console=messages, transient=True) as bar:
+        task = bar.add_task("finding the board", total=1.0)
+        views = board_views(recording, board, progress=lambda share: bar.update(task, completed=share))
+    found = calibrate_lens(views, board, sensor.width, sensor.height, model)
+    for warning in found.warnings():
+        report_warning(warning)
+    about = {"board": {"columns": board.columns, "rows": board.rows, "markers": board.dictionary}}
+    with outputs.writing("--out", out):
+        size = {"width": sensor.width, "height": sensor.height}
+        out.write_text(json.dumps({**size, **found.report(), **about}, indent=1) + "\n", encoding="utf-8")
+        picture = cv2.imencode(".png", found.picture(sensor.width, sensor.height))[1]
+        out.with_suffix(".png").write_bytes(picture.tobytes())
+    if profile is not None:
+        before = CameraProfile.read(profile) if profile.exists() and profile.stat().st_size else CameraProfile()
+        before.model_copy(update={"fov": None}).write(profile)
+        _write_profile(profile, None, replace(sensor, intrinsics=found.intrinsics))
+    k, sigma = found.intrinsics, found.sigmas
+    values = {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy, **(k.distortion.named() if k.distortion else {})}
+    lens = ", ".join(f"{name} {value:.5g} (+- {sigma[name]:.2g})" for name, value in values.items() if name in sigma)
+    output.print(
+        f"{out}: {k.distortion.model if k.distortion else 'no distortion'}, {lens}; {len(found.pixels)} corners in "
+        f"{found.views} images, {found.rms_px:.3f} px RMS, {found.rejected} left out",
+        markup=False,
+    )

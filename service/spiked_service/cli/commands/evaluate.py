@@ -67,7 +67,7 @@ def _score_views(recording: Recording, truth: Trajectory, estimate: Trajectory, 
     matrices = [np.array(view.c2w) for view in held_out.views]
     poses = [similarity.poses(matrix[:3, :3], matrix[:3, 3]) for matrix in matrices]
     pictures = [_read_picture(folder / view.file, colour=sensor.mosaic is not None) for view in held_out.views]
-    rasteriser = Rasteriser(Camera(sensor.intrinsics, sensor.width, sensor.height))
+    rasteriser = Rasteriser(Camera(sensor.intrinsics.pinhole, sensor.width, sensor.height))
 
     def render(rotation: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float32]:
         values = rasteriser.forward(scene, rotation[None], centre[None]).values

@@ -62,6 +62,7 @@ def rows(recording: Recording) -> list[tuple[str, str]]:
         ("frames", f"{recording.frames} at {sensor.frame_rate_hz:g} Hz, {seconds:.4f} s"),
         ("spikes", f"{rate:.4f} a pixel and frame, {rate * sensor.frame_rate_hz:.0f} a pixel and second{part}"),
         ("optics", f"fx {k.fx:.2f} fy {k.fy:.2f} cx {k.cx:.2f} cy {k.cy:.2f} px" if k else "not known"),
+        ("lens", "not known" if k is None else str(k.distortion or "no distortion")),
         ("gaps", gaps),
     ]
 

@@ -32,6 +32,7 @@ def localise(
     json_out: Annotated[Path | None, typer.Option("--json", help="Also write the figures to this file.")] = None,
     fov: g.Fov = None,
     intrinsics: g.IntrinsicsText = None,
+    distortion: g.DistortionText = None,
     width: g.Width = None,
     height: g.Height = None,
     rate: g.Rate = None,
@@ -66,7 +67,7 @@ def localise(
     for warning in recording.warnings:
         report_warning(warning)
     end = _end(recording, start, frames)
-    sensor = g.with_optics(recording.sensor, fov, intrinsics)
+    sensor = g.with_optics(recording.sensor, fov, intrinsics, distortion)
     index = MapIndex(known.scene, known.known.trajectory, camera_in(sensor, known.camera))
     localiser = Localiser(index, sensor, measured)
     for first_frame, part in track(

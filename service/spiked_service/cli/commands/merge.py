@@ -55,11 +55,14 @@ def merge(
 
 def _report(merged: Merged, folders: tuple[Path, Path], maps: tuple[MapFolder, MapFolder]) -> dict[str, object]:
     intrinsics = maps[0].intrinsics
+    distortion = intrinsics.distortion
+    lens = {} if distortion is None else {"distortion": {"model": str(distortion.model), **distortion.named()}}
     return {
         "versions": versions(),
         "sensor": {"width": maps[0].width, "height": maps[0].height},
         "focal_px": [intrinsics.fx, intrinsics.fy],
         "principal_point_px": [intrinsics.cx, intrinsics.cy],
+        **lens,
         "outcome": "complete",
         "splats": len(merged.scene),
         "merged": {

@@ -85,6 +85,7 @@ def reconstruct(
     watch_port: Annotated[int, typer.Option(help="Port of the progress page; 0: any free port.", min=0)] = 8660,
     fov: g.Fov = None,
     intrinsics: g.IntrinsicsText = None,
+    distortion: g.DistortionText = None,
     width: g.Width = None,
     height: g.Height = None,
     rate: g.Rate = None,
@@ -136,7 +137,7 @@ def reconstruct(
     recording = described.recording
     for warning in recording.warnings:
         report_warning(warning)
-    sensor = g.with_optics(recording.sensor, fov, intrinsics)
+    sensor = g.with_optics(recording.sensor, fov, intrinsics, distortion)
     if mosaic is g.MosaicChoice.AUTO:
         sensor = _by_pixels(recording, sensor)
     chosen = ReconstructionOptions(

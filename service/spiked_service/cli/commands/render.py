@@ -1,11 +1,13 @@
 """`spiked render`: pictures of a scene along a path."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.progress import track
 
+from spiked.distortion import Distortion
 from spiked.recon.statistics import evenly
 from spiked.render import Camera
 from spiked.render.cpu import Rasteriser
@@ -14,7 +16,7 @@ from spiked.sensor import Intrinsics
 from spiked.trajectory import Trajectory
 from spiked_service.cli import outputs
 from spiked_service.cli.console import messages, output
-from spiked_service.cli.recording_flags import parse_intrinsics
+from spiked_service.cli.recording_flags import DistortionText, parse_intrinsics
 from spiked_service.results.image_encoding import ImageFormat, encode
 
 
@@ -27,6 +29,7 @@ def render(
     height: Annotated[int, typer.Option(help="Height in pixels.")] = 250,
     fov: Annotated[float, typer.Option(help="Horizontal field of view in degrees.")] = 60.0,
     intrinsics: Annotated[str | None, typer.Option(help="fx,fy,cx,cy in pixels; overrides --fov.")] = None,
+    distortion: DistortionText = None,
     white: Annotated[
         float | None,
         typer.Option(help="Radiance shown as white. Default: from the PLY, or 1.", min=1e-9),
@@ -41,7 +44,10 @@ def render(
     Example: `spiked render out/scene.ply --poses out/trajectory.tum -o views --count 4`
     """
     outputs.try_folder("--out", out)
-    k = parse_intrinsics(intrinsics) if intrinsics else Intrinsics.from_fov(width, height, fov)
+    lens = None if distortion is None else Distortion.parse(distortion)
+    k = Intrinsics.from_fov(width, height, fov, lens)
+    if intrinsics:
+        k = replace(parse_intrinsics(intrinsics), distortion=lens)
     rasteriser = Rasteriser(Camera(k, width, height))
     splats, path = Scene.read_ply(scene), Trajectory.read_tum(poses)
     shown_white = splats.colour_of_white if white is None else white

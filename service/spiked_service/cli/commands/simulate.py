@@ -18,7 +18,7 @@ from spiked.simulate.record import camera_of_files
 from spiked.simulate.record import simulate as write_simulation
 from spiked_service.cli import outputs
 from spiked_service.cli.console import messages, output
-from spiked_service.cli.recording_flags import with_optics
+from spiked_service.cli.recording_flags import DistortionText, with_optics
 
 _FOV_DEG = 60.0
 """Horizontal field of view if none is given, degrees."""
@@ -42,6 +42,7 @@ def simulate(
     mosaic: Annotated[Mosaic | None, typer.Option(help="Colour mosaic of the upright image. Default: grey.")] = None,
     fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees. Default: 60.")] = None,
     intrinsics: Annotated[str | None, typer.Option(help="fx,fy,cx,cy in pixels.", metavar="FX,FY,CX,CY")] = None,
+    distortion: DistortionText = None,
     gain: Annotated[
         float | None,
         typer.Option(help="Spikes per frame of white. Default: from the PLY, or 0.35."),
@@ -60,18 +61,23 @@ def simulate(
 ) -> None:
     """Simulate a camera with shot, thermal, dark and fixed-pattern noise, with ground truth.
 
+    With --distortion the recording is distorted; the held-out views are not.
+
     Examples:
 
     - `spiked simulate -o room --frames 1280`
 
     - `spiked simulate -o again --scene out/scene.ply --poses out/trajectory.tum --fov 60`
 
+    - `spiked simulate -o wide --fov 120 --distortion fisheye:0.02`
+
     - `spiked simulate -o walk --scene flat.ply --poses walk.tum --fov 60 --frames 200000 --views 40`
     """
     outputs.try_folder("--out", out)
-    sensor = with_optics(Sensor(width, height, rate, mosaic=mosaic), fov, intrinsics)
-    if sensor.intrinsics is None:
-        sensor = with_optics(sensor, _FOV_DEG, None)
+    sensor = Sensor(width, height, rate, mosaic=mosaic)
+    if intrinsics is None and fov is None:
+        fov = _FOV_DEG
+    sensor = with_optics(sensor, fov, intrinsics, distortion)
     if (scene is None) != (poses is None):
         raise ConfigurationError("give --scene and --poses together")
     step_px = default_step_px(frames) if picture_step is None else picture_step

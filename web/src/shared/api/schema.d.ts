@@ -1700,6 +1700,37 @@ export interface components {
             finding: string;
         };
         /**
+         * FisheyeLens
+         * @description Distortion by OpenCV's fisheye model.
+         */
+        FisheyeLens: {
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            model: "fisheye";
+            /**
+             * K1
+             * @default 0
+             */
+            k1?: number;
+            /**
+             * K2
+             * @default 0
+             */
+            k2?: number;
+            /**
+             * K3
+             * @default 0
+             */
+            k3?: number;
+            /**
+             * K4
+             * @default 0
+             */
+            k4?: number;
+        };
+        /**
          * FrameRangeOut
          * @description Frames `first` to `first + count - 1`, by absolute index.
          */
@@ -1807,7 +1838,7 @@ export interface components {
         ImageFormat: "png" | "webp" | "jpeg" | "exr";
         /**
          * IntrinsicsModel
-         * @description A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5).
+         * @description A pinhole camera behind a lens; pixels, the centre of the first pixel is (0.5, 0.5).
          * @example {
          *       "cx": 200,
          *       "cy": 125,
@@ -1824,10 +1855,15 @@ export interface components {
             cx: number;
             /** Cy */
             cy: number;
+            /**
+             * Distortion
+             * @description Of the lens, as OpenCV has it; null: none.
+             */
+            distortion?: (components["schemas"]["OpencvLens"] | components["schemas"]["FisheyeLens"]) | null;
         };
         /**
          * IntrinsicsOption
-         * @description A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5).
+         * @description A pinhole camera behind a lens; pixels, the centre of the first pixel is (0.5, 0.5).
          */
         IntrinsicsOption: {
             /** Fx */
@@ -1838,6 +1874,11 @@ export interface components {
             cx: number;
             /** Cy */
             cy: number;
+            /**
+             * Distortion
+             * @description Of the lens, as OpenCV has it; null: none.
+             */
+            distortion?: (components["schemas"]["OpencvLens"] | components["schemas"]["FisheyeLens"]) | null;
         };
         /**
          * JobState
@@ -2020,6 +2061,42 @@ export interface components {
          */
         Mosaic: "RGGB" | "BGGR" | "GRBG" | "GBRG";
         /**
+         * OpencvLens
+         * @description Distortion by OpenCV's polynomial: radial k1, k2, k3 and tangential p1, p2.
+         */
+        OpencvLens: {
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            model: "opencv";
+            /**
+             * K1
+             * @default 0
+             */
+            k1?: number;
+            /**
+             * K2
+             * @default 0
+             */
+            k2?: number;
+            /**
+             * P1
+             * @default 0
+             */
+            p1?: number;
+            /**
+             * P2
+             * @default 0
+             */
+            p2?: number;
+            /**
+             * K3
+             * @default 0
+             */
+            k3?: number;
+        };
+        /**
          * Origin
          * @description Where a recording comes from.
          * @enum {string}
@@ -2093,7 +2170,7 @@ export interface components {
         PictureKind: "interval" | "rate" | "accumulation" | "render";
         /**
          * Pinhole
-         * @description A pinhole camera; pixels, the centre of the first pixel is (0.5, 0.5).
+         * @description A pinhole camera behind a lens; pixels, the centre of the first pixel is (0.5, 0.5).
          */
         Pinhole: {
             /** Fx */
@@ -2104,6 +2181,11 @@ export interface components {
             cx: number;
             /** Cy */
             cy: number;
+            /**
+             * Distortion
+             * @description Of the lens, as OpenCV has it; null: none.
+             */
+            distortion?: (components["schemas"]["OpencvLens"] | components["schemas"]["FisheyeLens"]) | null;
         };
         /**
          * Policy
@@ -3156,6 +3238,12 @@ export interface components {
             height?: number | null;
             /** @description Optics of the pictures; if not given the capture's own, scaled to the width, the height taken from or added to the middle. */
             intrinsics?: components["schemas"]["IntrinsicsModel"] | null;
+            /**
+             * Undistorted
+             * @description Without the distortion of the lens that these optics have.
+             * @default false
+             */
+            undistorted?: boolean;
             /**
              * Background
              * @description Red, green and blue behind the scene; 1 is white.
@@ -4972,6 +5060,8 @@ export interface operations {
                 gain?: number;
                 /** @description Value shown as white. Default: determined from the image and returned in X-White. */
                 white?: number | null;
+                /** @description Without the distortion of the lens: of a recorded frame, or of the scene. */
+                undistorted?: boolean;
                 /** @description Takes precedence over Accept; the default is PNG. */
                 format?: components["schemas"]["ImageFormat"] | null;
             };

@@ -47,6 +47,11 @@ BEYOND_SCHEMA = {
 """Where what the schema allows may be refused with 422 or 413 all the same, and why; test_rules has the other rules."""
 TOO_LARGE = ("/api/v1/captures", "/api/v1/uploads")
 """Where 507 says that the disk has no room for what is asked: no failure of the service."""
+OF_SOME = (
+    "/api/v1/reconstructions/{reconstruction_id}/localisation",
+    "/api/v1/reconstructions/{reconstruction_id}/registration",
+)
+"""What a new reconstruction need not have: it depends on its task, and answers 404 otherwise."""
 _ACCEPTED = ["2xx", "3xx", "401", "403", "404", "409", "429", "5xx"]
 
 
@@ -61,6 +66,9 @@ def configuration(known: dict[str, str]) -> str:
         lines += [f"checks.positive_data_acceptance.expected-statuses = {accepted}"]
         if path in TOO_LARGE:
             lines += ['checks.not_a_server_error.expected-statuses = ["2xx", "3xx", "4xx", "507"]']
+    for path in OF_SOME:
+        lines += ["[[operations]]", f'include-path = "{path}"']
+        lines += ["checks.ensure_resource_availability.enabled = false"]
     return "\n".join(lines) + "\n"
 
 

@@ -35,7 +35,7 @@ def left_behind(data_store: DataStore, job: ReconstructionRow, frames: int) -> N
     parameters = {"options": job.options.model_dump(mode="json"), "intrinsics": None}
     assert recording.sensor.intrinsics is not None
     k = recording.sensor.intrinsics
-    parameters["intrinsics"] = {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}
+    parameters["intrinsics"] = {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy, "distortion": None}
     reconstructor = Reconstructor(recording.sensor, job.options.options(), recording=recording)
     saver = CheckpointSaver(data_store.folder.checkpoint(job.id), recording, parameters, pytest.fail)
 

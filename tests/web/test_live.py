@@ -178,7 +178,7 @@ def test_kinds_of_pictures_and_gain(studied: Studied, visit: Callable[..., Any])
         )
 
     before = mean()
-    page.get_by_label("Gain").fill("-2")
+    page.get_by_role("slider", name="Gain").fill("-2")
     until(lambda: mean() < 0.5 * before, "the picture is darker")
 
 

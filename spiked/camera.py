@@ -22,7 +22,7 @@ from pydantic import (
 
 from spiked.distortion import Distortion
 from spiked.errors import ConfigurationError
-from spiked.lens import Lens, lens_of
+from spiked.lens import Lens, distortion_of, lens_of
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
 
 __all__ = ["CameraFiles", "CameraOptions", "LocalPath", "Pinhole", "PinholeText", "Rate", "Side", "StoredCameraOptions"]
@@ -59,8 +59,7 @@ class Pinhole(BaseModel):
 
     def intrinsics(self) -> Intrinsics:
         """The same for the library."""
-        lens = None if self.distortion is None else self.distortion.distortion()
-        return Intrinsics(self.fx, self.fy, self.cx, self.cy, lens)
+        return Intrinsics(self.fx, self.fy, self.cx, self.cy, distortion_of(self.distortion))
 
     @classmethod
     def of(cls, intrinsics: Intrinsics | None) -> Self | None:

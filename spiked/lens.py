@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictFloat, model_validator
 from spiked.distortion import MOST_COEFFICIENT, Distortion, LensModel
 from spiked.errors import ConfigurationError
 
-__all__ = ["FisheyeLens", "Lens", "OpencvLens", "lens_of"]
+__all__ = ["FisheyeLens", "Lens", "OpencvLens", "distortion_of", "lens_of"]
 
 Coefficient = Annotated[StrictFloat, Field(ge=-MOST_COEFFICIENT, le=MOST_COEFFICIENT)]
 
@@ -61,3 +61,8 @@ def lens_of(distortion: Distortion | None) -> OpencvLens | FisheyeLens | None:
     if distortion.model is LensModel.OPENCV:
         return OpencvLens(model=LensModel.OPENCV, **distortion.named())
     return FisheyeLens(model=LensModel.FISHEYE, **distortion.named())
+
+
+def distortion_of(lens: OpencvLens | FisheyeLens | None) -> Distortion | None:
+    """As of a camera; None for none."""
+    return None if lens is None else lens.distortion()

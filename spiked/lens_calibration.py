@@ -15,6 +15,8 @@ from spiked.board import Board
 from spiked.camera import Pinhole
 from spiked.distortion import Distortion, LensModel
 from spiked.errors import CalibrationError, ConfigurationError
+from spiked.recon.frontend.windowing import luminance
+from spiked.recon.statistics import WHITE_PERCENTILE, evenly
 from spiked.recording import Recording
 from spiked.sensor import Intrinsics, Sensor
 
@@ -25,8 +27,6 @@ Array = NDArray[np.float64]
 VIEWS, WINDOW_FRAMES, EDGE_FRAMES = 80, 16, 48
 """Views of the board, evenly spread over the recording; frames of each; frames on either side that are searched for the
 spikes that bound it."""
-WHITE_PERCENTILE = 99.5
-"""Percentile of the rates that is shown as white to the detector."""
 LEAST_CORNERS, LEAST_VIEWS = 8, 8
 """Corners that a view needs, and views that a calibration needs."""
 LEAST_COVER = 0.4
@@ -123,8 +123,7 @@ def board_views(
     sensor, found = recording.sensor, []
     if recording.frames < window_frames:
         raise CalibrationError(f"{recording.path} has {recording.frames} frames: an image needs {window_frames}")
-    begins = np.linspace(0, recording.frames - window_frames, views).round().astype(int)
-    for done, begin in enumerate(np.unique(begins).tolist()):
+    for done, begin in enumerate(evenly(recording.frames - window_frames + 1, views)):
         low = max(begin - EDGE_FRAMES, 0)
         high = min(begin + window_frames + EDGE_FRAMES, recording.frames)
         window = aligned_window(recording.read(low, high - low), sensor, low, begin, begin + window_frames)
@@ -136,10 +135,9 @@ def board_views(
 
 
 def _picture(rate: NDArray[np.float32], sensor: Sensor) -> NDArray[np.uint8]:
-    if sensor.mosaic is not None:  # a mean that sees every colour in the same proportion
-        rate = cv2.sepFilter2D(rate, cv2.CV_32F, np.array([0.25, 0.5, 0.25]), np.array([0.25, 0.5, 0.25]))
-    white = max(float(np.percentile(rate, WHITE_PERCENTILE)), 1e-6)
-    return np.asarray(np.round(255 * np.sqrt(np.clip(rate / white, 0, 1))), np.uint8)
+    grey = luminance(rate, sensor.mosaic)
+    white = max(float(np.percentile(grey, WHITE_PERCENTILE)), 1e-6)
+    return np.asarray(np.round(255 * np.sqrt(np.clip(grey / white, 0, 1))), np.uint8)
 
 
 def calibrate_lens(

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from spiked.errors import ConfigurationError, SceneError
-from spiked.lens import Lens
+from spiked.lens import Lens, distortion_of
 from spiked.recon import KnownMap
 from spiked.render import Camera
 from spiked.scene import Scene
@@ -58,7 +58,7 @@ class MapFolder:
         cx, cy = report.principal_point_px or (sensor.width / 2, sensor.height / 2)
         scene, path = Scene.read_ply(folder / "scene.ply"), Trajectory.read_tum(folder / "trajectory.tum")
         paths = {one.name: Trajectory.read_tum(folder / PATHS / f"{one.name}.tum") for one in report.paths}
-        intrinsics = Intrinsics(fx, fy, cx, cy, None if report.distortion is None else report.distortion.distortion())
+        intrinsics = Intrinsics(fx, fy, cx, cy, distortion_of(report.distortion))
         paths = paths or {file_name(folder.resolve().name): path}
         return cls(scene, path, sensor.width, sensor.height, intrinsics, paths, report.versions)
 

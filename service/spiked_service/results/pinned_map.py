@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from spiked.errors import ConfigurationError
-from spiked.lens import Lens, lens_of
+from spiked.lens import Lens, distortion_of, lens_of
 from spiked.poses import PoseFile
 from spiked.recon import KnownMap
 from spiked.render import Camera
@@ -49,8 +49,7 @@ class PinnedMap(BaseModel):
     @property
     def intrinsics(self) -> Intrinsics:
         """Of the camera of its own recording."""
-        lens = None if self.distortion is None else self.distortion.distortion()
-        return Intrinsics(self.fx, self.fy, self.cx, self.cy, lens)
+        return Intrinsics(self.fx, self.fy, self.cx, self.cy, distortion_of(self.distortion))
 
     def recorded(self, folder: Path) -> list[RecordedPath]:
         """The paths of all recordings. Raises SceneError."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from spiked.errors import ConfigurationError
-from spiked.lens import Lens, lens_of
+from spiked.lens import Lens, distortion_of, lens_of
 from spiked.poses import PoseAppender
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
@@ -74,8 +74,7 @@ class Published(BaseModel):
     @property
     def camera(self) -> Intrinsics | None:
         """The intrinsics with the distortion."""
-        lens = None if self.distortion is None else self.distortion.distortion()
-        return None if self.intrinsics is None else Intrinsics(*self.intrinsics, lens)
+        return None if self.intrinsics is None else Intrinsics(*self.intrinsics, distortion_of(self.distortion))
 
 
 class _Index(BaseModel):

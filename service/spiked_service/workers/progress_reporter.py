@@ -116,8 +116,7 @@ class ProgressReporter:
         """Publish the live result of a capture that is reconstructed again from its recording."""
         self._least_poses = 0
         status = self._reconstructor.status()
-        if self._reconstructor.posed_frames:
-            self._publish(status, every_frame=True)
+        self._publish(status, every_frame=True)
         self._send_status(status)
         self._channel.send(FramesSkipped(frames=status.frames, skipped=skipped))
 
@@ -136,8 +135,7 @@ class ProgressReporter:
         self._timeline.closed(self._reconstructor.closures())
         self._least_poses = 0
         status = self._reconstructor.status()
-        if self._reconstructor.posed_frames:
-            self._publish(status, tolerance=0.0, every_frame=True)
+        self._publish(status, tolerance=0.0, every_frame=True)
         shown = self._best(cut_short)
         self._poses = self._poses if shown is None else shown.poses
         if shown is not None and shown.version != self._publisher.version:
@@ -219,7 +217,8 @@ class ProgressReporter:
         )
 
     def _publish(self, status: Status, tolerance: float = TOLERANCE, every_frame: bool = False) -> None:
-        """Publish a version; while a long path is tracked with the poses of its views, or of `every_frame`."""
+        """Publish a version if there is a path; while a long one is tracked with the poses of its views, or of
+        `every_frame`."""
         poses = self._reconstructor.posed_frames
         self._published_s, self._seen = time.monotonic(), status.version
         if not poses or poses < self._least_poses:

@@ -156,7 +156,7 @@ class Host:
     """Cameras at one test bed, and the loop that serves them."""
 
     def __init__(self, cameras: list[CameraSettings], limits: Limits, usbfs_memory_mb: int) -> None:
-        self.selector = selectors.DefaultSelector()
+        self.selector = selectors.SelectSelector()  # in microseconds; epoll's timeout is rounded up to a millisecond
         self.testbed = Testbed(usbfs_memory_mb)
         self.limits = limits
         self._timers: list[tuple[float, Callable[[], None]]] = []

@@ -6,6 +6,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -529,6 +530,34 @@ def test_a_disk_gone_read_only_is_survived_and_made_up_for(small_disk: Path, tmp
         data_store.captures.retry_saving()
         assert data_store.catalogue.captures.get(capture_id).state.over
         assert_holds(data_store.captures.recording(capture_id), frames)
+
+
+def fill_to_the_last_byte(disk: Path) -> Path:
+    """A file that leaves no room at all on a small disk, not even for the catalogue."""
+    filler = disk / "others"
+    with filler.open("wb", buffering=0) as file, suppress(OSError):
+        while file.write(bytes(1 << 16)):
+            pass
+    return filler
+
+
+def test_a_job_whose_row_could_not_be_saved_begins_when_the_disk_has_room(
+    small_disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("spiked_service.captures.archive._CLEAN_S", 0.2)
+    random_recording(tmp_path / "noise.dat", 500)
+    with kept(small_disk) as data_store:
+        done = over(data_store, data_store.captures.start(Plan(f"replay:{tmp_path / 'noise.dat'}?pace=0")).id)
+        job = done.reconstructions[0]
+        assert job.state.over
+        filler = fill_to_the_last_byte(small_disk)
+        with pytest.raises(StoreError):
+            while True:
+                data_store.catalogue.reconstructions.put(job)
+        assert data_store.reconstructions.restart(job.id).state is JobState.QUEUED
+        filler.unlink()
+        wait_for(lambda: data_store.reconstructions.rows.get(job.id).attempts > 0, "its worker begins")
+        wait_for(lambda: data_store.reconstructions.rows.get(job.id).state.over, "it ends")
 
 
 def test_a_capture_that_cannot_be_recorded_at_all_fails_and_says_so(data_store: DataStore, tmp_path: Path) -> None:

@@ -226,8 +226,13 @@ class Victim:
             now = [(job["id"], job["state"], job["stage"], job["frames"], job["progress"]) for job in left]
             if now != last:
                 last, since_s = now, time.monotonic()
-            assert time.monotonic() - since_s < DEADLINE_S, f"no job gets on: {left}"
+            assert time.monotonic() - since_s < DEADLINE_S, f"no job gets on: {left}\n{self.logs()}"
             time.sleep(0.2)
+
+    def logs(self) -> str:
+        """The ends of the logs of all jobs, which go with the disk."""
+        logs = sorted(self._data.glob("reconstructions/*/log"))
+        return "\n".join(f"{log}:\n{log.read_text(errors='replace')[-4000:]}" for log in logs)
 
     def _ready(self) -> Any:
         with suppress(httpx.HTTPError):

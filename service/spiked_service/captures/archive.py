@@ -93,6 +93,7 @@ class DataStore:
         while not self._over.wait(_CLEAN_S):
             self._guarded(self.captures.retry_saving)
             self._guarded(self.reconstructions.rows.retry_saving)
+            self.reconstructions.wake_queue()  # jobs may have waited for a row
             self._guarded(self.retention.apply)
 
     def _guarded(self, work: Callable[[], None]) -> None:

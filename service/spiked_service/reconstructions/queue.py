@@ -179,7 +179,7 @@ class Reconstructions:
             self.rows.remove(row.id)
 
     def wake_queue(self) -> None:
-        """Check the queue: the recording of a capture has been closed, or will not exist."""
+        """Check the queue: the recording of a capture has been closed, or will not exist, or rows have been saved."""
         with self._lock:
             self._wake.notify_all()
 

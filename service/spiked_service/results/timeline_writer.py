@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spiked.errors import SceneError
 from spiked.recon import State, Status, Tracked
 from spiked_service.results.timeline import states_at
 
@@ -15,13 +16,16 @@ NAME = "timeline.jsonl"
 
 
 class TimelineWriter:
-    """Starts a timeline; a kill leaves at most one incomplete line. Raises OSError if the disk is full."""
+    """Starts a timeline; a kill leaves at most one incomplete line. Raises SceneError if the disk is full."""
 
     def __init__(self, folder: Path, views: int = 0, frames: int = 0) -> None:
         """Of the timeline in the folder the first `views` moments stay, and gaps before frame `frames`."""
         path = folder / NAME
         lines = path.read_bytes().splitlines(keepends=True) if views and path.exists() else []
-        self._file = path.open("w", buffering=1)
+        try:
+            self._file = path.open("wb")
+        except OSError as error:
+            raise _write_error(path, error) from error
         self._frames: list[int] = []
         self._states: list[State] = []
         self._closures: set[tuple[float, float]] = set()
@@ -82,4 +86,12 @@ class TimelineWriter:
         return states_at(self._frames, self._states, frames)
 
     def _add(self, line: dict[str, Any]) -> None:
-        self._file.write(json.dumps(line) + "\n")
+        try:
+            self._file.write(json.dumps(line).encode() + b"\n")
+            self._file.flush()
+        except OSError as error:
+            raise _write_error(Path(self._file.name), error) from error
+
+
+def _write_error(path: Path, error: OSError) -> SceneError:
+    return SceneError(f"{path}: the timeline cannot be written: {error.strerror}; free disk space")

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from spiked_service.results.timeline import STATES, Timeline, Timelines
-from spiked_service.results.timeline_writer import TimelineWriter
+from spiked_service.results.timeline_writer import NAME, TimelineWriter
 
+from spiked.errors import SceneError
 from spiked.recon import State
 
 
@@ -64,3 +65,10 @@ def test_closed_loops_are_told_once_also_after_a_resumption(tmp_path: Path) -> N
     timeline = Timeline.read(path)
     assert [(one.earlier_s, one.later_s) for one in timeline.closures] == [(0.1, 3.5), (0.2, 3.6)]
     assert len(timeline.moments) == 2 and len(timeline.gaps) == 1
+
+
+def test_a_timeline_on_a_full_disk_says_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / NAME).symlink_to("/dev/full")
+    writer = TimelineWriter(tmp_path)
+    with pytest.raises(SceneError, match="timeline cannot be written: No space left on device; free disk space"):
+        writer.lost(0, 3, "usb")

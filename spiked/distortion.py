@@ -24,6 +24,8 @@ MOST_COEFFICIENT = 1000.0
 """Coefficients beyond are refused: only lenses of a very narrow field have some above 10."""
 LEAST_REACH = 0.02
 """A lens that images only slopes below this, 1 degree, is refused: its coefficients are wrong."""
+FITTED_SLOPES = 100
+"""Slopes at which a lens is fitted to one of another model."""
 NEWTON_STEPS, NEWTON_TOLERANCE = 30, 1e-12
 """Most steps of the inverse, and the largest slope error that ends it."""
 
@@ -145,6 +147,26 @@ class Distortion:
         rows = [scale + 2 * x * x * growth + 2 * p1 * y + 6 * p2 * x, mixed]
         rows += [mixed, scale + 2 * y * y * growth + 6 * p1 * y + 2 * p2 * x]
         return np.stack(rows, -1).reshape(*x.shape, 2, 2)
+
+    def by_radial(self, slopes: Array) -> Array:
+        """Derivative [..., 2, 2] of bent slopes by k1 and k2, at slopes [..., 2]."""
+        inside = self._limited(slopes)
+        square = np.maximum((inside**2).sum(-1), 1e-10)
+        first = next_ = square
+        if self.model is LensModel.FISHEYE:
+            angle = np.arctan(np.sqrt(square))
+            first, next_ = angle**3 / np.sqrt(square), angle**2
+        return np.asarray(inside[..., None] * np.stack([first, first * next_], -1)[..., None, :])
+
+    def as_model(self, model: LensModel, widest: float) -> "Distortion":
+        """k1 and k2 of a model that bends slopes up to `widest` as nearly like this one as it can.
+
+        Raises ConfigurationError if that folds the image.
+        """
+        slopes = np.stack([np.linspace(0, min(widest, self.reach), FITTED_SLOPES)[1:], np.zeros(FITTED_SLOPES - 1)], -1)
+        plain = Distortion(model, ())
+        rows = plain.by_radial(slopes)[:, 0]
+        return Distortion(model, tuple(np.linalg.lstsq(rows, (self.bend(slopes) - plain.bend(slopes))[:, 0])[0]))
 
     def straighten(self, bent: Array) -> Array:
         """Slopes [..., 2] whose bent slopes are given, by Newton's method; at most `reach` long."""

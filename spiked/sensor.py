@@ -126,6 +126,14 @@ class Intrinsics:
         """The inverse of `undistorted`, for pixels [..., 2]."""
         return pixels if self.distortion is None else self.project(self.pinhole.unproject(pixels))
 
+    @property
+    def folds(self) -> bool:
+        """Whether the distortion turns back before the corner of the image, the centre taken to be its middle."""
+        if self.distortion is None:
+            return False
+        corner = np.hypot(self.cx / self.fx, self.cy / self.fy)
+        return bool(np.linalg.norm(self.distortion.bend(np.array([self.distortion.reach, 0.0]))) < corner)
+
     def lens(self) -> dict[str, NDArray[np.float64]]:
         """Keyword arguments of compiled functions: `lens` [7] as `Distortion.arguments`; none without distortion."""
         return {} if self.distortion is None else {"lens": self.distortion.arguments()}

@@ -48,6 +48,27 @@ def test_the_derivative_is_that_of_the_bent_slopes(distortion: Distortion) -> No
     assert np.abs(distortion.derivative(slopes) - numeric).max() < 1e-8
 
 
+@pytest.mark.parametrize("distortion", LENSES, ids=str)
+def test_k1_and_k2_move_bent_slopes_as_their_derivative_says(distortion: Distortion) -> None:
+    at, step = points(distortion), 1e-6
+    slopes = at[:, :2] / at[:, 2:]
+    slopes = slopes[np.linalg.norm(slopes, axis=1) < 0.9 * distortion.reach]
+    for number in range(2):
+        moved = np.array(distortion.coefficients)
+        moved[number] += step
+        difference = (Distortion(distortion.model, tuple(moved)).bend(slopes) - distortion.bend(slopes)) / step
+        np.testing.assert_allclose(distortion.by_radial(slopes)[..., number], difference, atol=1e-5)
+
+
+def test_a_lens_is_said_by_the_other_model() -> None:
+    mild, slopes = Distortion(LensModel.OPENCV, (-0.1, 0.02)), np.stack([np.linspace(0, 0.7, 50)] * 2, -1) / np.sqrt(2)
+    fisheye = mild.as_model(LensModel.FISHEYE, 0.7)
+    assert fisheye.model is LensModel.FISHEYE
+    assert np.abs(fisheye.bend(slopes) - mild.bend(slopes)).max() < 1e-4
+    back = fisheye.as_model(LensModel.OPENCV, 0.7)
+    assert back.coefficients[:2] == pytest.approx(mild.coefficients[:2], abs=5e-3)
+
+
 def test_slopes_beyond_the_fold_are_not_imaged_again() -> None:
     folding = Distortion(LensModel.OPENCV, (-0.3,))
     assert folding.reach == pytest.approx(np.sqrt(1 / 0.9), abs=2e-3)  # where 1 + 3 k1 r^2 = 0

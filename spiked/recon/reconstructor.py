@@ -21,7 +21,7 @@ from spiked.recon.mapping.scene_psnr import COMPARED_VIEWS, scene_psnr_db
 from spiked.recon.mapping.trainer import MapTrainer
 from spiked.recon.odometry.keyframe_pictures import KeyframePictures
 from spiked.recon.odometry.odometry import Odometry
-from spiked.recon.odometry.self_calibration import FIRST_DEG, FOCAL_TOLERANCE, Focal
+from spiked.recon.odometry.self_calibration import FIRST_DEG, EstimatedLens, Focal, optics_moved
 from spiked.recon.options import Options
 from spiked.recon.refiner import Refiner
 from spiked.recon.report import Sample, Status, Tracked, WorkLog
@@ -239,7 +239,7 @@ class Reconstructor:
         if path is None:
             return
         with self._log.measure("mapping"):
-            if self._focal_moved():
+            if self._optics_moved():
                 self._trainer.restart(self.odometry.intrinsics)
             self._stage = "mapping"
             self._trainer.train_live(path, self._points(), until)
@@ -254,9 +254,13 @@ class Reconstructor:
         """The known landmarks [N, 3]."""
         return self.odometry.points[np.isfinite(self.odometry.points[:, 0])]
 
-    def _focal_moved(self) -> bool:
-        """Whether the focal length changed by more than `FOCAL_TOLERANCE` since the map was begun."""
-        return bool(abs(np.log(self.odometry.intrinsics.fx / self.camera.intrinsics.fx)) > FOCAL_TOLERANCE)
+    def _optics_moved(self) -> bool:
+        """Whether focal length or distortion changed by more than their tolerance since the map was begun."""
+        return optics_moved(self.camera.intrinsics, self.odometry.intrinsics)
+
+    def _estimated(self) -> list[Focal | EstimatedLens]:
+        """What was estimated of the optics."""
+        return [one for one in (self.odometry.focal, self.odometry.lens) if one is not None]
 
     def finish(
         self,
@@ -314,9 +318,9 @@ class Reconstructor:
         save: Callable[[], None],
     ) -> None:
         self._stage = "refining"
-        if self.focal is not None:
-            self.warnings.append(f"{self.focal}: give --fov or --intrinsics if you know it")
-        if len(self._trainer.mapper.scene) and not self._focal_moved():
+        for estimate in self._estimated():
+            self.warnings.append(f"{estimate}: {estimate.ADVICE}")
+        if len(self._trainer.mapper.scene) and not self._optics_moved():
             progress(self.status())  # the live map, before it may be rebuilt
             if cancelled():
                 return  # a rebuilt map without refinement would be worse
@@ -364,7 +368,7 @@ class Reconstructor:
         o, m = self.odometry, self._trainer.mapper
         last = next((v for v in reversed(o.views) if v.rotation is not None), None)
         pose = (last.inliers, last.chi2, last.sigma_px) if last is not None else (None, None, None)
-        reason = o.reason if self.focal is None or o.spline is None else f"{o.reason}; {self.focal}"
+        reason = o.reason if o.spline is None else "; ".join(map(str, [o.reason, *self._estimated()]))
         version = self._path_version + self._trainer.version
         return Status(o.state, reason, self._stage, self._frames, len(m.scene), m.loss, version, self._progress, *pose)
 
@@ -445,7 +449,7 @@ class Reconstructor:
         return {
             "versions": report.versions(),
             "sensor": {"width": sensor.width, "height": sensor.height, "frame_rate_hz": sensor.frame_rate_hz},
-            **report.focal_section(mapper, self.focal),
+            **report.optics_section(mapper, self.focal, self.odometry.lens),
             "options": report.options_section(self.options),
             "frames": self._frames,
             "gaps": [{"first_frame": f, "frames": n} for f, n in self._gaps],

@@ -13,7 +13,7 @@ from spiked.pose import Array, log_so3
 from spiked.recon.frontend.demosaic import fill_mosaic
 from spiked.recon.mapping.mapper import Mapper
 from spiked.recon.odometry.odometry import WORST_PATH_ERROR, Odometry
-from spiked.recon.odometry.self_calibration import Focal
+from spiked.recon.odometry.self_calibration import EstimatedLens, Focal, corner_px
 from spiked.recon.odometry.sparse_map import TrackedView
 from spiked.recon.odometry.tracking_state import State
 from spiked.recon.options import Options
@@ -207,8 +207,8 @@ def closures_section(closures: list[tuple[float, float]]) -> list[dict[str, floa
     return [{"earlier_s": round(earlier, 6), "later_s": round(later, 6)} for earlier, later in ordered]
 
 
-def focal_section(mapper: Mapper, focal: Focal | None) -> dict[str, object]:
-    """The focal length in use; `focal` where it was estimated."""
+def optics_section(mapper: Mapper, focal: Focal | None, estimated: EstimatedLens | None) -> dict[str, object]:
+    """The intrinsics in use; `focal` and `estimated` where focal length and distortion were estimated."""
     sigma = None if focal is None or not np.isfinite(focal.relative_sigma) else focal.relative_sigma
     lens = mapper.camera.intrinsics.distortion
     return {
@@ -217,6 +217,9 @@ def focal_section(mapper: Mapper, focal: Focal | None) -> dict[str, object]:
         **({} if lens is None else {"distortion": {"model": str(lens.model), **lens.named()}}),
         "focal_estimated": focal is not None,
         "focal_relative_sigma": sigma,
+        "distortion_estimated": estimated is not None,
+        "distortion_corner_px": None if lens is None else corner_px(mapper.camera.intrinsics),
+        "distortion_corner_sigma_px": None if estimated is None else estimated.corner_sigma_px,
     }
 
 

@@ -8,12 +8,14 @@ import pytest
 from spiked.pose import exp_so3
 from spiked.recon.odometry import banded_bundle
 from spiked.recon.odometry.bundle_adjustment import Bundle
+from spiked.recon.odometry.normal_equations import FreeOptics
 from spiked.sensor import Intrinsics
 
+OPTICS = [FreeOptics(focal, radial) for radial in (False, True) for focal in (False, True)]
 POSES, POINTS, WAY, NOISE_PX, SCALE_PX = 40, 800, 15.0, 0.05, 0.5
 
 
-def sideways(loop: bool, focal_free: bool = False) -> Bundle:
+def sideways(loop: bool, free: FreeOptics = FreeOptics()) -> Bundle:  # noqa: B008
     """Poses along a wall, with errors; with a `loop` the last ones see what the first ones saw."""
     rng = np.random.default_rng(0)
     intrinsics = Intrinsics.from_fov(400, 250, 60)
@@ -34,21 +36,26 @@ def sideways(loop: bool, focal_free: bool = False) -> Bundle:
         camera,
         point,
         pixels[seen] + NOISE_PX * rng.standard_normal((int(seen.sum()), 2)),
-        replace(intrinsics, fx=1.02 * intrinsics.fx, fy=1.02 * intrinsics.fy) if focal_free else intrinsics,
-        focal_free,
+        replace(intrinsics, fx=1.02 * intrinsics.fx, fy=1.02 * intrinsics.fy) if free.focal else intrinsics,
+        free,
     )
 
 
 @pytest.mark.parametrize("loop", [False, True], ids=["open", "loop"])
-@pytest.mark.parametrize("focal_free", [False, True], ids=["", "focal"])
-def test_it_is_the_dense_adjustment(loop: bool, focal_free: bool) -> None:
-    dense, banded = sideways(loop, focal_free), sideways(loop, focal_free)
+@pytest.mark.parametrize("free", OPTICS, ids=["", "focal", "lens", "both"])
+def test_it_is_the_dense_adjustment(loop: bool, free: FreeOptics) -> None:
+    dense, banded = sideways(loop, free), sideways(loop, free)
     fixed = np.arange(POSES) < 2
     cost = dense.optimise(4, SCALE_PX, fixed)
     assert banded_bundle.optimise(banded, 4, SCALE_PX, fixed) == pytest.approx(cost, rel=1e-6)
     np.testing.assert_allclose(banded.centres, dense.centres, atol=1e-7)
     np.testing.assert_allclose(banded.points, dense.points, atol=1e-6)
     assert banded.intrinsics.fx == pytest.approx(dense.intrinsics.fx, rel=1e-7)
+    if free.radial:
+        assert banded.intrinsics.distortion is not None and dense.intrinsics.distortion is not None
+        assert banded.intrinsics.distortion.coefficients == pytest.approx(
+            dense.intrinsics.distortion.coefficients, abs=1e-7
+        )
 
 
 def test_the_band_is_narrow_on_an_open_path_and_in_a_loop() -> None:

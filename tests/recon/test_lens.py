@@ -14,6 +14,7 @@ from spiked.recon import Options, Reconstructor
 from spiked.recon.mapping.frame_warp import FrameWarp
 from spiked.recon.odometry.bundle_adjustment import Bundle
 from spiked.recon.odometry.initialisation import Views, bootstrap
+from spiked.recon.odometry.normal_equations import FreeOptics, PoseBlocks
 from spiked.recon.odometry.pnp import draw_pose, solve_pose
 from spiked.recon.odometry.sparse_map import Pose
 from spiked.render import Camera
@@ -149,17 +150,61 @@ def test_a_room_is_reconstructed_through_a_lens(k: Intrinsics) -> None:
     assert reconstructor.report()["distortion"]["k1"] == k.distortion.coefficients[0]  # type: ignore[index, union-attr]
 
 
-def test_a_lens_that_is_ignored_spoils_the_path() -> None:
-    small = replace(BARREL.scaled(0.5), cx=100.0, cy=64.0)
+def test_the_adjustment_moves_as_a_free_lens_says() -> None:
+    """Normal equations of the focal length, k1 and k2 against differences of the residuals."""
+    pixels, rotations, centres, points = tracks(BARREL, 0.05)
+    camera, point = np.divmod(np.arange(1500), 150)
+    free = FreeOptics(focal=True, radial=True)
+    bundle = Bundle(rotations, centres, points, camera, point, pixels.reshape(-1, 2), BARREL, free)
+    fixed, step = PoseBlocks.of_poses(np.zeros(10, bool)), 1e-6
+    system = bundle.linearise(1e6, fixed)
+    moved = [replace(bundle, intrinsics=free.moved(BARREL, step * unit)).residuals() for unit in np.eye(3)]
+    by_optics = (np.stack(moved, -1) - bundle.residuals()[..., None]).reshape(-1, 3) / step
+    np.testing.assert_allclose(system.hessian, by_optics.T @ by_optics, rtol=1e-4)
+    np.testing.assert_allclose(system.gradient, by_optics.T @ bundle.residuals().ravel(), rtol=1e-3)
+
+
+def moved_through(small: Intrinsics) -> tuple[Sensor, np.ndarray, Trajectory]:
+    """400 frames of a camera that moves sideways in the built-in room, and its path."""
     sensor = Sensor(200, 128, 20_000.0, intrinsics=small)
     camera = SimulatedCamera(sensor, seed=2, motion=MotionKind.ARC, flow_px=0.2, parallax=0.4, threads=2)
-    frames, count = camera.next_frames(400), np.arange(400)
-    truth = Trajectory((count + 0.5) / 20_000.0, *camera.truth(count))
+    count = np.arange(400)
+    return sensor, camera.next_frames(400), Trajectory((count + 0.5) / 20_000.0, *camera.truth(count))
+
+
+def tracked(sensor: Sensor, frames: np.ndarray) -> Reconstructor:
+    reconstructor = Reconstructor(sensor, Options(steps=0))
+    reconstructor.feed(0, frames)
+    reconstructor.finish()
+    return reconstructor
+
+
+@pytest.mark.parametrize("focal_known", [True, False], ids=["focal", "nothing"])
+@LENSES
+def test_a_lens_that_nobody_stated_is_found_and_said(k: Intrinsics, focal_known: bool) -> None:
+    assert k.distortion is not None
+    radial = Distortion(k.distortion.model, k.distortion.coefficients[:2])
+    small = Intrinsics(0.5 * k.fx, 0.5 * k.fx, 100.0, 64.0, radial)
+    sensor, frames, truth = moved_through(small)
     errors = []
-    for known in (sensor, replace(sensor, intrinsics=small.pinhole)):
-        reconstructor = Reconstructor(known, Options(steps=0))
-        reconstructor.feed(0, frames)
-        reconstructor.finish()
+    for known in (sensor, replace(sensor, intrinsics=small.pinhole if focal_known else None)):
+        reconstructor = tracked(known, frames)
         score = score_trajectory(truth=truth, estimate=reconstructor.trajectory(), frame_rate_hz=20_000.0)
-        errors.append(np.inf if score.errors is None else score.errors.ate_percent)
-    assert errors[1] > 3 * errors[0]
+        assert score.errors is not None
+        errors.append(score.errors.ate_percent)
+    assert errors[1] < 2 * errors[0]
+    found = reconstructor.camera.intrinsics
+    middle = np.stack(np.meshgrid(np.linspace(30, 170, 8), np.linspace(20, 108, 6)), -1)
+    rays = [one.unproject(middle) for one in (small, found)]
+    assert np.abs(small.project(rays[1]) - small.project(rays[0])).max() < 2
+    assert any("the lens distorts, which was not given and was estimated" in line for line in reconstructor.warnings)
+    assert "the lens distorts" in reconstructor.status().reason
+    report = reconstructor.report()
+    assert report["distortion_estimated"] and report["distortion_corner_sigma_px"] is not None
+
+
+def test_a_camera_without_distortion_is_not_given_one() -> None:
+    sensor, frames, _ = moved_through(Intrinsics(173.0, 173.0, 100.0, 64.0))
+    reconstructor = tracked(sensor, frames)
+    assert reconstructor.odometry.lens is None and reconstructor.camera.intrinsics.distortion is None
+    assert reconstructor.report()["distortion_estimated"] is False

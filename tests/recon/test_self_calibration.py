@@ -11,7 +11,8 @@ from spiked.pose import exp_so3
 from spiked.recon import Options, Reconstructor, State
 from spiked.recon.odometry.bundle_adjustment import Bundle
 from spiked.recon.odometry.initialisation import Views
-from spiked.recon.odometry.self_calibration import MAX_FOCAL_SIGMA, Focal, try_fields
+from spiked.recon.odometry.normal_equations import FreeOptics
+from spiked.recon.odometry.self_calibration import MAX_FOCAL_SIGMA, Focal, try_optics
 from spiked.recording import open_recording
 from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
@@ -36,23 +37,23 @@ def tracks(turn_rad: float, way: float) -> tuple[np.ndarray, np.ndarray, np.ndar
 def test_adjustment_finds_the_focal_length() -> None:
     pixels, rotations, centres, points = tracks(0.25, 0.3)
     camera, point = np.divmod(np.arange(pixels.shape[0] * pixels.shape[1]), pixels.shape[1])
-    bundle = Bundle(rotations, centres, points, camera, point, pixels.reshape(-1, 2), GUESS, focal_free=True)
+    bundle = Bundle(rotations, centres, points, camera, point, pixels.reshape(-1, 2), GUESS, FreeOptics(focal=True))
     bundle.optimise(60, 0.3, tolerance=1e-7)
-    sigma = bundle.focal_sigma(0.3)
+    sigma = float(np.sqrt(bundle.optics_covariance(0.3)[0, 0]))
     assert bundle.intrinsics.fx == pytest.approx(K.fx, rel=max(5 * sigma, 1e-3))
     assert sigma < 0.01 and bundle.noise_px() < 0.07
 
 
 def test_the_first_map_is_found_without_a_focal_length() -> None:
     pixels, *_ = tracks(0.25, 0.3)
-    verdict, found = try_fields(Views(pixels, np.arange(pixels.shape[1]), GUESS), 0, 0.8)
+    verdict, found = try_optics(Views(pixels, np.arange(pixels.shape[1]), GUESS), 0, 0.8, False)
     assert verdict.winner is not None, verdict.reason
     assert found.fx == pytest.approx(K.fx, rel=0.03)
 
 
 def test_turning_with_an_unknown_focal_length_is_not_taken_for_moving() -> None:
     pixels, *_ = tracks(0.15, 0.0)
-    verdict, _ = try_fields(Views(pixels, np.arange(pixels.shape[1]), GUESS), 0, 1.2)
+    verdict, _ = try_optics(Views(pixels, np.arange(pixels.shape[1]), GUESS), 0, 1.2, False)
     assert verdict.winner is None and verdict.needs_motion and "parallax" in verdict.reason
 
 

@@ -131,27 +131,82 @@ void inverse_cholesky(const double* v, double* out) {
 // Six parameters of a pose, padded to a whole vector.
 constexpr int kPoseStride = 8;
 
+// The optics that may be free, in this order: the logarithm of the focal length, and k1 with k2 of the lens, OpenCV's
+// if there is none.
+constexpr int kMostOptics = 3;
+
 struct System {
     double scale, damping;
-    int64_t size, unknown, each;  // D, D without the focal length, slots of a pose
+    int64_t size, unknown, each;  // D, D without the optics, slots of a pose
     const int64_t* slots;
     const double* shares;
     double *hessian, *gradient, *eliminated, *whitened_gradient, *roots;
-    bool focal;
+    bool focal, radial;
+
+    int optics() const { return focal + 2 * radial; }
 };
 
 // Sums over the observations of each pose, in rows of kPoseStride.
 struct PoseSums {
     explicit PoseSums(int64_t cameras)
-        : hessian(6 * kPoseStride * cameras), gradient(kPoseStride * cameras), focal(kPoseStride * cameras) {}
+        : hessian(6 * kPoseStride * cameras),
+          gradient(kPoseStride * cameras),
+          optics(kMostOptics * kPoseStride * cameras) {}
 
-    std::vector<double> hessian, gradient, focal;
+    std::vector<double> hessian, gradient, optics;
 };
 
 // Sums over all observations of a point.
 struct PointSums {
-    double hessian[9] = {}, gradient[3] = {}, focal[3] = {};
+    double hessian[9] = {}, gradient[3] = {}, optics[kMostOptics][3] = {};
 };
+
+// Derivatives of the two rows of an observation by the free optics.
+inline void by_optics(const System& system, const Pinhole& k, const double* rotation, const Projection& projection,
+                      const double* pixel, double out[2][kMostOptics]) {
+    if (system.focal) {
+        out[0][0] = projection.error[0] + pixel[0] - k.cx;
+        out[1][0] = projection.error[1] + pixel[1] - k.cy;
+    }
+    if (!system.radial) return;
+    double local[3] = {};
+    for (int i = 0; i < 3; ++i) {
+        for (int j = 0; j < 3; ++j) local[j] += rotation[3 * i + j] * projection.ray[i];
+    }
+    double x = local[0] / local[2], y = local[1] / local[2], square = x * x + y * y;
+    if (k.lens.model && square > k.lens.reach2) {
+        const double shorter = std::sqrt(k.lens.reach2 / square);
+        x *= shorter, y *= shorter, square = k.lens.reach2;
+    }
+    double first = square, next = square;  // of k1, and what makes that of k2 of it
+    if (k.lens.model == 2) {
+        const double r = std::sqrt(std::max(square, 1e-10)), angle = std::atan(r);
+        first = angle * angle * angle / r;
+        next = angle * angle;
+    }
+    const int k1 = system.focal, k2 = k1 + 1;
+    out[0][k1] = k.fx * x * first;
+    out[1][k1] = k.fy * y * first;
+    out[0][k2] = out[0][k1] * next;
+    out[1][k2] = out[1][k1] * next;
+}
+
+// Adds one row of an observation, with its derivatives `d` by the free optics.
+inline void add_optics(const Projection& projection, int row, double weight, const double* d, const System& system,
+                       double* own, PointSums& sums) {
+    const int optics = system.optics();
+    if (!optics) return;
+    double a[6];
+    by_pose(projection.by_point[row], projection.ray, a);
+    for (int n = 0; n < optics; ++n) {
+        for (int m = 0; m < optics; ++m) {
+            system.hessian[(system.unknown + n) * system.size + system.unknown + m] += weight * d[n] * d[m];
+        }
+        system.gradient[system.unknown + n] += weight * d[n] * projection.error[row];
+        for (int i = 0; i < 3; ++i) sums.optics[n][i] += weight * d[n] * projection.by_point[row][i];
+        for (int i = 0; i < 6; ++i) own[kPoseStride * n + i] += weight * d[n] * a[i];
+    }
+}
 
 // Adds one row (u or v) of an observation; `cross` [3][kPoseStride] is its block of point and pose.
 inline void add_row(const Projection& projection, int row, double weight, double* own, double* own_gradient,
@@ -180,10 +235,13 @@ inline void eliminate(const System& system, int64_t p, PointSums& sums, const st
     double* root = system.roots + 9 * p;
     inverse_cholesky(sums.hessian, root);
     for (int a = 0; a < 3; ++a) {
-        const double *r = root + 3 * a, *g = sums.gradient, *f = sums.focal;
+        const double *r = root + 3 * a, *g = sums.gradient;
         double* to = system.eliminated + (3 * p + a) * system.size;
         system.whitened_gradient[3 * p + a] = r[0] * g[0] + r[1] * g[1] + r[2] * g[2];
-        if (system.focal) to[system.unknown] = r[0] * f[0] + r[1] * f[1] + r[2] * f[2];
+        for (int n = 0; n < system.optics(); ++n) {
+            const double* f = sums.optics[n];
+            to[system.unknown + n] = r[0] * f[0] + r[1] * f[1] + r[2] * f[2];
+        }
         for (const int64_t slot : used) {
             const double* from = cross + 3 * kPoseStride * slot;
             for (int i = 0; i < 6; ++i) {
@@ -210,17 +268,13 @@ template <bool Bent>
             if (!projection.in_front) continue;
             const double weight = 1 / (1 + cauchy_square(projection, system.scale));
             double block[3 * kPoseStride] = {};
+            double optics[2][kMostOptics];
+            by_optics(system, k, observations.rotations + 9 * c, projection, observations.pixels + 2 * m, optics);
             for (int row = 0; row < 2; ++row) {
                 add_row(projection, row, weight, poses.hessian.data() + 6 * kPoseStride * c,
                         poses.gradient.data() + kPoseStride * c, block, sums);
-                if (!system.focal) continue;
-                const double f = projection.error[row] + observations.pixels[2 * m + row] - (row ? k.cy : k.cx);
-                double a[6];
-                by_pose(projection.by_point[row], projection.ray, a);
-                system.hessian[system.size * system.size - 1] += weight * f * f;
-                system.gradient[system.unknown] += weight * f * projection.error[row];
-                for (int i = 0; i < 3; ++i) sums.focal[i] += weight * f * projection.by_point[row][i];
-                for (int i = 0; i < 6; ++i) poses.focal[kPoseStride * c + i] += weight * f * a[i];
+                add_optics(projection, row, weight, optics[row], system,
+                           poses.optics.data() + kMostOptics * kPoseStride * c, sums);
             }
             for (int64_t s = c * system.each; s < (c + 1) * system.each; ++s) {
                 const int64_t slot = system.slots[s];
@@ -263,9 +317,11 @@ void scatter_to_slots(const System& system, int64_t cameras, const PoseSums& pos
                     const double* own = poses.hessian.data() + (6 * c + i) * kPoseStride;
                     for (int j = 0; j < 6; ++j) row[6 * other + j] += share * system.shares[t] * own[j];
                 }
-                if (!system.focal) continue;
-                row[system.unknown] += share * poses.focal[kPoseStride * c + i];
-                system.hessian[system.unknown * system.size + 6 * slot + i] += share * poses.focal[kPoseStride * c + i];
+                for (int n = 0; n < system.optics(); ++n) {
+                    const double value = share * poses.optics[(kMostOptics * c + n) * kPoseStride + i];
+                    row[system.unknown + n] += value;
+                    system.hessian[(system.unknown + n) * system.size + 6 * slot + i] += value;
+                }
             }
         }
     }
@@ -273,12 +329,12 @@ void scatter_to_slots(const System& system, int64_t cameras, const PoseSums& pos
 
 void linearise(const In3& rotations, const In2& centres, const In2& points, const Index& camera, const Index& point,
                const In2& pixels, double fx, double fy, double cx, double cy, double scale, double damping,
-               const Index2& slots, const In2& shares, bool focal, const Array<double, 2>& hessian,
+               const Index2& slots, const In2& shares, bool focal, bool radial, const Array<double, 2>& hessian,
                const Array<double, 1>& gradient, const Array<double, 2>& eliminated,
                const Array<double, 2>& whitened_gradient, const Array<double, 3>& roots,
                const Array<double, 3>& pose_hessian, const std::optional<Array<const double, 1>>& lens) {
     const Observations observations(rotations, centres, points, camera, point, pixels);
-    const int64_t size = static_cast<int64_t>(hessian.shape(0)), unknown = size - focal;
+    const int64_t size = static_cast<int64_t>(hessian.shape(0)), unknown = size - focal - 2 * radial;
     const auto count = static_cast<size_t>(observations.point_count),
                cameras = static_cast<size_t>(observations.cameras);
     if (static_cast<int64_t>(hessian.shape(1)) != size || static_cast<int64_t>(gradient.shape(0)) != size ||
@@ -288,7 +344,8 @@ void linearise(const In3& rotations, const In2& centres, const In2& points, cons
         pose_hessian.shape(2) != 6 || unknown < 0 || unknown % 6) {
         throw std::invalid_argument(
             "expected hessian [D, D], gradient [D], eliminated [3 P, D], whitened_gradient [P, 3], roots [P, 3, 3], "
-            "pose_hessian [C, 6, 6] with D six times the slots, and one more for a free focal length");
+            "pose_hessian [C, 6, 6] with D six times the slots, one more for a free focal length and two for a free "
+            "lens");
     }
     if (slots.shape(0) != cameras || shares.shape(0) != cameras || shares.shape(1) != slots.shape(1)) {
         throw std::invalid_argument("slots and shares must be [C, K]");
@@ -310,7 +367,8 @@ void linearise(const In3& rotations, const In2& centres, const In2& points, cons
                            eliminated.data(),
                            whitened_gradient.data(),
                            roots.data(),
-                           focal};
+                           focal,
+                           radial};
     const Pinhole k = {fx, fy, cx, cy, lens_of(lens)};
     nb::gil_scoped_release release;
     std::fill_n(hessian.data(), size * size, 0.0);
@@ -338,10 +396,11 @@ void bind_normal_equations(nb::module_& m) {
     m.def("linearise", &linearise, nb::arg("rotations"), nb::arg("centres"), nb::arg("points"), nb::arg("camera"),
           nb::arg("point"), nb::arg("pixels"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"),
           nb::arg("scale"), nb::arg("damping"), nb::arg("slots"), nb::arg("shares"), nb::arg("focal"),
-          nb::arg("hessian"), nb::arg("gradient"), nb::arg("eliminated"), nb::arg("whitened_gradient"),
-          nb::arg("roots"), nb::arg("pose_hessian"), nb::arg("lens") = nb::none(),
+          nb::arg("radial"), nb::arg("hessian"), nb::arg("gradient"), nb::arg("eliminated"),
+          nb::arg("whitened_gradient"), nb::arg("roots"), nb::arg("pose_hessian"), nb::arg("lens") = nb::none(),
           "Hessian [D, D] and gradient [D] of what the poses are made of: slots [C, K] of six numbers each, with\n"
-          "shares [C, K], and the logarithm of the focal length where it is free. Each point's damped 3x3 Hessian V\n"
+          "shares [C, K], and of the free optics: the logarithm of the focal length, then k1 and k2 of the lens. Each "
+          "point's damped 3x3 Hessian V\n"
           "is taken out: with roots R = chol(V)^-1, `eliminated` holds the rows R cross^T and `whitened_gradient` R "
           "gradient.");
 }

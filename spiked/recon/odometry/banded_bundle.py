@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from spiked.pose import Array
 from spiked.recon.odometry.bundle_adjustment import Bundle, LevenbergMarquardt
-from spiked.recon.odometry.normal_equations import RIDGE, NormalEquations, PoseBlocks, Step, focal_step
+from spiked.recon.odometry.normal_equations import RIDGE, FreeOptics, NormalEquations, PoseBlocks, Step, optics_step
 
 Index = NDArray[np.int64]
 
@@ -103,15 +103,17 @@ class _BandedSystem:
     right: Array
     """[6 F]"""
     cross: Array
-    """[6 F], cross terms with the log focal length."""
-    focal: Array
-    """Hessian of the log focal length, its right side, and its Hessian before marginalisation."""
+    """[6 F, n], cross terms with the free optics."""
+    optics: tuple[Array, Array, Array]
+    """Hessian [n, n] of the free optics, its right side [n], and its diagonal [n] before marginalisation."""
 
     @classmethod
     def of(cls, bundle: Bundle, structure: BandedStructure, scale_px: float, damping: float) -> "_BandedSystem":
         width, size = structure.bandwidth, 6 * len(structure.order)
         band, diagonal = np.zeros((width + 1, size)), np.zeros(size)
-        right, cross, focal, parts = np.zeros(size), np.zeros(size), np.zeros(3), []
+        free = bundle.free.count
+        right, cross, parts = np.zeros(size), np.zeros((size, free)), []
+        optics = np.zeros((free, free)), np.zeros(free), np.zeros(free)
         for group in structure.groups:
             part = _of_group(bundle, group).linearise(scale_px, group.blocks, damping)
             hessian, gradient = part.reduced()
@@ -122,30 +124,33 @@ class _BandedSystem:
             band[width + at[rows] - at[columns], at[columns]] += hessian[rows, columns]
             diagonal[at] += np.diag(part.hessian)[:count]
             right[at] -= gradient[:count]
-            if bundle.focal_free:
-                cross[at] += hessian[:count, -1]
-                focal += [hessian[-1, -1], -gradient[-1], part.hessian[-1, -1]]
+            cross[at] += hessian[:count, count:]
+            own, own_right, own_diagonal = optics
+            own += hessian[count:, count:]
+            own_right -= gradient[count:]
+            own_diagonal += np.diag(part.hessian)[count:]
             parts.append(part)
-        return cls(structure, parts, band, diagonal, right, cross, focal)
+        return cls(structure, parts, band, diagonal, right, cross, optics)
 
-    def solve(self, damping: float, focal_free: bool) -> Step:
-        """Steps of the poses, the points and, if free, the focal length."""
+    def solve(self, damping: float, free: FreeOptics) -> Step:
+        """Steps of the poses, the points and the free optics."""
         band = self.band.copy()
         band[-1] += damping * self.diagonal + RIDGE
-        solutions = solveh_banded(band, np.stack([self.right, self.cross], 1), overwrite_ab=True, check_finite=False)
-        solution, log_focal = solutions[:, 0], 0.0
-        if focal_free:
-            hessian, right, diagonal = self.focal
-            solution, log_focal = focal_step(solutions, self.cross, hessian + damping * diagonal + RIDGE, right)
+        solutions = solveh_banded(
+            band, np.column_stack([self.right, self.cross]), overwrite_ab=True, check_finite=False
+        )
+        solution, optics = solutions[:, 0], np.zeros(0)
+        if free.count:
+            hessian, right, diagonal = self.optics
+            damped = hessian + np.diag(damping * diagonal + RIDGE)
+            solution, optics = optics_step(solutions, self.cross, damped, right, free.limits)
         points = np.zeros((sum(len(group.points) for group in self.structure.groups), 3))
         for group, part in zip(self.structure.groups, self.parts, strict=True):
-            part_solution = solution[group.unknowns]
-            if focal_free:
-                part_solution = np.append(part_solution, log_focal)
+            part_solution = np.append(solution[group.unknowns], optics)
             whitened = -part.whitened_gradient - (part.eliminated @ part_solution).reshape(-1, 3)
             points[group.points] = np.einsum("Pji,Pj->Pi", part.roots, whitened)
         blocks = solution.reshape(-1, 6)[self.structure.order]
-        return Step(blocks, points, log_focal)
+        return Step(blocks, points, optics)
 
 
 def _of_group(bundle: Bundle, group: _Group) -> Bundle:
@@ -179,7 +184,7 @@ def optimise(
         if stop():
             return np.inf, bundle
         try:
-            step = _BandedSystem.of(bundle, structure, scale_px, damping).solve(damping, bundle.focal_free)
+            step = _BandedSystem.of(bundle, structure, scale_px, damping).solve(damping, bundle.free)
         except np.linalg.LinAlgError:  # not positive definite: more damping
             return np.inf, bundle
         trial = bundle.stepped(step, free)

@@ -1,7 +1,7 @@
 """Bundle adjustment of sparse points and poses: robust Levenberg-Marquardt with the points eliminated (Schur)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 import spiked.native._bundle as _bundle
 from spiked.pose import Array, exp_so3
-from spiked.recon.odometry.normal_equations import MOST_LOG_FOCAL, NormalEquations, PoseBlocks, Step
+from spiked.recon.odometry.normal_equations import FreeOptics, NormalEquations, PoseBlocks, Step
 from spiked.recon.odometry.smoothness_prior import SmoothnessPrior
 from spiked.recon.statistics import RAYLEIGH_MEDIAN, median
 from spiked.sensor import Intrinsics
@@ -72,8 +72,8 @@ class Bundle:
     point: Index  # [M] the point of each observation
     pixels: Array  # [M, 2] px
     intrinsics: Intrinsics
-    focal_free: bool = False
-    """Whether the focal length (one for both axes) is adjusted too: then `intrinsics` changes as well."""
+    free: FreeOptics = field(default_factory=FreeOptics)
+    """What is adjusted of `intrinsics`."""
 
     def residuals(self) -> Array:
         """Reprojection errors [M, 2] in px; a point at or behind its camera has infinite error."""
@@ -82,7 +82,9 @@ class Bundle:
         return out
 
     def cost(self, scale_px: float) -> float:
-        """Mean over observations of the Cauchy loss log(1 + e^2 / s^2)."""
+        """Mean over observations of the Cauchy loss log(1 + e^2 / s^2); infinite if a free lens folds the image."""
+        if self.free.radial and self.intrinsics.folds:
+            return np.inf
         return float(_bundle.cost(*self._seen(), scale_px, **self.intrinsics.lens()))
 
     def _seen(self) -> tuple[object, ...]:
@@ -155,16 +157,18 @@ class Bundle:
         """Information of each pose with fixed points: [C, 6, 6] of (rotation, centre), in 1/px^2."""
         return self.linearise(scale_px, PoseBlocks.of_poses(np.zeros(len(self.centres), bool))).pose_hessian
 
-    def focal_sigma(self, scale_px: float) -> float:
-        """Relative standard deviation of the focal length, all else free, for independent track errors."""
+    def optics_covariance(self, scale_px: float) -> Array:
+        """Covariance [n, n] of the free optics, all else free, for independent track errors."""
         blocks = PoseBlocks.of_poses(np.ones(len(self.centres), bool))
-        information = replace(self, focal_free=True).linearise(scale_px, blocks).focal_information()
-        return float(self.noise_px() / np.sqrt(information)) if information > 0 else np.inf
+        information, _ = self.linearise(scale_px, blocks).of_optics()
+        if np.linalg.eigvalsh(information).min(initial=np.inf) <= 0:
+            return np.full(information.shape, np.inf)
+        return np.asarray(self.noise_px() ** 2 * np.linalg.inv(information))
 
     def spline_information(self, spline: Spline, times: Array, scale_px: float) -> Array:
         """Information of the knots, points marginalised: [6 knots, 6 knots] of (rotation, centre), in 1/px^2."""
         smoothness = SmoothnessPrior.of(spline, spline.basis_matrix(times), self.noise_px())
-        hessian, _ = replace(self, focal_free=False).linearise(scale_px, PoseBlocks.of_knots(spline, times)).reduced()
+        hessian, _ = replace(self, free=FreeOptics()).linearise(scale_px, PoseBlocks.of_knots(spline, times)).reduced()
         return hessian + smoothness.hessian().reshape(hessian.shape)
 
     def stepped(self, step: Step, free: NDArray[np.bool_]) -> "Bundle":
@@ -174,22 +178,23 @@ class Bundle:
         return self._moved(rotations, centres, step)
 
     def _moved(self, rotations: Array, centres: Array, step: Step) -> "Bundle":
-        """With these poses, and points and focal length moved by the step."""
-        points, intrinsics = self.points + step.points, _scaled(self.intrinsics, step.log_focal)
+        """With these poses, and points and free optics moved by the step."""
+        points, intrinsics = self.points + step.points, self.free.moved(self.intrinsics, step.optics)
         return replace(self, rotations=rotations, centres=centres, points=points, intrinsics=intrinsics)
 
     def linearise(
         self, scale_px: float, blocks: PoseBlocks, damping: float = 0.0, workspace: NormalEquations | None = None
     ) -> NormalEquations:
         """The normal equations, with damped points; written over earlier ones of the same size, if given."""
-        system = workspace or NormalEquations.empty(blocks.count, len(self.centres), len(self.points), self.focal_free)
+        system = workspace or NormalEquations.empty(blocks.count, len(self.centres), len(self.points), self.free)
         _bundle.linearise(
             *self._seen(),
             scale_px,
             damping,
             blocks.slots,
             blocks.shares,
-            self.focal_free,
+            self.free.focal,
+            self.free.radial,
             system.hessian,
             system.gradient,
             system.eliminated,
@@ -199,10 +204,3 @@ class Bundle:
             **self.intrinsics.lens(),
         )
         return system
-
-
-def _scaled(intrinsics: Intrinsics, log_focal: float) -> Intrinsics:
-    if log_focal == 0:
-        return intrinsics
-    factor = float(np.exp(np.clip(log_focal, -MOST_LOG_FOCAL, MOST_LOG_FOCAL)))
-    return replace(intrinsics, fx=intrinsics.fx * factor, fy=intrinsics.fy * factor)

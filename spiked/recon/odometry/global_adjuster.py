@@ -10,7 +10,13 @@ from spiked.pose import Array, log_so3, mean_rotation
 from spiked.recon.odometry.bundle_adjustment import Bundle
 from spiked.recon.odometry.initialisation import BOOT_VIEWS, INLIER_PX, SCALE_PX
 from spiked.recon.odometry.pnp import LOST_CHI2, MIN_POINTS, chi2_of, noise_outside_px
-from spiked.recon.odometry.self_calibration import FOCAL_ERROR_FACTOR, FOCAL_TOLERANCE, Focal
+from spiked.recon.odometry.self_calibration import (
+    EstimatedLens,
+    estimates,
+    find_distortion,
+    optics_moved,
+    try_other_model,
+)
 from spiked.recon.odometry.sparse_map import MapBundle, Pose, SparseMap, TrackedView
 from spiked.recon.odometry.spline_fitting import MotionBursts, fit_coarsest_spline, knot_time_warp, motion_bursts
 from spiked.recon.odometry.stationarity import STILL_PX
@@ -28,9 +34,9 @@ GROWTH, LEAST_NEW_VIEWS = 1.5, 12
 SLOW_FRAMES = 16
 """Views shorter than this see fast motion."""
 MAX_FOCAL_ROUNDS = 4
-"""Global adjustments at the end, at most, until an estimated focal length is stable."""
+"""Global adjustments at the end, at most, until estimated optics are stable."""
 MAX_TRACK_RMS_RATIO = 1.25
-"""Tracks with a larger RMS residual, relative to the median track, are left out when the focal length is adjusted."""
+"""Tracks with a larger RMS residual, relative to the median track, are left out when the optics are adjusted."""
 MIN_FOCAL_TRACKS = 3 * MIN_POINTS
 """Tracks that each view keeps then: otherwise none is left out."""
 OUTLIER_NEIGHBOURS = 2
@@ -114,16 +120,16 @@ class GlobalAdjuster:
             effort = FULL_EFFORT
 
     def finish(self, stop: Callable[[], bool] = lambda: False, save: Callable[[], None] = lambda: None) -> None:
-        """The last adjustments: an estimated focal length may need several. Ends after one if `stop` is true. They are
+        """The last adjustments: estimated optics may need several. Ends after one if `stop` is true. They are
         one piece: `save` is not called."""
         del save
         self.adjust()
         for _ in range(MAX_FOCAL_ROUNDS):
-            before = self.map.intrinsics.fx
-            if self.map.focal is None or self.spline is None or stop():
+            before = self.map.intrinsics
+            if not self.map.free_optics.count or self.spline is None or stop():
                 return
             self.adjust()
-            if abs(self.map.intrinsics.fx / before - 1) < FOCAL_TOLERANCE:
+            if not optics_moved(before, self.map.intrinsics):
                 return
 
     def path_error(self) -> float | None:
@@ -147,7 +153,7 @@ class GlobalAdjuster:
     def _solve(self, posed: list[TrackedView], effort: AdjustmentEffort) -> "_Solution | None":
         """Spline and adjusted bundle of some of the views; None with too few observations.
 
-        Points and focal length of the map take the result of the free poses, the start of the spline.
+        Points and optics of the map take the result of the free poses, the start of the spline.
         """
         views = _select_views(posed, effort.views)
         start = self._free_pose_ba(_select_views(views, effort.free_views), effort.rounds)
@@ -156,8 +162,8 @@ class GlobalAdjuster:
             return None
         every = made.ids
         made.bundle.rotations, made.bundle.centres = start.poses(made.times)
-        if self.map.focal is not None:
-            made.bundle.focal_free = True
+        made.bundle.free = self.map.free_optics
+        if self.map.free_optics.count:
             made = _without_worst_tracks(made)
         spline, _ = made.bundle.optimise_spline(start, made.times, effort.rounds, SPLINE_SCALE_PX, TOLERANCE)
         return _Solution(spline, made, np.setdiff1d(every, made.ids))
@@ -168,19 +174,32 @@ class GlobalAdjuster:
         if made is None:
             return None
         bundle = made.bundle
-        bundle.focal_free = self.map.focal is not None
+        bundle.free = self.map.free_optics
         bundle.optimise(rounds, SCALE_PX, tolerance=TOLERANCE)
-        self.map.points[made.ids], self.map.intrinsics = bundle.points, bundle.intrinsics
+        if not self.map.lens_known and self.map.lens is None:
+            self._look_for_distortion(bundle)
+        elif bundle.free.radial:
+            try_other_model(bundle)
+        self.map.points[made.ids] = bundle.points
+        self.map.take_optics(bundle)
         return _coarsest_spline(self.map.views, made)
 
+    def _look_for_distortion(self, bundle: Bundle) -> None:
+        """Let the lens of the map be estimated from now on if an adjusted bundle shows one; changes the bundle then."""
+        found = find_distortion(bundle)
+        if found is not None:
+            bundle.take(found)
+            self.map.lens = EstimatedLens(found.intrinsics, np.inf)
+            self.map.points[:] = np.nan  # of a pinhole camera; `bundle` has those that are known now
+
     def _take(self, found: "_Solution", effort: AdjustmentEffort) -> None:
-        """Take over spline, poses, points and focal length of an adjustment; the other views move to the spline."""
+        """Take over spline, poses, points and optics of an adjustment; the other views move to the spline."""
         sparse_map, adjusted, bundle = self.map, found.adjusted, found.adjusted.bundle
         sparse_map.noise_px = bundle.noise_px()
-        if sparse_map.focal is not None:
+        if bundle.free.count:
             sparse_map.points[found.left_out] = np.nan  # triangulated again below with the new path
+            sparse_map.focal, sparse_map.lens = estimates(bundle)
             sparse_map.intrinsics = bundle.intrinsics
-            sparse_map.focal = Focal(sparse_map.intrinsics, FOCAL_ERROR_FACTOR * bundle.focal_sigma(SCALE_PX))
         self.spline = _align_to_previous(found.spline, adjusted)
         self._newest = bundle, adjusted.times
         sparse_map.apply(adjusted)

@@ -16,7 +16,7 @@ from spiked.recon.odometry.initialisation import (
 )
 from spiked.recon.odometry.motion_segmentation import initialise
 from spiked.recon.odometry.pnp import MIN_POINTS, fit_pose
-from spiked.recon.odometry.self_calibration import try_fields
+from spiked.recon.odometry.self_calibration import EstimatedLens, try_optics
 from spiked.recon.odometry.sparse_map import Pose, SparseMap, TrackedView
 from spiked.recon.odometry.stationarity import STILL_PX, STOOD_PX, moving_object_share
 from spiked.recon.odometry.tracking_state import State, TrackingState
@@ -99,13 +99,16 @@ class Initialiser:
                 self._start, self._min_views = newest.id, 0
 
     def _solve(self, chosen: Sequence[TrackedView]) -> InitialisationResult:
-        """Initialise from some views; an unknown focal length is estimated and set."""
+        """Initialise from some views; unknown optics are estimated and set."""
         common = reduce(np.intersect1d, [view.ids for view in chosen])
         pixels = np.stack([view.pixels_of(common) for view in chosen])
         views = Views(pixels, common, self.map.intrinsics)
-        if self.map.focal is None:
+        if self.map.lens_known or self.map.lens is not None:
             return initialise(views, self.seed, self._min_parallax_px)
-        result, self.map.intrinsics = try_fields(views, self.seed, self._min_parallax_px)
+        known = self.map.focal is None
+        result, self.map.intrinsics = try_optics(views, self.seed, self._min_parallax_px, focal_known=known)
+        if self.map.intrinsics.distortion is not None:
+            self.map.lens = EstimatedLens(self.map.intrinsics, np.inf)
         return result
 
     def _start_map(self, chosen: Sequence[TrackedView], result: InitialisationResult) -> None:

@@ -6,7 +6,7 @@ run on another thread. The path is interpolated between the views, see `SparseMa
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -222,12 +222,10 @@ class KeyframeAdjuster:
         keyframes = self._all_chosen()
         if len(keyframes) <= 2 or (made := self.map.bundle(keyframes)) is None:
             return
-        made.bundle.focal_free = self.map.focal is not None
+        made.bundle.free = self.map.free_optics
         first = np.arange(len(keyframes)) < 1
         banded_bundle.optimise(made.bundle, iterations, FINAL_SCALE_PX, first, TOLERANCE, stop)
-        if self.map.focal is not None:
-            self.map.intrinsics = made.bundle.intrinsics
-            self.map.focal = replace(self.map.focal, intrinsics=made.bundle.intrinsics)
+        self.map.take_optics(made.bundle)
         self._take(made, self.map.views, refit_all)
 
     def path_error(self) -> float | None:

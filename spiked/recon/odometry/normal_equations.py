@@ -4,16 +4,20 @@
 system of a few hundred poses is small, and the long sides are one matrix product.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spiked.distortion import Distortion, LensModel
 from spiked.pose import Array
+from spiked.sensor import Intrinsics
 from spiked.spline import Spline
 
 MOST_LOG_FOCAL = 0.2
 """Largest change of the focal length's logarithm in one step."""
+MOST_RADIAL_STEP, MOST_RADIAL = 0.2, 2.0
+"""Largest change of k1 and k2 in one step, and their largest values."""
 RIDGE = 1e-9
 """Added to the diagonal of the reduced Hessian: unknowns that nothing observes stay where they are."""
 
@@ -53,6 +57,39 @@ class PoseBlocks:
 
 
 @dataclass(frozen=True)
+class FreeOptics:
+    """Intrinsics that are adjusted: n unknowns, the logarithm of the focal length, then k1 and k2 of the lens."""
+
+    focal: bool = False
+    """One focal length for both axes."""
+    radial: bool = False
+    """Of OpenCV's lens where there is none yet."""
+
+    @property
+    def count(self) -> int:
+        """n"""
+        return self.focal + 2 * self.radial
+
+    @property
+    def limits(self) -> Array:
+        """[n], the largest step of each."""
+        return np.array([MOST_LOG_FOCAL] * self.focal + [MOST_RADIAL_STEP] * 2 * self.radial)
+
+    def moved(self, intrinsics: Intrinsics, step: Array) -> Intrinsics:
+        """Intrinsics after a step [n]."""
+        if self.focal and step[0]:
+            factor = float(np.exp(np.clip(step[0], -MOST_LOG_FOCAL, MOST_LOG_FOCAL)))
+            intrinsics = replace(intrinsics, fx=intrinsics.fx * factor, fy=intrinsics.fy * factor)
+        if self.radial:
+            before = intrinsics.distortion
+            lens = Distortion(LensModel.OPENCV, ()) if before is None else before
+            k = np.array(lens.coefficients)
+            k[:2] = np.clip(k[:2] + step[-2:], -MOST_RADIAL, MOST_RADIAL)
+            intrinsics = replace(intrinsics, distortion=Distortion(lens.model, tuple(k.tolist())))
+        return intrinsics
+
+
+@dataclass(frozen=True)
 class Step:
     """Solution of the normal equations."""
 
@@ -60,12 +97,13 @@ class Step:
     """[blocks, 6] of (left rotation vector, centre)."""
     points: Array
     """[P, 3]"""
-    log_focal: float = 0.0
+    optics: Array = field(default_factory=lambda: np.zeros(0))
+    """[n] of the free optics."""
 
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations of D unknowns, six a block and one for the log focal length if it is free.
+    """Normal equations of D unknowns, six a block and n of the free optics.
 
     The points' 3x3 blocks V are marginalised: R = chol(V)^-1.
     """
@@ -82,12 +120,12 @@ class NormalEquations:
     """[P, 3, 3]: R."""
     pose_hessian: Array
     """[C, 6, 6] of each pose with fixed points."""
-    focal_free: bool
+    free: FreeOptics
 
     @classmethod
-    def empty(cls, blocks: int, poses: int, points: int, focal_free: bool) -> "NormalEquations":
+    def empty(cls, blocks: int, poses: int, points: int, free: FreeOptics) -> "NormalEquations":
         """Arrays to be filled."""
-        size = 6 * blocks + focal_free
+        size = 6 * blocks + free.count
         return cls(
             np.empty((size, size)),
             np.empty(size),
@@ -95,29 +133,30 @@ class NormalEquations:
             np.empty((points, 3)),
             np.empty((points, 3, 3)),
             np.empty((poses, 6, 6)),
-            focal_free,
+            free,
         )
 
     def reduced(self) -> tuple[Array, Array]:
         """Hessian [D, D] and gradient [D] with the points marginalised."""
         return marginalise(self.hessian, self.gradient, self.eliminated, self.whitened_gradient.ravel())
 
-    def focal_information(self) -> float:
-        """Information of the log focal length with all else free, in 1/px^2."""
-        assert self.focal_free
-        hessian, _ = self.reduced()
-        poses, cross = hessian[:-1, :-1], hessian[:-1, -1]
-        poses[np.diag_indices(len(poses))] += RIDGE * np.abs(np.diag(poses)).max()
-        return float(hessian[-1, -1] - cross @ np.linalg.solve(poses, cross))
+    def of_optics(self) -> tuple[Array, Array]:
+        """Hessian [n, n] and gradient [n] of the free optics with all else marginalised, in 1/px^2 times px^2."""
+        size = len(self.hessian) - self.free.count
+        hessian, gradient = self.reduced()
+        poses, cross = hessian[:size, :size], hessian[:size, size:]
+        poses[np.diag_indices(size)] += RIDGE * np.abs(np.diag(poses)).max()
+        solved = np.linalg.solve(poses, np.column_stack([cross, gradient[:size]]))
+        return hessian[size:, size:] - cross.T @ solved[:, :-1], gradient[size:] - cross.T @ solved[:, -1]
 
     def solve(self, damping: float, prior: tuple[Array, Array] | None = None) -> Step:
-        """Steps of the blocks, the points and, if free, the focal length.
+        """Steps of the blocks, the points and the free optics.
 
         `prior` is added to the Hessian [blocks, 6, blocks, 6] and gradient [blocks, 6] of the blocks.
         """
         hessian, gradient = self.reduced()
         right = -gradient
-        size = len(hessian) - self.focal_free
+        size = len(hessian) - self.free.count
         diagonal = np.diag(self.hessian).copy()
         if prior is not None:
             prior_hessian = prior[0].reshape(size, size)
@@ -125,30 +164,27 @@ class NormalEquations:
             right[:size] -= prior[1].ravel()
             diagonal[:size] += np.diag(prior_hessian)
         hessian[np.diag_indices(len(hessian))] += damping * diagonal + RIDGE
-        solution, log_focal = right, 0.0
-        if self.focal_free:
-            solution, log_focal = _solve_with_focal(hessian, right)
+        solution, optics = right, np.zeros(0)
+        if self.free.count:
+            cross = hessian[:size, size:]
+            sides = np.column_stack([right[:size], cross])
+            solutions = np.asarray(np.linalg.solve(hessian[:size, :size], sides), np.float64)
+            blocks, optics = optics_step(solutions, cross, hessian[size:, size:], right[size:], self.free.limits)
+            solution = np.append(blocks, optics)
         elif size:
             solution = np.asarray(np.linalg.solve(hessian, right))
         whitened = -self.whitened_gradient - (self.eliminated @ solution).reshape(-1, 3)
-        return Step(solution[:size].reshape(-1, 6), np.einsum("Pji,Pj->Pi", self.roots, whitened), log_focal)
+        return Step(solution[:size].reshape(-1, 6), np.einsum("Pji,Pj->Pi", self.roots, whitened), optics)
 
 
-def _solve_with_focal(hessian: Array, right: Array) -> tuple[Array, float]:
-    """Solution [D] whose last unknown, the log focal length, is limited; and that unknown."""
-    cross = hessian[:-1, -1]
-    solutions = np.asarray(np.linalg.solve(hessian[:-1, :-1], np.stack([right[:-1], cross], 1)), np.float64)
-    blocks, log_focal = focal_step(solutions, cross, hessian[-1, -1], right[-1])
-    return np.append(blocks, log_focal), log_focal
+def optics_step(solutions: Array, cross: Array, hessian: Array, right: Array, limits: Array) -> tuple[Array, Array]:
+    """Solution [D] of the blocks and the limited step [n] of the free optics, with their cross terms `cross` [D, n].
 
-
-def focal_step(solutions: Array, cross: Array, hessian: float, right: float) -> tuple[Array, float]:
-    """Solution [D] of the blocks and the limited step of the log focal length, with its cross terms `cross` [D].
-
-    solutions [D, 2] solve the blocks' system for their right side and for `cross`; hessian and right are of the focal
-    length.
+    solutions [D, 1 + n] solve the blocks' system for their right side and for `cross`; hessian [n, n] and right [n] are
+    of the optics.
     """
-    complement = float(hessian - cross @ solutions[:, 1])
-    log_focal = (right - float(cross @ solutions[:, 0])) / max(complement, RIDGE)
-    log_focal = float(np.clip(log_focal, -MOST_LOG_FOCAL, MOST_LOG_FOCAL))
-    return np.asarray(solutions[:, 0] - log_focal * solutions[:, 1]), log_focal
+    complement = hessian - cross.T @ solutions[:, 1:]
+    complement[np.diag_indices(len(right))] = np.maximum(np.diag(complement), RIDGE)
+    step = np.linalg.solve(complement, right - cross.T @ solutions[:, 0])
+    step = np.clip(step, -limits, limits)
+    return np.asarray(solutions[:, 0] - solutions[:, 1:] @ step), step

@@ -23,7 +23,7 @@ from spiked.recon.odometry.path_adjuster import PathAdjuster
 from spiked.recon.odometry.pnp import fit_pose
 from spiked.recon.odometry.pose_tracker import LOCAL_BA_EVERY, PoseTracker
 from spiked.recon.odometry.relocaliser import Relocaliser
-from spiked.recon.odometry.self_calibration import MAX_FOCAL_SIGMA, Focal
+from spiked.recon.odometry.self_calibration import MAX_FOCAL_SIGMA, MAX_LENS_SIGMA_PX, EstimatedLens, Focal
 from spiked.recon.odometry.sparse_map import Pose, SparseMap, TrackedView
 from spiked.recon.odometry.tracking_state import State, TrackingState
 from spiked.sensor import Intrinsics
@@ -55,7 +55,7 @@ class Odometry:
     ) -> None:
         """focal: set where the focal length is to be estimated; live: reasons advise how to move the camera now;
         pictures: where images of keyframes are held."""
-        self._map = SparseMap(intrinsics, focal)
+        self._map = SparseMap(intrinsics, focal, lens_known=intrinsics.distortion is not None)
         self._status = TrackingState()
         self._tracks = Tracks()
         self._timestamps = TrackTimestamps()
@@ -109,6 +109,11 @@ class Odometry:
     def focal(self) -> Focal | None:
         """Estimate of the focal length; None if it was given."""
         return self._map.focal
+
+    @property
+    def lens(self) -> EstimatedLens | None:
+        """Estimate of the distortion; None if it was given, or if there is none to be seen."""
+        return self._map.lens
 
     @property
     def state(self) -> State:
@@ -274,4 +279,6 @@ class Odometry:
             sigma = self.focal.relative_sigma
             known = "that the recording does not determine" if sigma > 1 else f"only known to about {sigma:.0%}"
             why.append(f"path and depths depend on a focal length {known}")
+        if self.lens is not None and self.lens.corner_sigma_px > MAX_LENS_SIGMA_PX:
+            why.append(f"the distortion of the lens is only known to about {self.lens.corner_sigma_px:.0f} px")
         return why

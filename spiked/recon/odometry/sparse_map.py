@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 import spiked.native._bundle as _bundle
 from spiked.pose import Array
 from spiked.recon.odometry.bundle_adjustment import Bundle
-from spiked.recon.odometry.self_calibration import Focal
+from spiked.recon.odometry.normal_equations import FreeOptics
+from spiked.recon.odometry.self_calibration import EstimatedLens, Focal
 from spiked.recon.odometry.stationarity import STILL_PX
 from spiked.recon.odometry.tracking_state import State
 from spiked.sensor import LEAST_DEPTH, Intrinsics
@@ -134,6 +135,10 @@ class SparseMap:
     intrinsics: Intrinsics
     focal: Focal | None = None
     """Set where the focal length is estimated: `intrinsics` then follow it."""
+    lens: EstimatedLens | None = None
+    """Set where a distortion is estimated: `intrinsics` then follow it."""
+    lens_known: bool = False
+    """No distortion is searched for."""
     views: list[TrackedView] = field(default_factory=list)
     points: Array = field(default_factory=lambda: np.full((0, 3), np.nan))
     """Position of every track by id, NaN where unknown."""
@@ -141,6 +146,19 @@ class SparseMap:
     """Standard deviation of a track's place in one view and one direction, by the last initialisation or
     adjustment of keyframes or of the whole path."""
     _travelled_px: list[float] = field(default_factory=list)
+
+    @property
+    def free_optics(self) -> FreeOptics:
+        """What is estimated of `intrinsics`."""
+        return FreeOptics(self.focal is not None, self.lens is not None)
+
+    def take_optics(self, bundle: Bundle) -> None:
+        """Take over the estimated intrinsics of an adjusted bundle, with the standard deviations of before."""
+        self.intrinsics = bundle.intrinsics
+        if self.focal is not None:
+            self.focal = replace(self.focal, intrinsics=bundle.intrinsics)
+        if self.lens is not None:
+            self.lens = replace(self.lens, intrinsics=bundle.intrinsics)
 
     def travelled_px(self, number: int) -> float:
         """Image motion from the first view up to view `number`."""

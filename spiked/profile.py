@@ -4,7 +4,7 @@ import hashlib
 import os
 import secrets
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar
 from urllib.parse import quote
 
 from pydantic import ConfigDict, Field, ValidationError
@@ -43,6 +43,8 @@ class CameraProfile(CameraOptions):
     """Pinhole model in pixels, instead of a field of view; the first pixel's centre is (0.5, 0.5)."""
     calibration: LocalPath | None = None
     """File of gains, dark rates and dead pixels, relative to the profile."""
+    session: Literal["auto", "request", "stream"] | None = None
+    """How the bridge of a USB camera is made to send."""
     note: str = Field(default="", max_length=20_000)
 
     @classmethod
@@ -89,7 +91,7 @@ class CameraProfile(CameraOptions):
         `size`: width and height, too, where nothing else says them.
         """
         stated = options.model_fields_set
-        names = CameraOptions.model_fields.keys() | ({"width", "height"} if size else set())
+        names = CameraOptions.model_fields.keys() | {"session"} | ({"width", "height"} if size else set())
         names &= type(options).model_fields.keys()
         if stated & _OPTICS:
             names -= _OPTICS

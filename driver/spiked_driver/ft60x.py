@@ -1,12 +1,13 @@
-"""Protocol of FTDI's FT60x bridge: identity, endpoints, read requests, the chip's configuration.
+"""Protocol of FTDI's FT60x bridge: identity, endpoints, session requests, the chip's configuration.
 
-The facts come from public drivers of the chip, not from its maker, and were not tested on hardware. Corrections belong
-here. This module encodes and decodes bytes; it makes no transfer.
+The facts come from public drivers of the chip, not from its maker, and were not tested on hardware: docs/usb.md has the
+table with the source of each. Corrections belong here. This module encodes and decodes bytes; it makes no transfer.
 """
 
 import struct
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import IntEnum, StrEnum
+from itertools import count
 
 from spiked.errors import SourceError
 
@@ -31,19 +32,46 @@ REQUEST_TYPE, REQUEST_CONFIGURATION, REQUEST_VALUE, REQUEST_INDEX = 0xC0, 0xCF, 
 CONFIGURATION_BYTES = 152
 """Length of the configuration."""
 
-_READ_REQUEST = struct.Struct("<IBBHIII")
-READ_REQUEST_BYTES = _READ_REQUEST.size
-_COMMAND_READ = 1
-"""Command byte of a read request."""
+_SESSION_REQUEST = struct.Struct("<IBBHIII")
+SESSION_REQUEST_BYTES = _SESSION_REQUEST.size
 _CONFIGURATION = struct.Struct("<HH128sBBHBBBBHBBII")
 
 
-def read_request(index: int, length: int) -> bytes:
-    """A 20-byte request for SESSION_OUT: up to `length` bytes may then come from DATA_IN. `index` counts requests.
+class SessionMode(StrEnum):
+    """How the bridge is made to send."""
 
-    {u32 index, u8 pipe, u8 command 1 = read, u16 0, u32 length, u32 0, u32 0}, little endian.
-    """
-    return _READ_REQUEST.pack(index & 0xFFFFFFFF, DATA_IN, _COMMAND_READ, 0, length, 0, 0)
+    REQUEST = "request"
+    """Each read is asked for with its length."""
+    STREAM = "stream"
+    """The bridge is put into stream mode once; reads are not asked for."""
+
+    def __str__(self) -> str:
+        """As shown to users."""
+        return "read requests" if self is SessionMode.REQUEST else "stream mode"
+
+
+class SessionCommand(IntEnum):
+    """Command byte of a session request."""
+
+    ABORT = 0
+    READ = 1
+    STREAM = 2
+    FLUSH = 3
+
+
+class SessionRequests:
+    """Requests for SESSION_OUT, numbered from `first` on."""
+
+    def __init__(self, first: int = 0) -> None:
+        self._numbers = count(first)
+
+    def encode(self, command: SessionCommand, length: int = 0) -> bytes:
+        """The next request, 20 bytes, little endian; `length` is that of a read, or of all reads in stream mode.
+
+        {u32 number, u8 pipe, u8 command, u16 0, u32 length, u32 0, u32 0}.
+        """
+        number = next(self._numbers) & 0xFFFFFFFF
+        return _SESSION_REQUEST.pack(number, DATA_IN, command, 0, length, 0, 0)
 
 
 class FifoClock(IntEnum):

@@ -12,14 +12,20 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from enum import StrEnum
-from itertools import count, islice
+from itertools import islice
 from typing import Protocol, TypeVar
 
 import numpy as np
 import usb.core
 from numpy.typing import NDArray
 
-from spiked_driver.ft60x import DATA_IN, READ_REQUEST_BYTES, SESSION_OUT, read_request
+from spiked_driver.ft60x import (
+    DATA_IN,
+    SESSION_OUT,
+    SESSION_REQUEST_BYTES,
+    SessionCommand,
+    SessionRequests,
+)
 from spiked_driver.libusb import Callback, OutOfUsbMemoryError, Transfer, TransferStatus, UsbContext
 from spiked_driver.usb_budget import MIN_TRANSFERS, TransferPlan
 
@@ -45,6 +51,8 @@ _BY_NUMBER = {
     errno.EOVERFLOW: TransferError.BABBLE,
     errno.ENODEV: TransferError.GONE,
 }
+MOST_REQUESTS = 64
+"""Requests that the bridge holds at a time, at most; how many it can hold is not public."""
 _REQUEST_TIMEOUT_MS = 100
 """Time for a request of 20 bytes to be sent, ms."""
 
@@ -115,7 +123,7 @@ class _Request:
     """A request's bytes and its transfer."""
 
     def __init__(self) -> None:
-        self.bytes = ctypes.create_string_buffer(READ_REQUEST_BYTES)
+        self.bytes = ctypes.create_string_buffer(SESSION_REQUEST_BYTES)
         self.transfer: Transfer
         self.pending = False
 
@@ -127,16 +135,26 @@ _abandoned: list[object] = []
 
 
 class AsynchronousBulkReader:
-    """Keeps the reads of a plan in flight; a request of its own precedes each read."""
+    """Keeps the reads of a plan in flight. Each is asked for by a request, unless the bridge is in stream mode."""
 
-    def __init__(self, context: UsbContext, buffers: Buffers) -> None:
+    def __init__(
+        self,
+        context: UsbContext,
+        buffers: Buffers,
+        requests: SessionRequests | None = None,
+        most_requests: int = MOST_REQUESTS,
+    ) -> None:
+        """`requests` None: the bridge is in stream mode."""
         self._context = context
         self._buffers = buffers
         self._callback = Callback(self._completed)
         self._by_address: dict[int, _Read | _Request] = {}
         self._reads = [self._new_read(row) for row in buffers.rows]
         self._free_requests: list[_Request] = []
-        self._requests = count()
+        self._requests = requests
+        self._most_requests = most_requests
+        self._unasked: deque[_Read] = deque()
+        """Reads in flight whose requests wait until the bridge holds fewer."""
         self._queue: deque[_Read] = deque()
         self._unsubmitted: list[_Read] = []
         self._current: _Read | None = None
@@ -160,6 +178,7 @@ class AsynchronousBulkReader:
         self._running = True
         self._request_error = None
         self._unsubmitted.clear()
+        self._unasked.clear()
         for number, read in enumerate(self._reads):
             try:
                 self._submit(read)
@@ -180,6 +199,7 @@ class AsynchronousBulkReader:
             error, self._request_error = self._request_error, None
             return CompletedTransfer(self._queue[0].buffer[:0], error) if error else None
         read = self._current = self._queue.popleft()
+        self._ask_for_more()
         status = TransferStatus(read.transfer.status)
         return CompletedTransfer(read.buffer[: read.transfer.actual_length], _ERRORS.get(status))
 
@@ -244,7 +264,7 @@ class AsynchronousBulkReader:
     def _new_request(self) -> _Request:
         request = _Request()
         request.transfer = self._context.allocate(
-            SESSION_OUT, ctypes.addressof(request.bytes), READ_REQUEST_BYTES, self._callback
+            SESSION_OUT, ctypes.addressof(request.bytes), SESSION_REQUEST_BYTES, self._callback
         )
         return self._register(request)
 
@@ -258,16 +278,31 @@ class AsynchronousBulkReader:
 
     def _submit(self, read: _Read) -> None:
         """Send the request before the read, so that the bridge has the data when the read arrives."""
+        held = self._in_flight - len(self._unasked)
+        wait = self._requests is not None and held >= self._most_requests
+        if self._requests is not None and not wait:
+            self._ask_for(read, self._requests)
+        self._send(read)
+        if wait:
+            self._unasked.append(read)
+        self._queue.append(read)
+        self._in_flight += 1
+
+    def _ask_for(self, read: _Read, requests: SessionRequests) -> None:
         request = self._free_requests.pop() if self._free_requests else self._new_request()
-        request.bytes.raw = read_request(next(self._requests), read.buffer.size)
+        request.bytes.raw = requests.encode(SessionCommand.READ, read.buffer.size)
         try:
             self._send(request)
         except BaseException:
             self._free_requests.append(request)
             raise
-        self._send(read)
-        self._queue.append(read)
-        self._in_flight += 1
+
+    def _ask_for_more(self) -> None:
+        """Send the requests for which the bridge has room by now. Raises usb.core.USBError."""
+        while self._running and self._unasked and self._in_flight - len(self._unasked) < self._most_requests:
+            assert self._requests is not None
+            self._ask_for(self._unasked[0], self._requests)
+            self._unasked.popleft()
 
     def _send(self, one: _Read | _Request) -> None:
         one.pending = True
@@ -310,11 +345,12 @@ class AsynchronousBulkReader:
 class SynchronousBulkReader:
     """One read at a time by pyusb. Nothing is queued between two reads, so any delay of the host loses frames."""
 
-    def __init__(self, device: usb.core.Device, plan: TransferPlan) -> None:
+    def __init__(self, device: usb.core.Device, plan: TransferPlan, requests: SessionRequests | None = None) -> None:
+        """`requests` None: the bridge is in stream mode."""
         self._device = device
         self._buffer = array.array("B", bytes(plan.transfer_bytes))
         self._view = np.frombuffer(self._buffer, np.uint8)
-        self._requests = count()
+        self._requests = requests
         self._requested_bytes = 0
         self._running = False
 
@@ -337,8 +373,8 @@ class SynchronousBulkReader:
         if not self._running:
             return None
         try:
-            if not self._requested_bytes:
-                request = read_request(next(self._requests), self._view.size)
+            if self._requests is not None and not self._requested_bytes:
+                request = self._requests.encode(SessionCommand.READ, self._view.size)
                 self._device.write(SESSION_OUT, request, _REQUEST_TIMEOUT_MS)
                 self._requested_bytes = self._view.size
             timeout_ms = max(1, round(1e3 * timeout_s))

@@ -18,13 +18,13 @@ from spiked.ring import DeviceState, DeviceStatus, LossCause
 from spiked_driver.camera_search import CameraSearch
 from spiked_driver.connection_state import ConnectionState, ConnectionStateMachine
 from spiked_driver.framing import USB_FRAME_BYTES
-from spiked_driver.ft60x import VENDOR_ID
+from spiked_driver.ft60x import VENDOR_ID, SessionMode
 from spiked_driver.gap_attribution import StreamBreak
 from spiked_driver.libusb import OutOfUsbMemoryError
 from spiked_driver.source import READ_WAIT_S
 from spiked_driver.source_kind import RATE_HZ
 from spiked_driver.stream_watch import StreamWatch
-from spiked_driver.transfers import Buffers, TransferError, transfer_error_of
+from spiked_driver.transfers import MOST_REQUESTS, Buffers, TransferError, transfer_error_of
 from spiked_driver.usb_budget import TRANSFER_BYTES, TransferPlan
 from spiked_driver.usb_cameras import CameraChoice, NotUsableError, UsbCamera
 from spiked_driver.usb_session import NotThereError, UsbSession
@@ -62,6 +62,10 @@ class UsbOptions:
     """False: pyusb's own reads, one at a time, for machines where queued reads do not work."""
     silence_s: float = SILENCE_S
     """Seconds without a byte after which the camera counts as lost."""
+    session: SessionMode | None = None
+    """How the bridge is made to send; None: read requests, and while nothing has come each mode in turn."""
+    most_requests: int = MOST_REQUESTS
+    """Read requests that the bridge holds at a time, at most."""
 
     @property
     def rate_bytes(self) -> float:
@@ -99,6 +103,10 @@ class UsbConnection:
         self._error: TransferError | None = None
         self._attempts = 0  # to get a lost stream back, since the last delivered frame
         self._break: StreamBreak | None = None
+        self._mode = options.session or SessionMode.REQUEST
+        self._mode_open = options.session is None
+        """No byte has come yet: the other mode may be the right one."""
+        self._tried_modes = False
         self._note = ""
         if plan.note:
             _log.warning("%s", plan.note)
@@ -202,6 +210,7 @@ class UsbConnection:
         ended_break = None
         if data.size:
             ended_break, self._break = self._break, None
+            self._keep_mode()
         return Reception(data, contiguous, underrun_bytes, ended_break)
 
     def _check_frames(self, frames: int) -> None:
@@ -223,11 +232,36 @@ class UsbConnection:
         assert self.camera is not None
         self._error = error
         reason = f"{error or 'the camera sends nothing'} ({self.camera.port})"
+        if error is None and self._mode_open:
+            reason = self._try_other_mode()
         _log.warning("%s", reason)
         self._machine.enter(ConnectionState.DRAINING, DeviceStatus(DeviceState.LOST, reason))
         if not self._session.reader.stop(_CANCEL_S):
             self._record_break()
             self._disconnect(ConnectionState.SEARCHING, self.device_status)
+
+    def _try_other_mode(self) -> str:
+        """Read in the other mode from the next attempt on; what is said of it."""
+        assert self.camera is not None
+        silent = self._mode
+        self._mode = SessionMode.STREAM if silent is SessionMode.REQUEST else SessionMode.REQUEST
+        said = f"the camera at {self.camera.port} sends nothing in answer to {silent}: {self._mode} is tried"
+        if silent is SessionMode.STREAM:
+            said = f"the camera at {self.camera.port} sends nothing in {silent}: {self._mode} are tried"
+        if not self._tried_modes:
+            self._warn(said)
+        self._tried_modes = True
+        return said
+
+    def _keep_mode(self) -> None:
+        """Bytes came: no other mode is tried from now on."""
+        if not self._mode_open:
+            return
+        self._mode_open = False
+        if self._tried_modes:
+            assert self.camera is not None
+            save = f"`session={self._mode.value}` saves the trial"
+            self._warn(f"the camera at {self.camera.port} sends with {self._mode}: {save}")
 
     def _record_break(self) -> bool:
         """Note the cause of the interruption. Returns whether the camera is still plugged in."""
@@ -243,9 +277,10 @@ class UsbConnection:
         """Read again: in the same session where that may help, otherwise in a new one."""
         assert self._session is not None
         there = self._record_break()
-        if there and self._attempts == 1 and self._error in _REARM_AFTER and self._rearm():
+        same_mode = self._session.mode is self._mode
+        if there and same_mode and self._attempts == 1 and self._error in _REARM_AFTER and self._rearm():
             return
-        if there and self._error is None:
+        if there and same_mode and self._error is None:
             self._session.reset()
         self._disconnect(ConnectionState.SEARCHING, self.device_status)
         time.sleep(READ_WAIT_S if self._attempts > 1 else 0)
@@ -284,9 +319,15 @@ class UsbConnection:
 
     def _connect(self, camera: UsbCamera) -> None:
         """Raises NotUsableError, OutOfUsbMemoryError or NotThereError."""
-        self._session = UsbSession(camera, self._buffers, asynchronous=self._options.asynchronous)
+        self._session = UsbSession(
+            camera,
+            self._buffers,
+            mode=self._mode,
+            asynchronous=self._options.asynchronous,
+            most_requests=self._options.most_requests,
+        )
         try:
-            self._session.reader.start()
+            self._session.start()
         except usb.core.USBError as error:
             raise NotThereError(f"{transfer_error_of(error)} ({camera.port}: {error.strerror})") from error
         if self._session.reader.in_flight_bytes < self._buffers.plan.in_flight_bytes and self._options.asynchronous:

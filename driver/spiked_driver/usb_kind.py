@@ -7,7 +7,9 @@ from pydantic import Field
 from spiked.errors import SourceError
 from spiked.ring import DeviceState
 from spiked_driver.capabilities import USB_CAPABILITIES
+from spiked_driver.ft60x import SessionMode
 from spiked_driver.source_kind import Device, HardwareOptions, SourceKind, SourceSpec, Warn
+from spiked_driver.transfers import MOST_REQUESTS
 from spiked_driver.usb import UsbSource
 from spiked_driver.usb_budget import TRANSFER_BYTES
 from spiked_driver.usb_cameras import CameraChoice, UsbCamera, find_cameras
@@ -25,6 +27,10 @@ class UsbCameraOptions(HardwareOptions):
     """`single`: one read at a time, for machines where queued reads do not work."""
     silence_s: float = Field(SILENCE_S, ge=0.01, le=3600)
     """Seconds without a byte after which the camera counts as lost."""
+    session: Literal["auto", "request", "stream"] = "auto"
+    """How the bridge is made to send: each read asked for, or in its stream mode. auto: whichever brings bytes."""
+    requests: int = Field(MOST_REQUESTS, ge=1, le=1024)
+    """Read requests that the bridge holds at a time, at most."""
 
 
 def _open(spec: SourceSpec, options: UsbCameraOptions, warn: Warn | None) -> UsbSource:
@@ -37,6 +43,8 @@ def _open(spec: SourceSpec, options: UsbCameraOptions, warn: Warn | None) -> Usb
             transfer_bytes=options.transfer_kib << 10,
             asynchronous=options.transfers == "queued",
             silence_s=options.silence_s,
+            session=None if options.session == "auto" else SessionMode(options.session),
+            most_requests=options.requests,
         ),
         warn,
     )

@@ -19,14 +19,19 @@ from spiked_driver.ft60x import (
     SESSION_INTERFACE,
     SESSION_OUT,
     ChipConfiguration,
+    SessionCommand,
+    SessionMode,
+    SessionRequests,
 )
 from spiked_driver.libusb import NoContextError, UsbContext
-from spiked_driver.transfers import AsynchronousBulkReader, Buffers, BulkReader, SynchronousBulkReader
+from spiked_driver.transfers import MOST_REQUESTS, AsynchronousBulkReader, Buffers, BulkReader, SynchronousBulkReader
 from spiked_driver.usb_cameras import NotUsableError, UsbCamera
 
 _log = logging.getLogger(__name__)
 _CONTROL_TIMEOUT_MS = 500
 """Time for the answer to a control request, ms."""
+_COMMAND_TIMEOUT_MS = 50
+"""Time for a session request of 20 bytes to be taken, ms."""
 
 
 class NotThereError(SourceError):
@@ -36,9 +41,20 @@ class NotThereError(SourceError):
 class UsbSession:
     """A camera from opening to closing. Used by one thread."""
 
-    def __init__(self, camera: UsbCamera, buffers: Buffers, *, asynchronous: bool = True) -> None:
-        """Open the camera; `reader.start` starts reading. Raises NotUsableError or NotThereError."""
+    def __init__(
+        self,
+        camera: UsbCamera,
+        buffers: Buffers,
+        *,
+        mode: SessionMode = SessionMode.REQUEST,
+        asynchronous: bool = True,
+        most_requests: int = MOST_REQUESTS,
+    ) -> None:
+        """Open the camera; `start` starts reading. Raises NotUsableError or NotThereError."""
         self.camera = camera
+        self.mode = mode
+        self._requests = SessionRequests()
+        self._started = False
         problem = camera.speed_problem() or camera.permission_problem()
         if problem:
             raise NotUsableError(problem)
@@ -49,10 +65,12 @@ class UsbSession:
         try:
             self._device = self._open()
             self.chip = self._read_configuration()
+            self._transfer_bytes = buffers.plan.transfer_bytes
+            requests = self._requests if mode is SessionMode.REQUEST else None
             self.reader: BulkReader = (
-                AsynchronousBulkReader(self._context, buffers)
+                AsynchronousBulkReader(self._context, buffers, requests, most_requests)
                 if asynchronous
-                else SynchronousBulkReader(self._device, buffers.plan)
+                else SynchronousBulkReader(self._device, buffers.plan, requests)
             )
         except usb.core.USBError as error:
             self._context.close()
@@ -61,11 +79,21 @@ class UsbSession:
             self._context.close()
             raise
 
+    def start(self) -> None:
+        """Put the bridge into its mode and queue the reads. Raises usb.core.USBError, or OutOfUsbMemoryError."""
+        if self.mode is SessionMode.STREAM:
+            self._command(SessionCommand.ABORT)
+            self._command(SessionCommand.STREAM, self._transfer_bytes)
+        self._started = True
+        self.reader.start()
+
     def rearm(self) -> None:
         """After `reader.stop`: clear a stall of both endpoints and queue the reads again. Raises usb.core.USBError."""
         self._device.clear_halt(DATA_IN)
         self._device.clear_halt(SESSION_OUT)
-        self.reader.start()
+        self._command(SessionCommand.ABORT)
+        self._command(SessionCommand.FLUSH)
+        self.start()
 
     def reset(self) -> None:
         """Reset the port. The camera must be opened again afterwards."""
@@ -75,10 +103,18 @@ class UsbSession:
     def close(self, timeout_s: float) -> None:
         """End all transfers and close. If some do not end in time, their memory is kept and the camera stays open."""
         ended = self.reader.stop(timeout_s)
+        if ended and self._started:  # a fresh handle is left as it is
+            with suppress(usb.core.USBError):  # the camera may be gone
+                self._command(SessionCommand.ABORT)
+                self._command(SessionCommand.FLUSH)
         if self.reader.close() and ended:
             self._context.close()
         else:
             _log.warning("transfers of the camera at %s did not end: the camera stays open", self.camera.port)
+
+    def _command(self, command: SessionCommand, length: int = 0) -> None:
+        """Send a session request while no read is in flight. Raises usb.core.USBError."""
+        self._device.write(SESSION_OUT, self._requests.encode(command, length), _COMMAND_TIMEOUT_MS)
 
     def _open(self) -> usb.core.Device:
         device = self._context.find(self.camera)

@@ -424,6 +424,16 @@ class Problem(BaseModel):
     what_to_do: Annotated[str | None, Field(description="How to correct it, if known.")]
 
 
+class Session(StrEnum):
+    """
+    How the bridge of a USB camera is made to send.
+    """
+
+    auto = "auto"
+    request = "request"
+    stream = "stream"
+
+
 class RateHistogram(BaseModel):
     """
     How many pixels fire how often.
@@ -1082,6 +1092,10 @@ class ProfileModel(BaseModel):
     calibration: Annotated[
         str | None,
         Field(description="File of gains, dark rates and dead pixels, relative to the profile."),
+    ] = None
+    session: Annotated[
+        Session | None,
+        Field(description="How the bridge of a USB camera is made to send."),
     ] = None
     note: str = ""
 

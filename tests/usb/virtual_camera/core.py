@@ -4,14 +4,29 @@ import struct
 import time
 from collections import deque
 from dataclasses import dataclass
+from enum import StrEnum
 
 from .descriptors import DATA_IN, DATA_OUT, SESSION_IN, SESSION_OUT, Identity, Speed
 from .faults import Fault, Kind
 from .stream import Stream
 
 _REQUEST = struct.Struct("<IBBHIII")
+_ENDLESS = 1 << 62
 _CONTROL = struct.Struct("<BBHHH")
-_READ = 1
+_ABORT, _READ, _STREAM, _FLUSH = range(4)
+
+
+class Bridge(StrEnum):
+    """What makes the bridge send."""
+
+    ALL = "all"
+    REQUEST = "request"
+    """Read requests only: stream mode is ignored."""
+    STREAM = "stream"
+    """Stream mode only: read requests are ignored."""
+    SINGLE = "single"
+    """One read request at a time: with a second one it sends nothing until it is aborted."""
+    NOTHING = "nothing"
 
 
 class Stalled(Exception):
@@ -27,10 +42,22 @@ class Request:
 
 
 class Camera:
-    """An FT601 with a camera behind it. Data flow only as far as the host has asked for them on endpoint 0x01."""
+    """An FT601 with a camera behind it. Data flow only as far as the host has asked for them on endpoint 0x01, or in
+    stream mode."""
 
-    def __init__(self, stream: Stream, identity: Identity | None = None, speed: Speed = Speed.SUPER) -> None:
+    def __init__(
+        self,
+        stream: Stream,
+        identity: Identity | None = None,
+        speed: Speed = Speed.SUPER,
+        bridge: Bridge = Bridge.ALL,
+    ) -> None:
         self.stream = stream
+        self.bridge = bridge
+        self.commands: list[int] = []
+        """Session commands so far but for reads."""
+        self._streams = False
+        self._confused = False
         self.identity = identity or Identity()
         self.speed = speed
         self.halted = False
@@ -42,8 +69,10 @@ class Camera:
 
     @property
     def credit(self) -> int:
-        """Bytes asked for and not yet sent."""
-        return sum(self._asked)
+        """Bytes that may be sent."""
+        if self.bridge is Bridge.NOTHING or self._confused:
+            return 0
+        return _ENDLESS if self._streams else sum(self._asked)
 
     @property
     def descriptors(self) -> bytes:
@@ -98,15 +127,29 @@ class Camera:
             self.bad_requests += 1
             return
         index, pipe, command, zero, length, *rest = _REQUEST.unpack(data)
-        if pipe != DATA_IN or command != _READ or zero or any(rest) or not length:
+        wants_length = command in (_READ, _STREAM)
+        if pipe != DATA_IN or command > _FLUSH or zero or any(rest) or bool(length) != wants_length:
             self.bad_requests += 1
             return
-        self.requests.append(Request(index, length))
-        self._asked.append(length)
+        if command == _READ:
+            self.requests.append(Request(index, length))
+            if self.bridge is not Bridge.STREAM and not self._streams:
+                self._confused |= self.bridge is Bridge.SINGLE and bool(self._asked)
+                self._asked.append(length)
+            return
+        self.commands.append(command)
+        if command == _STREAM:
+            self._streams = self.bridge in (Bridge.ALL, Bridge.STREAM)
+        else:
+            self._end_session()
+
+    def _end_session(self) -> None:
+        self._asked.clear()
+        self._streams = self._confused = False
 
     def make_room(self, nbytes: int) -> None:
         """So much can be written at the host's end of the data endpoint now; tell of it whenever it changes."""
-        if not nbytes or not self._asked or self.halted:
+        if not nbytes or not self.credit or self.halted:
             self._room_since_s = None
         elif self._room_since_s is None:
             self._room_since_s = time.monotonic()
@@ -117,7 +160,7 @@ class Camera:
             return None
         if self.halted:
             return 0.0
-        return self.stream.wait_s(now_s, min(wanted_bytes, self.credit)) if self._asked else None
+        return self.stream.wait_s(now_s, min(wanted_bytes, self.credit)) if self.credit else None
 
     def read(self, endpoint: int, limit: int) -> tuple[list[memoryview], Fault | None]:
         """Bytes for a transfer that has room for `limit` more, and what befalls it behind them."""
@@ -137,6 +180,8 @@ class Camera:
         return pieces, fault
 
     def _use(self, nbytes: int) -> None:
+        if self._streams:
+            return
         while nbytes and nbytes >= self._asked[0]:
             nbytes -= self._asked.popleft()
         if nbytes:
@@ -150,4 +195,4 @@ class Camera:
     def reset(self) -> None:
         """The port is reset, or the device was unplugged: no session is left."""
         self.halted = False
-        self._asked.clear()
+        self._end_session()

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .core import Camera
+from .core import Bridge, Camera
 from .descriptors import Identity, Speed
 from .faults import Fault, Kind
 from .stream import COMPACT_BYTES, MAGIC, Stream
@@ -46,6 +46,7 @@ class CameraSettings:
     chip: tuple[int, int, int] = (0, 0, 2)
     """The bridge's codes for clock, FIFO mode and channels."""
     faults: tuple[Fault, ...] = ()
+    bridge: Bridge = Bridge.ALL
 
     def build(self) -> Camera:
         """The camera."""
@@ -62,7 +63,7 @@ class CameraSettings:
             faults=self.faults,
         )
         identity = Identity(serial=self.serial, chip=tuple(self.chip))  # type: ignore[arg-type]
-        return Camera(stream, identity, Speed.HIGH if self.usb2 else Speed.SUPER)
+        return Camera(stream, identity, Speed.HIGH if self.usb2 else Speed.SUPER, Bridge(self.bridge))
 
 
 def settings_from(values: dict[str, Any]) -> CameraSettings:
@@ -235,6 +236,7 @@ class Host:
                     "done": [asdict(fault) for fault in stream.done],
                     "requests": [asdict(request) for request in socketed.camera.requests],
                     "bad_requests": socketed.camera.bad_requests,
+                    "commands": socketed.camera.commands,
                     "in_flight_bytes": node.in_flight_bytes() if node else 0,
                     "room_bytes": node.room_bytes() if node else 0,
                     "plugged": node is not None,

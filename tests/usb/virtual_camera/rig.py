@@ -42,6 +42,8 @@ class Report:
     requests: tuple[tuple[int, int], ...]
     """Index and length of the last read requests."""
     bad_requests: int
+    commands: tuple[int, ...]
+    """Session commands but for reads: 0 abort, 2 stream, 3 flush."""
     in_flight_bytes: int
     room_bytes: int
     """Bytes that the camera can send into the reads that are queued."""
@@ -138,6 +140,7 @@ class VirtualCameras:
         values["sent"] = tuple(Run(*run) for run in values["sent"])
         values["done"] = tuple(fault["kind"] for fault in values["done"])
         values["requests"] = tuple((request["index"], request["length"]) for request in values["requests"])
+        values["commands"] = tuple(values["commands"])
         return Report(**values)
 
     def hurry(self) -> None:

@@ -2290,6 +2290,11 @@ export interface components {
              */
             calibration?: string | null;
             /**
+             * Session
+             * @description How the bridge of a USB camera is made to send.
+             */
+            session?: ("auto" | "request" | "stream") | null;
+            /**
              * Note
              * @default
              */

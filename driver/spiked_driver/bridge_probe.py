@@ -32,6 +32,7 @@ STOPPED_S = 0.5
 STOP_S = 0.4
 """Longest wait for cancelled reads."""
 _WAIT_S = 0.05
+"""Longest wait for one read."""
 
 
 @dataclass(frozen=True)

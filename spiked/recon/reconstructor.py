@@ -12,7 +12,7 @@ from spiked.pose import Array
 from spiked.recon import report
 from spiked.recon.blas import one_blas_thread
 from spiked.recon.frontend.feature_tracks import Picture, picture, white_of
-from spiked.recon.frontend.mosaic_check import mosaic_warning
+from spiked.recon.frontend.mosaic_check import layout_warnings
 from spiked.recon.frontend.recorded_views import RecordedFrames, RecordedViews
 from spiked.recon.frontend.windowing import View, Windows, luminance
 from spiked.recon.given_poses import GivenPoses
@@ -203,7 +203,7 @@ class Reconstructor:
         self.views.add(view, tracked, bridged=skipped and since < BRIDGED_S * self.sensor.frame_rate_hz)
         self._after_gap = False
         if len(self.views) == 1:
-            self._warn(mosaic_warning(self.sensor.mosaic, view.rate))
+            self.warnings += layout_warnings(self.sensor, view.rate)
         else:
             self._windows.follow(tracked.motion_px, view.time - self.views[-2].time)
         if self._stage == "waiting":

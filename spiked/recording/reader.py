@@ -69,6 +69,8 @@ class Recording:
     """SpikeCV's ids of the label types, from a config.yaml."""
     data: NDArray[np.uint8]
     """The whole frames as stored, uint8 [frames, frame_bytes], a read-only memory map."""
+    questions: tuple[str, ...] = ()
+    """What nothing states and no pixel shows, and what was taken, one sentence each."""
     _unreleased: list[int] = field(default_factory=lambda: [0], repr=False)
     """Bytes read since pages were given back, see `RELEASED_BYTES`."""
 
@@ -216,6 +218,7 @@ def open_unchecked(path: Path, given: RecordingGeometry) -> Recording:
         sidecar.clock if sidecar else (),
         described.label_types,
         whole,
+        described.questions,
     )
 
 
@@ -249,6 +252,7 @@ def _release(data: NDArray[np.uint8]) -> None:
 class _Description:
     sensor: Sensor
     origin: Origin
+    questions: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     overruled: tuple[str, ...] = ()
     sidecar: Sidecar | None = None
@@ -303,7 +307,8 @@ def _from_spikecv(path: Path, given: RecordingGeometry) -> _Description | None:
         return None
     sensor = _replaced(path, Sensor(8, 1, DEFAULT_RATE_HZ), {"width": config.spike_w, "height": config.spike_h})
     sentence = f"{sensor.width}x{sensor.height} from SpikeCV's {beside.name}, which knows sizes only; {_assumed(given)}"
-    return _Description(sensor, Origin(OriginKind.SIDECAR, sentence), label_types=config.labeled_data_type)
+    origin = Origin(OriginKind.SIDECAR, sentence)
+    return _Description(sensor, origin, _asked(given), label_types=config.labeled_data_type)
 
 
 def _from_size(path: Path, data: NDArray[np.uint8], given: RecordingGeometry) -> _Description:
@@ -311,14 +316,23 @@ def _from_size(path: Path, data: NDArray[np.uint8], given: RecordingGeometry) ->
         raise RecordingError(f"{path}: give both width and height, or neither")
     if given.width is not None:
         sensor = _replaced(path, Sensor(8, 1, DEFAULT_RATE_HZ), given.stated())
-        return _Description(
-            sensor, Origin(OriginKind.GIVEN, f"{sensor.width}x{sensor.height} as given; {_assumed(given)}")
-        )
+        origin = Origin(OriginKind.GIVEN, f"{sensor.width}x{sensor.height} as given; {_assumed(given)}")
+        return _Description(sensor, origin, _asked(given))
     flavour = guess(str(path), data)
     fields = {"width": flavour.width, "height": flavour.height, "layout": flavour.layout, **given.stated()}
     sensor = _replaced(path, Sensor(8, 1, DEFAULT_RATE_HZ), fields)
     sentence = f"{flavour.name}, the only known flavour that fits the file; {_assumed(given)}"
-    return _Description(sensor, Origin(OriginKind.GUESSED, sentence))
+    return _Description(sensor, Origin(OriginKind.GUESSED, sentence), _asked(given))
+
+
+def _asked(given: RecordingGeometry) -> tuple[str, ...]:
+    """What no pixel shows: a world that is mirrored is as consistent as the true one."""
+    if given.flipped is not None:
+        return ()
+    return (
+        "nothing says which way up its rows come, and its pixels cannot: bottom-up is taken; if writing in a picture "
+        "reads mirrored, give --upright, else --flipped",
+    )
 
 
 def _assumed(given: RecordingGeometry) -> str:

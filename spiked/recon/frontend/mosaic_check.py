@@ -1,4 +1,4 @@
-"""Checks the stated colour mosaic against the pixels of a recording."""
+"""Checks the stated colour mosaic, and the order of bits, against the pixels of a recording."""
 
 from dataclasses import dataclass
 
@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 
 from spiked.blocks import aligned_window
+from spiked.recon.frontend.bit_order_check import bit_order_warning
 from spiked.recording import Recording
-from spiked.sensor import Image, Mosaic
+from spiked.sensor import Image, Mosaic, Sensor
 
 GREEN_RATIO = 1.25
 """Factor by which one diagonal must agree better than the other to be green."""
@@ -116,19 +117,30 @@ def mosaic_warning(stated: Mosaic | None, rate: Image) -> str | None:
             "by its pixels the sensor has a colour mosaic, which is not stated, so that it is taken as grey: state "
             f"mosaic {first} or {second}, which differ in red and blue only"
         )
+    if find_green(rate) is None:
+        return (
+            f"the colour mosaic is said to be {stated}, but the pixels show none: the sensor is grey, or all that it "
+            "sees is; of a grey sensor do not state a mosaic"
+        )
     likelier = contradicts(stated, rate)
     if likelier is None:
         return None
     return (
         f"the colour mosaic is said to be {stated}, but by the pixels green is where {likelier} has it: "
-        "colours and fine detail will be wrong; give --mosaic auto, or correct the sidecar's cfa"
+        "colours and fine detail will be wrong; give --mosaic auto, or correct the sidecar's cfa; if the mosaic is "
+        "right, the rows come the other way up: give --upright or --flipped"
     )
 
 
-def recorded_mosaic_warning(recording: Recording) -> str | None:
-    """`mosaic_warning` of a recording, by its first frames; None with fewer than `LEAST_FRAMES`."""
+def layout_warnings(sensor: Sensor, rate: Image) -> list[str]:
+    """What an upright rate image [H, W] contradicts: the order of bits, else the mosaic."""
+    warning = bit_order_warning(sensor.bit_order, rate) or mosaic_warning(sensor.mosaic, rate)
+    return [] if warning is None else [warning]
+
+
+def recorded_layout_warnings(recording: Recording) -> list[str]:
+    """`layout_warnings` of a recording, by its first frames; none with fewer than `LEAST_FRAMES`."""
     sensor, frames = recording.sensor, min(recording.frames, CHECKED_FRAMES)
     if frames < LEAST_FRAMES:
-        return None
-    window = aligned_window(recording.read(0, frames), sensor, 0, 0, frames)
-    return mosaic_warning(sensor.mosaic, window.rate(fill=True))
+        return []
+    return layout_warnings(sensor, aligned_window(recording.read(0, frames), sensor, 0, 0, frames).rate(fill=True))

@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from spiked.recon.frontend.mosaic_check import recorded_mosaic_warning
+from spiked.recon.frontend.mosaic_check import recorded_layout_warnings
 from spiked.recording import Recording, RecordingGeometry
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import output, report_warning
@@ -38,8 +38,10 @@ def info(
     recording = g.open_described(file, stated, profile).recording
     for warning in recording.warnings:
         report_warning(warning)
-    if (mosaic_warning := recorded_mosaic_warning(recording)) is not None:
-        report_warning(mosaic_warning)
+    for warning in recorded_layout_warnings(recording):
+        report_warning(warning)
+    for question in recording.questions:
+        output.print(question, markup=False)
     for name, value in rows(recording):
         output.print(f"{name:10s} {value}", markup=False)
 

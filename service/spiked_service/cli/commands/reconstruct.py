@@ -154,6 +154,7 @@ def reconstruct(
     reconstructor = Reconstructor(
         sensor, replace(chosen.options(), poses=known, calibration=measured), recording=recording
     )
+    reconstructor.warnings += recording.questions
     run = ReconstructionRun.begun(recording, reconstructor, out, parameters_of(context, described.geometry))
     _carry_out(run, _watched(file.name, watch_port) if watch else None)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from spiked.blocks import Window, aligned_window
 from spiked.recon.frontend.demosaic import fill_mosaic
-from spiked.recon.frontend.mosaic_check import mosaic_warning
+from spiked.recon.frontend.mosaic_check import layout_warnings
 from spiked.ring import End, Frames, Gap, Policy, RingReader
 from spiked.sensor import Sensor
 from spiked_service.results.image_encoding import display_white, thumbnail
@@ -65,7 +65,7 @@ def run_preview(command: PreviewCommand, channel: WorkerChannel) -> None:
                 frames = np.concatenate(blocks)
                 if len(frames) > 2 * block:
                     channel.send(renderer.render(frames, first, block))
-                    if (warning := renderer.mosaic_warning()) is not None:
+                    if (warning := renderer.layout_warning()) is not None:
                         channel.send(Warned(text=warning))
                 blocks.clear()
                 channel.leave.wait(_PERIOD_S)
@@ -111,13 +111,13 @@ class PreviewRenderer:
             hot_pixels=_hot(window),
         )
 
-    def mosaic_warning(self) -> str | None:
-        """The first contradiction between the stated mosaic and the newest image, which is looked at now and then."""
+    def layout_warning(self) -> str | None:
+        """The first contradiction between the stated layout and the newest image, which is looked at now and then."""
         self._images += 1
         due = not self._warned and self._images.bit_count() == 1  # images 1, 2, 4, 8, ...
-        warning = mosaic_warning(self._sensor.mosaic, self._newest) if due and self._newest is not None else None
-        self._warned |= warning is not None
-        return warning
+        warnings = layout_warnings(self._sensor, self._newest) if due and self._newest is not None else []
+        self._warned |= bool(warnings)
+        return warnings[0] if warnings else None
 
     def keep(self, *, replace: bool) -> None:
         """Write a thumbnail of the first image, and at the end of the last one."""

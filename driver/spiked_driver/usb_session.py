@@ -104,13 +104,20 @@ class UsbSession:
         """End all transfers and close. If some do not end in time, their memory is kept and the camera stays open."""
         ended = self.reader.stop(timeout_s)
         if ended and self._started:  # a fresh handle is left as it is
-            with suppress(usb.core.USBError):  # the camera may be gone
-                self._command(SessionCommand.ABORT)
-                self._command(SessionCommand.FLUSH)
+            self._end_session()
         if self.reader.close() and ended:
             self._context.close()
         else:
             _log.warning("transfers of the camera at %s did not end: the camera stays open", self.camera.port)
+
+    def _end_session(self) -> None:
+        """Abort and flush; a bridge that refuses that is told in the log, unless the camera is gone."""
+        try:
+            self._command(SessionCommand.ABORT)
+            self._command(SessionCommand.FLUSH)
+        except usb.core.USBError as error:
+            if error.errno != errno.ENODEV:
+                _log.info("the bridge of the camera at %s refuses abort or flush: %s", self.camera.port, error)
 
     def _command(self, command: SessionCommand, length: int = 0) -> None:
         """Send a session request while no read is in flight. Raises usb.core.USBError."""

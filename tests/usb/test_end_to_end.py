@@ -21,6 +21,7 @@ from virtual_camera.host import CameraSettings
 from virtual_camera.rig import VirtualCameras
 
 from spiked.recording import open_recording
+from spiked.recording.time_base import offset
 from spiked.sensor import Sensor
 from spiked.simulate import SimulatedCamera
 from spiked.simulate.record import simulate
@@ -29,6 +30,7 @@ RATE = 2000
 FRAMES = 1000
 FOV_DEG = 60.0
 PATIENCE_S = 240.0
+OVER = ("complete", "failed")
 
 
 @pytest.fixture(scope="module")
@@ -220,6 +222,46 @@ def test_frames_are_timed_within_a_millisecond_on_a_busy_machine(
     rates_hz = 1e9 * np.diff(frames) / np.diff(times_ns)
     assert len(frames) >= 5
     assert np.abs(rates_hz / RATE - 1).max() < 0.01, rates_hz
+
+
+def test_two_cameras_share_a_time_base(
+    cameras: Callable[..., VirtualCameras],
+    daemon: Callable[..., Any],
+    room: Path,
+    tmp_path: Path,
+    figure: Callable[[str, object, str], None],
+) -> None:
+    ports = ("2-1", "2-2")
+    rig = cameras(
+        *(CameraSettings(str(room), rate_hz=RATE, buffer_frames=200, port=port) for port in ports), usbfs_memory_mb=64
+    )
+    try:
+        rig.hurry()
+    except PermissionError:
+        pytest.skip("needs real-time priority for the virtual cameras")
+    http = daemon("--no-capture", seen=rig).http
+    ids = []
+    for port in ports:
+        source = f"usb:{port}?rate={RATE}&transfer_kib=64"
+        plan = {"source": source, "frames": 10 * RATE, "reconstruct": False}
+        ids.append(http.post("captures", json=plan).json()["id"])
+    began_s = []
+    recordings = []
+    for number, capture_id in enumerate(ids):
+        wait_for(lambda one=capture_id: http.get(f"captures/{one}").json()["state"] in OVER, "it ends")  # type: ignore[misc]
+        recording = open_recording(tmp_path / "data" / "captures" / capture_id / "recording.dat")
+        numbers = recording.compact(0, recording.frames)[:, :8].copy().view("<i8")[:, 0]
+        assert recording.frames == 10 * RATE and not recording.gaps
+        repeated = sent(room, range(FRAMES))[:, 8:]
+        np.testing.assert_array_equal(recording.compact(0, recording.frames)[:, 8:], repeated[numbers % FRAMES])
+        began_s.append(rig.report(number).start_s + numbers[0] / RATE)
+        recordings.append(recording)
+    found, true_s = offset(*recordings), began_s[1] - began_s[0]
+    error_us = 1e6 * (found.seconds - true_s)
+    figure("offset of two cameras", f"{error_us:+.0f} us", f"one frame, {1e6 / RATE:.0f} us")
+    assert found.sigma_s is not None
+    figure("its standard deviation", f"{1e6 * found.sigma_s:.0f} us", "")
+    assert abs(error_us) < 1e6 / RATE, (found.seconds, true_s)
 
 
 def test_a_rate_that_is_not_the_stated_one_is_a_warning(

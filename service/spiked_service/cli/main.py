@@ -19,6 +19,7 @@ from spiked_service.cli.commands.info import info
 from spiked_service.cli.commands.localise import localise
 from spiked_service.cli.commands.merge import merge
 from spiked_service.cli.commands.noise_report import noise_report
+from spiked_service.cli.commands.offset import offset
 from spiked_service.cli.commands.openapi import openapi
 from spiked_service.cli.commands.reconstruct import reconstruct
 from spiked_service.cli.commands.render import render
@@ -56,7 +57,7 @@ def _options(
 
 for _group, _commands in {
     "Live": (serve, devices, backup, restore),
-    "Files": (info, verify, convert, simulate, calibrate, noise_report),
+    "Files": (info, verify, convert, offset, simulate, calibrate, noise_report),
     "Scenes": (reconstruct, localise, merge, render, evaluate),
     "This program": (bench, openapi, version),
 }.items():

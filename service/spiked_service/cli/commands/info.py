@@ -8,6 +8,7 @@ import typer
 
 from spiked.recon.frontend.mosaic_check import recorded_layout_warnings
 from spiked.recording import Recording, RecordingGeometry
+from spiked.recording.time_base import MeasuredRate, measured_rate
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import output, report_warning
 
@@ -54,6 +55,7 @@ def rows(recording: Recording) -> list[tuple[str, str]]:
     rate = _spike_rate(recording, sampled)
     part = "" if sampled == recording.frames else f" (first {sampled} frames)"
     k = sensor.intrinsics
+    measured = measured_rate(recording.clock)
     order = "bottom-up" if sensor.flipped else "top-down"
     gaps = f"{len(recording.gaps)}, {sum(gap.count for gap in recording.gaps)} frames" if recording.gaps else "none"
     return [
@@ -62,11 +64,21 @@ def rows(recording: Recording) -> list[tuple[str, str]]:
         ("layout", f"{sensor.layout}, rows {order}, {sensor.bit_order} first, {sensor.frame_bytes} bytes a frame"),
         ("colour", str(sensor.mosaic) if sensor.mosaic else "grey"),
         ("frames", f"{recording.frames} at {sensor.frame_rate_hz:g} Hz, {seconds:.4f} s"),
+        *([] if measured is None else [("clock", _clock(measured, sensor.frame_rate_hz))]),
         ("spikes", f"{rate:.4f} a pixel and frame, {rate * sensor.frame_rate_hz:.0f} a pixel and second{part}"),
         ("optics", f"fx {k.fx:.2f} fy {k.fy:.2f} cx {k.cx:.2f} cy {k.cy:.2f} px" if k else "not known"),
         ("lens", "not known" if k is None else str(k.distortion or "no distortion")),
         ("gaps", gaps),
     ]
+
+
+def _clock(measured: MeasuredRate, stated_hz: float) -> str:
+    off = 1e6 * (measured.hz / stated_hz - 1)
+    drift = "" if measured.drift_ppm_s is None else f", drifting by {measured.drift_ppm_s:+.2f} ppm a second"
+    return (
+        f"{measured.hz:.3f} Hz by this machine's clock, standard deviation {measured.sigma_hz:.3f} Hz, "
+        f"{off:+.1f} ppm from the stated rate{drift}"
+    )
 
 
 def _spike_rate(recording: Recording, frames: int) -> float:

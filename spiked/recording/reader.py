@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spiked.blocks import unpack
 from spiked.errors import ConfigurationError, RecordingError
+from spiked.recording.arrays import is_array
 from spiked.recording.geometry import DEFAULT_RATE_HZ, Origin, OriginKind, RecordingGeometry, guess, tags_agree
 from spiked.recording.host_time import host_times_ns
 from spiked.recording.sidecar import (
@@ -231,7 +232,8 @@ def _map(path: Path) -> NDArray[np.uint8]:
             head = file.read(16)
             for magic, what in _MAGICS.items():
                 if head.startswith(magic):
-                    raise RecordingError(f"{path}: this is {what}, not a recording")
+                    hint = ": `spiked convert` reads arrays of spikes" if is_array(head) else ""
+                    raise RecordingError(f"{path}: this is {what}, not a recording{hint}")
             if not head:
                 raise RecordingError(f"{path}: the file is empty")
             return np.asarray(np.memmap(file, np.uint8, "r"))

@@ -27,6 +27,8 @@ from spiked.recording import (
     read_sidecar,
     sidecar_path,
 )
+from spiked.recording.arrays import SpikeArray, is_array, open_array, open_bits
+from spiked.recording.geometry import DEFAULT_RATE_HZ
 from spiked.sensor import Layout, Sensor
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
@@ -45,6 +47,14 @@ class Form(StrEnum):
     ROW_TAGGED = "row_tagged"
     USB = "usb"
     PCIE = "pcie"
+    ARRAY = "array"
+    """An array of NumPy or HDF5; read only."""
+    BITS = "bits"
+    """The bits of a frame one after the other, without an end of a row; read only."""
+
+
+READ_ONLY = (Form.ARRAY, Form.BITS)
+"""Forms that are not written."""
 
 
 def _form(text: str) -> Form:
@@ -55,7 +65,15 @@ def _form(text: str) -> Form:
         raise typer.BadParameter(f"{text!r} is not one of {', '.join(Form)}") from error
 
 
+def _written_form(text: str) -> Form:
+    form = _form(text)
+    if form in READ_ONLY:
+        raise typer.BadParameter(f"{form} is read and not written: choose another form")
+    return form
+
+
 _FORMS = f"<{'|'.join(Form)}>"
+_WRITTEN_FORMS = f"<{'|'.join(form for form in Form if form not in READ_ONLY)}>"
 
 
 Item = NDArray[np.uint8] | Gap
@@ -84,11 +102,14 @@ class Writer(Protocol):
 def convert(
     source: Annotated[Path, typer.Argument(metavar="IN", help="A recording, or the raw bytes of a camera.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="A new file.")],
-    to: Annotated[Form, typer.Option(help="The form to write.", parser=_form, metavar=_FORMS)] = Form.COMPACT,
+    to: Annotated[
+        Form, typer.Option(help="The form to write.", parser=_written_form, metavar=_WRITTEN_FORMS)
+    ] = Form.COMPACT,
     source_form: Annotated[
         Form | None,
         typer.Option("--from", help="The form of IN. Default: detected.", parser=_form, metavar=_FORMS),
     ] = None,
+    array: Annotated[str | None, typer.Option(help="Name of the array in an .npz or HDF5 file.")] = None,
     width: g.Width = None,
     height: g.Height = None,
     rate: g.Rate = None,
@@ -99,6 +120,10 @@ def convert(
 ) -> None:
     """Convert between recordings (compact, row_tagged) and raw camera bytes (usb 400x250, pcie 1000x1000).
 
+    Arrays of 0 and 1 [frames, rows, columns] in .npy, .npz and HDF5 files are read, too, photon cubes (.npy of packed
+    bits) among them, and frames whose rows do not end with a byte (`--from bits`). Rows of arrays come top-down unless
+    stated otherwise. Columns at the right beyond a multiple of 8 are left out.
+
     The bits of every frame are kept. Raw usb and pcie bytes have no sidecar: give rate, orientation and colour again
     when reading such a file. Raw pcie bytes do not record lost frames.
 
@@ -107,18 +132,35 @@ def convert(
     - `spiked convert endpoint82.bin rec.dat`
 
     - `spiked convert rec.dat rec.usb --to usb`
+
+    - `spiked convert photoncube.npy rec.dat --rate 97700`
+
+    - `spiked convert spikes.h5 rec.dat --array sequence/spikes`
+
+    - `spiked convert vidar.dat rec.dat --from bits --width 346 --height 260`
     """
     outputs.try_file("OUT", out)
     given = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic)
-    content = read_content(source, source_form, given)
+    content = read_content(source, source_form, given, array)
     count, lost = write_content(content, out, to)
     output.print(f"{out}: {count} frames, {lost} lost, {to}", markup=False)
 
 
-def read_content(path: Path, form: Form | None, given: RecordingGeometry) -> Content:
-    """Open any form. Raises RecordingError or ConfigurationError."""
+def read_content(path: Path, form: Form | None, given: RecordingGeometry, array: str | None = None) -> Content:
+    """Open any form; `array` is the name of one. Raises RecordingError or ConfigurationError."""
     form = form or _detect_form(path)
+    if array is not None and form is not Form.ARRAY:
+        raise ConfigurationError(f"--array names an array of a file, and {path} is none")
     match form:
+        case Form.ARRAY:
+            found = open_array(path, array, given.width, given.bit_order)
+            if given.height not in (None, found.height):
+                raise ConfigurationError(f"{path}: its array has {found.height} rows, not {given.height}")
+            return _array_content(found, given, flipped=False)
+        case Form.BITS:
+            if given.width is None or given.height is None:
+                raise ConfigurationError(f"{path}: of frames without rows give --width and --height")
+            return _array_content(open_bits(path, given.width, given.height, given.bit_order), given, flipped=True)
         case Form.USB:
             return _wire_content(path, UsbFraming, _wire_sensor(given, USB_WIDTH, USB_HEIGHT))
         case Form.PCIE:
@@ -129,6 +171,22 @@ def read_content(path: Path, form: Form | None, given: RecordingGeometry) -> Con
     for warning in recording.warnings:
         report_warning(warning)
     return Content(recording.sensor, _recorded(recording), _sidecar_fields(recording), recording.clock)
+
+
+def _array_content(found: SpikeArray, given: RecordingGeometry, flipped: bool) -> Content:
+    if given.layout is not None:
+        raise ConfigurationError("--layout is of recordings: leave it out")
+    if found.width < found.columns:
+        left_out = found.columns - found.width
+        report_warning(f"{left_out} of {found.columns} columns are left out: a recording has a multiple of 8")
+    sensor = Sensor(
+        found.width,
+        found.height,
+        given.frame_rate_hz or DEFAULT_RATE_HZ,
+        flipped=flipped if given.flipped is None else given.flipped,
+        mosaic=given.mosaic,
+    )
+    return Content(sensor, found.blocks(), {})
 
 
 def write_content(content: Content, out: Path, to: Form) -> tuple[int, int]:
@@ -159,6 +217,8 @@ def _detect_form(path: Path) -> Form | None:
         head = np.fromfile(path, np.uint8, _BLOCK_BYTES)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}; check its permissions") from error
+    if is_array(head[:8].tobytes()):
+        return Form.ARRAY
     framings: dict[Form, Callable[[], Framing]] = {Form.USB: UsbFraming, Form.PCIE: PcieFraming}
     for form, make in framings.items():
         if next(_parsed(make(), [head], _frame_bytes(form)), None) is not None:
@@ -314,5 +374,5 @@ def _writer(content: Content, out: Path, to: Form) -> Writer:
             return _RecordingFile(content, out, Layout.COMPACT)
         case Form.ROW_TAGGED:
             return _RecordingFile(content, out, Layout.ROW_TAGGED)
-        case Form.USB | Form.PCIE:
+        case _:
             return _WireFile(content.sensor, out, to)

@@ -253,7 +253,8 @@ def test_two_cameras_share_a_time_base(
         numbers = recording.compact(0, recording.frames)[:, :8].copy().view("<i8")[:, 0]
         assert recording.frames == 10 * RATE and not recording.gaps
         repeated = sent(room, range(FRAMES))[:, 8:]
-        np.testing.assert_array_equal(recording.compact(0, recording.frames)[:, 8:], repeated[numbers % FRAMES])
+        for first, frames in recording.chunks(FRAMES):
+            assert (frames[:, 8:] == repeated[numbers[first : first + len(frames)] % FRAMES]).all()
         began_s.append(rig.report(number).start_s + numbers[0] / RATE)
         recordings.append(recording)
     found, true_s = offset(*recordings), began_s[1] - began_s[0]

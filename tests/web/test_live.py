@@ -112,7 +112,7 @@ def test_what_is_not_recorded_leaves_no_file(daemon: Callable[..., Any], visit: 
     one = daemon("--device", "sim:?width=160&height=100", "--no-capture")
     page = visit(one.address)
     page.get_by_label("Length", exact=True).select_option("seconds")
-    page.get_by_label("Length in seconds").fill("0.01")
+    page.get_by_label("Length in seconds", exact=True).fill("0.01")
     page.get_by_role("checkbox", name="Record").uncheck()
     page.get_by_role("checkbox", name="Reconstruct").uncheck()
     page.get_by_role("button", name="Start").click()

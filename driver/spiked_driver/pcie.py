@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from spiked.native._wire import PcieParser
 
 from spiked.camera import CameraOptions
+from spiked.recording.geometry import Assumable
 from spiked.ring import DeviceState, DeviceStatus, End, EndReason, Gap, LossCause
 from spiked.sensor import Sensor
 from spiked_driver.capabilities import PCIE_CAPABILITIES
@@ -210,6 +211,11 @@ def _find() -> list[Device]:
     return [_describe(SourceSpec.parse(f"{KIND.name}:{path}")) for path in CARDS if path.exists()]
 
 
+def _assumed(source: PcieSource, options: HardwareOptions) -> tuple[Assumable, ...]:
+    """Public recordings of this camera come either way up."""
+    return ("flipped",) if options.flipped is None else ()
+
+
 KIND = SourceKind(
     name="pcie",
     usage="pcie:PATH",
@@ -217,6 +223,7 @@ KIND = SourceKind(
     options=HardwareOptions,
     open=_open,
     describe=_describe,
+    assumed=_assumed,
     find=_find,
     is_camera=True,
     takes_path=True,

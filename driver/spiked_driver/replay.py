@@ -12,6 +12,7 @@ from pydantic import Field, WithJsonSchema, field_validator
 from spiked.camera import StoredCameraOptions
 from spiked.errors import SourceError
 from spiked.recording import Recording, RecordingGeometry, open_recording
+from spiked.recording.geometry import Assumable
 from spiked.ring import DeviceState, DeviceStatus, End, EndReason, Gap, LossCause
 from spiked.sensor import BitOrder, Sensor
 from spiked_driver.fault_options import MOST_FRAMES
@@ -73,6 +74,11 @@ class ReplaySource:
     def path(self) -> Path:
         """The recording's file."""
         return self._recording.path
+
+    @property
+    def assumed(self) -> tuple[Assumable, ...]:
+        """Properties of the sensor that nobody stated."""
+        return self._recording.assumed
 
     @property
     def sensor(self) -> Sensor:
@@ -186,6 +192,7 @@ KIND = SourceKind(
     options=ReplayOptions,
     open=_open,
     describe=_describe,
+    assumed=lambda source, options: source.assumed,
     recording_of=_recording_of,
     can_block=True,
     takes_path=True,

@@ -7,12 +7,13 @@ The options of a kind are a pydantic model. Its fields carry types, bounds and d
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, Field, WithJsonSchema
 
 from spiked.camera import CameraFiles, CameraOptions, Rate
 from spiked.errors import SourceError
+from spiked.recording.geometry import Assumable
 from spiked.ring import DeviceState
 from spiked_driver.capabilities import Capability
 from spiked_driver.fault_options import FaultOptions
@@ -104,6 +105,11 @@ def _no_recording(spec: SourceSpec) -> Path | None:
     return None
 
 
+def _nothing_assumed(source: object, options: object) -> tuple[Assumable, ...]:
+    """Of a source that knows its sensor."""
+    return ()
+
+
 _Options = TypeVar("_Options", bound=BaseModel)
 
 
@@ -124,6 +130,8 @@ class SourceKind(Generic[_Options]):
     """The device that a text names, whether or not it is present. Raises nothing."""
     find: Callable[[], list[Device]] = list
     """Devices of this kind that are present without being configured."""
+    assumed: Callable[[Any, _Options], tuple[Assumable, ...]] = _nothing_assumed
+    """Properties of an opened source's sensor that nobody stated."""
     recording_of: Callable[[SourceSpec], Path | None] = _no_recording
     """The recording that is the source, whose sidecar describes the camera."""
     is_camera: bool = False

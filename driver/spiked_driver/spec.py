@@ -14,6 +14,7 @@ from spiked.calibration import Calibration
 from spiked.errors import SourceError
 from spiked.profile import CameraProfile, find_profile
 from spiked.recording import recorded_calibration, sidecar_path
+from spiked.recording.geometry import Assumable
 from spiked_driver.fault_options import FaultOptions
 from spiked_driver.faults import Faults, FaultySource
 from spiked_driver.source import Source
@@ -35,6 +36,8 @@ class OpenedCamera:
     """The profile that completed the options of the source's text."""
     calibration: Path | None = None
     """File of gains, dark rates and dead pixels; it fits the sensor."""
+    assumed: tuple[Assumable, ...] = ()
+    """Properties of the sensor that neither the options nor a profile nor the source state."""
 
 
 def open_source(spec: str, warn: Warn | None = None) -> Source:
@@ -64,6 +67,7 @@ def open_camera(spec: str, warn: Warn | None = None, profiles: Path | None = Non
         calibration = options.calibration
     _check_size(options, spec)
     source = kind.open(parts, options, warn)
+    assumed = kind.assumed(source, options)
     if profile is not None and path is not None:
         profile.check(source.sensor)
         if calibration is None and profile.calibration is not None:
@@ -75,7 +79,7 @@ def open_camera(spec: str, warn: Warn | None = None, profiles: Path | None = Non
     if isinstance(options, FaultOptions):
         faults = options.faults(source.sensor.frame_rate_hz)
         source = source if faults == Faults(seed=faults.seed) else FaultySource(source, faults)
-    return OpenedCamera(source, profile, calibration)
+    return OpenedCamera(source, profile, calibration, assumed)
 
 
 def stored_profile(device: Device, profiles: Path) -> Path | None:

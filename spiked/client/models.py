@@ -748,6 +748,12 @@ class UploadOut(BaseModel):
     capture_id: Annotated[str | None, Field(description="What it became.")]
 
 
+class AssumedEnum(StrEnum):
+    frame_rate = "frame_rate"
+    flipped = "flipped"
+    bit_order = "bit_order"
+
+
 class UploadSidecar(BaseModel):
     """
     A recording's sidecar, as it stands beside the `.dat`.
@@ -773,6 +779,7 @@ class UploadSidecar(BaseModel):
     calibration: str | None = None
     device: dict[str, Any] | None = None
     profile: dict[str, Any] | None = None
+    assumed: list[AssumedEnum] = []
 
 
 class UploadsOut(BaseModel):
@@ -1178,6 +1185,10 @@ class ReconstructionOut(BaseModel):
     reason: Annotated[
         str,
         Field(description="Why it failed, waits or tracks badly; empty while all is well."),
+    ]
+    warnings: Annotated[
+        list[str],
+        Field(description="What it found out about the camera, or had to assume."),
     ]
     priority: int
     options: ReconstructionOptions

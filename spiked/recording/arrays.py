@@ -5,8 +5,10 @@ Vidar files of widths that are no multiple of 8 have the bits of a frame one aft
 SpikeCV and Spike-Zoo).
 """
 
+import math
 import zipfile
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,6 +42,8 @@ class SpikeArray:
     """Columns of the container."""
     packed: BitOrder | None
     """Order of the bits where eight pixels are in a byte; None: an element a pixel."""
+    trailing_bytes: int = 0
+    """Bytes after the last whole frame."""
 
     @property
     def width(self) -> int:
@@ -65,8 +69,11 @@ class SpikeArray:
             row = bits.shape[1] // self.height if block.ndim == 3 else self.columns
             return bits[:, : self.height * row].reshape(len(block), self.height, row)[:, :, : self.columns]
         if not ((block == 0) | (block == 1)).all():
+            is_bytes = block.dtype == np.uint8
+            hint = f"; if eight pixels are in a byte, give --width {8 * self.columns}" if is_bytes else ""
             raise RecordingError(
-                f"{self.path}: frames {begin} to {end - 1} have other values than 0 and 1: this is no array of spikes"
+                f"{self.path}: frames {begin} to {end - 1} have other values than 0 and 1: this is no array of "
+                f"spikes{hint}"
             )
         return block.astype(np.uint8)
 
@@ -115,6 +122,8 @@ def open_bits(path: Path, width: int, height: int, bit_order: BitOrder | None = 
 
     Raises RecordingError.
     """
+    if width < 8 or height < 1:
+        raise RecordingError(f"{path}: frames of {width}x{height} pixels are impossible: correct --width and --height")
     size = -(-width * height // 8)
     try:
         data = np.memmap(path, np.uint8, "r")
@@ -126,7 +135,8 @@ def open_bits(path: Path, width: int, height: int, bit_order: BitOrder | None = 
             f"{path}: its {data.size} bytes are less than one frame of {width}x{height} ({size} bytes)"
         )
     stored = data[: frames * size].reshape(frames, size)
-    return _checked(SpikeArray(path, stored, frames, height, width, bit_order or BitOrder.LSB))
+    trailing = data.size - frames * size
+    return _checked(SpikeArray(path, stored, frames, height, width, bit_order or BitOrder.LSB, trailing))
 
 
 def _checked(found: SpikeArray) -> SpikeArray:
@@ -141,15 +151,76 @@ def _array(path: Path, name: str | None) -> Any:
         with path.open("rb") as file:
             head = file.read(8)
         if head.startswith(NUMPY_MAGIC):
+            if name is not None:
+                raise RecordingError(f"{path}: it is one array without a name: leave out --array")
             return np.load(path, mmap_mode="r", allow_pickle=False)
         if head.startswith(ZIP_MAGIC):
-            with np.load(path, allow_pickle=False) as opened:
-                return opened[_choose(path, {key: opened[key].ndim for key in opened.files}, name)]
+            return _of_npz(path, name)
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise RecordingError(f"{path}: this is no readable array of NumPy: {error}") from error
     if head.startswith(HDF5_MAGIC):
         return _of_hdf5(path, name)
     raise RecordingError(f"{path}: this is neither a NumPy array nor an HDF5 file")
+
+
+class _NpzArray:
+    """An array of an `.npz` file, read in slices of frames from its beginning to its end, without unpacking it whole.
+
+    Raises ValueError, OSError and BadZipFile.
+    """
+
+    def __init__(self, path: Path, member: str) -> None:
+        self._path, self._member = path, member
+        self._opened = ExitStack()
+        self._open()
+        if self._header[1]:
+            raise ValueError(f"{member} is stored by columns; save it with numpy.ascontiguousarray")
+        self.shape, _, self.dtype = self._header
+
+    @property
+    def ndim(self) -> int:
+        return len(self.shape)
+
+    def _open(self) -> None:
+        self._opened.close()
+        archive = self._opened.enter_context(zipfile.ZipFile(self._path))
+        self._file = self._opened.enter_context(archive.open(self._member))
+        self._header = _npy_header(self._file)
+        self._next = 0
+
+    def __getitem__(self, frames: slice) -> NDArray[Any]:
+        begin, end, _ = frames.indices(self.shape[0])
+        if begin < self._next:
+            self._open()
+        frame = math.prod(self.shape[1:]) * self.dtype.itemsize
+        while self._next < begin:
+            self._next += 1
+            self._file.read(frame)
+        data = self._file.read((end - begin) * frame)
+        if len(data) != (end - begin) * frame:
+            raise RecordingError(f"{self._path}: {self._member} ends within frame {self._next + len(data) // frame}")
+        self._next = end
+        return np.frombuffer(data, self.dtype).reshape(end - begin, *self.shape[1:])
+
+
+def _npy_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, whether it is in Fortran order, and type of an array in the `.npy` format. Raises ValueError."""
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = read(file)
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects")
+    return shape, fortran, dtype
+
+
+def _of_npz(path: Path, name: str | None) -> _NpzArray:
+    axes = {}
+    with zipfile.ZipFile(path) as file:
+        for member in file.namelist():
+            if member.endswith(".npy"):
+                with file.open(member) as opened:
+                    axes[member.removesuffix(".npy")] = len(_npy_header(opened)[0])
+    return _NpzArray(path, f"{_choose(path, axes, name)}.npy")
 
 
 def _of_hdf5(path: Path, name: str | None) -> Any:

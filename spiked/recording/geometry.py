@@ -1,18 +1,24 @@
 """Geometry of a recording: stated by a caller, or guessed from the file's size if there is no sidecar."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum, StrEnum
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spiked.camera import StoredCameraOptions
 from spiked.errors import RecordingError
-from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic
+from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
 
 DEFAULT_RATE_HZ = 20_000.0
 """Frame rate where neither sidecar nor options state one: that of both cameras."""
+
+Assumable = Literal["frame_rate", "flipped", "bit_order"]
+"""Fields of a sidecar for which there is a default if nobody states them."""
+ASSUMABLE: tuple[Assumable, ...] = get_args(Assumable)
+"""All of them."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +56,29 @@ class RecordingGeometry:
         """The stated fields by name: keyword arguments of `open_recording` and `verify`, fields of `Sensor`."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
+    def unstated(self, assumed: Iterable[Assumable]) -> tuple[Assumable, ...]:
+        """Those of the `assumed` fields that are not stated here."""
+        stated = {"frame_rate": self.frame_rate_hz, "flipped": self.flipped, "bit_order": self.bit_order}
+        return tuple(name for name in assumed if stated[name] is None)
+
     @property
     def states_size(self) -> bool:
         """Whether a field is stated that changes the bytes of a frame: width, height or layout."""
         return any(value is not None for value in (self.width, self.height, self.layout))
+
+
+def orientation_questions(assumed: Iterable[Assumable], sensor: Sensor) -> tuple[str, ...]:
+    """The question to the user where the direction of the rows is assumed.
+
+    No pixel shows it: a world that is mirrored is as consistent as the true one.
+    """
+    if "flipped" not in assumed:
+        return ()
+    taken, option, value = ("bottom-up", "--upright", "false") if sensor.flipped else ("top-down", "--flipped", "true")
+    return (
+        f"nothing says which way up its rows come, and its pixels cannot: {taken} is taken; if writing in a picture "
+        f"reads mirrored, give {option} (in a profile, a source or a request: flipped {value})",
+    )
 
 
 class OriginKind(StrEnum):

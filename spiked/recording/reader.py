@@ -12,7 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 from spiked.blocks import unpack
 from spiked.errors import ConfigurationError, RecordingError
 from spiked.recording.arrays import is_array
-from spiked.recording.geometry import DEFAULT_RATE_HZ, Origin, OriginKind, RecordingGeometry, guess, tags_agree
+from spiked.recording.geometry import (
+    ASSUMABLE,
+    DEFAULT_RATE_HZ,
+    Assumable,
+    Origin,
+    OriginKind,
+    RecordingGeometry,
+    guess,
+    orientation_questions,
+    tags_agree,
+)
 from spiked.recording.host_time import host_times_ns
 from spiked.recording.sidecar import (
     ClockPair,
@@ -70,10 +80,15 @@ class Recording:
     """SpikeCV's ids of the label types, from a config.yaml."""
     data: NDArray[np.uint8]
     """The whole frames as stored, uint8 [frames, frame_bytes], a read-only memory map."""
-    questions: tuple[str, ...] = ()
-    """What nothing states and no pixel shows, and what was taken, one sentence each."""
+    assumed: tuple[Assumable, ...] = ()
+    """Properties of the sensor, by their names in a sidecar, that nobody stated: a default was taken."""
     _unreleased: list[int] = field(default_factory=lambda: [0], repr=False)
     """Bytes read since pages were given back, see `RELEASED_BYTES`."""
+
+    @property
+    def questions(self) -> tuple[str, ...]:
+        """What nothing states and no pixel shows, and what was taken, one sentence each."""
+        return orientation_questions(self.assumed, self.sensor)
 
     @property
     def seconds(self) -> float:
@@ -219,7 +234,7 @@ def open_unchecked(path: Path, given: RecordingGeometry) -> Recording:
         sidecar.clock if sidecar else (),
         described.label_types,
         whole,
-        described.questions,
+        described.assumed,
     )
 
 
@@ -254,7 +269,7 @@ def _release(data: NDArray[np.uint8]) -> None:
 class _Description:
     sensor: Sensor
     origin: Origin
-    questions: tuple[str, ...] = ()
+    assumed: tuple[Assumable, ...] = ()
     warnings: tuple[str, ...] = ()
     overruled: tuple[str, ...] = ()
     sidecar: Sidecar | None = None
@@ -262,7 +277,7 @@ class _Description:
 
 
 def _describe(path: Path, data: NDArray[np.uint8], given: RecordingGeometry) -> _Description:
-    described = _from_sidecar(path) or _from_spikecv(path, given) or _from_size(path, data, given)
+    described = _from_sidecar(path, given) or _from_spikecv(path, given) or _from_size(path, data, given)
     fields = given.stated()
     if not fields or described.origin.kind is not OriginKind.SIDECAR:
         return described
@@ -290,14 +305,14 @@ def _replaced(path: Path, sensor: Sensor, fields: dict[str, object]) -> Sensor:
         raise RecordingError(f"{path}: {error}") from error
 
 
-def _from_sidecar(path: Path) -> _Description | None:
+def _from_sidecar(path: Path, given: RecordingGeometry) -> _Description | None:
     beside = sidecar_path(path)
     if not beside.exists():
         return None
     sidecar = read_sidecar(beside)
-    return _Description(
-        sidecar.sensor(), Origin(OriginKind.SIDECAR, f"from the sidecar {beside.name}"), sidecar=sidecar
-    )
+    assumed = given.unstated(sidecar.assumed)
+    sentence = f"from the sidecar {beside.name}{f'; {_sentence(assumed, sidecar.sensor())}' if assumed else ''}"
+    return _Description(sidecar.sensor(), Origin(OriginKind.SIDECAR, sentence), assumed, sidecar=sidecar)
 
 
 def _from_spikecv(path: Path, given: RecordingGeometry) -> _Description | None:
@@ -308,38 +323,31 @@ def _from_spikecv(path: Path, given: RecordingGeometry) -> _Description | None:
     if beside is None or config is None:
         return None
     sensor = _replaced(path, Sensor(8, 1, DEFAULT_RATE_HZ), {"width": config.spike_w, "height": config.spike_h})
-    sentence = f"{sensor.width}x{sensor.height} from SpikeCV's {beside.name}, which knows sizes only; {_assumed(given)}"
-    origin = Origin(OriginKind.SIDECAR, sentence)
-    return _Description(sensor, origin, _asked(given), label_types=config.labeled_data_type)
+    assumed = given.unstated(ASSUMABLE)
+    size = f"{sensor.width}x{sensor.height} from SpikeCV's {beside.name}, which knows sizes only"
+    origin = Origin(OriginKind.SIDECAR, f"{size}; {_sentence(assumed, sensor)}")
+    return _Description(sensor, origin, assumed, label_types=config.labeled_data_type)
 
 
 def _from_size(path: Path, data: NDArray[np.uint8], given: RecordingGeometry) -> _Description:
     if (given.width is None) != (given.height is None):
         raise RecordingError(f"{path}: give both width and height, or neither")
+    assumed = given.unstated(ASSUMABLE)
     if given.width is not None:
         sensor = _replaced(path, Sensor(8, 1, DEFAULT_RATE_HZ), given.stated())
-        origin = Origin(OriginKind.GIVEN, f"{sensor.width}x{sensor.height} as given; {_assumed(given)}")
-        return _Description(sensor, origin, _asked(given))
+        origin = Origin(OriginKind.GIVEN, f"{sensor.width}x{sensor.height} as given; {_sentence(assumed, sensor)}")
+        return _Description(sensor, origin, assumed)
     flavour = guess(str(path), data)
     fields = {"width": flavour.width, "height": flavour.height, "layout": flavour.layout, **given.stated()}
     sensor = _replaced(path, Sensor(8, 1, DEFAULT_RATE_HZ), fields)
-    sentence = f"{flavour.name}, the only known flavour that fits the file; {_assumed(given)}"
-    return _Description(sensor, Origin(OriginKind.GUESSED, sentence), _asked(given))
+    sentence = f"{flavour.name}, the only known flavour that fits the file; {_sentence(assumed, sensor)}"
+    return _Description(sensor, Origin(OriginKind.GUESSED, sentence), assumed)
 
 
-def _asked(given: RecordingGeometry) -> tuple[str, ...]:
-    """What no pixel shows: a world that is mirrored is as consistent as the true one."""
-    if given.flipped is not None:
-        return ()
-    return (
-        "nothing says which way up its rows come, and its pixels cannot: bottom-up is taken; if writing in a picture "
-        "reads mirrored, give --upright, else --flipped",
-    )
-
-
-def _assumed(given: RecordingGeometry) -> str:
-    rate = f"{DEFAULT_RATE_HZ:g} Hz" if given.frame_rate_hz is None else ""
-    rows = "rows bottom-up" if given.flipped is None else ""
-    bits = "least significant bit first" if given.bit_order is None else ""
-    assumed = ", ".join(part for part in (rate, rows, bits) if part)
-    return f"assumed: {assumed}" if assumed else "nothing assumed"
+def _sentence(assumed: tuple[Assumable, ...], sensor: Sensor) -> str:
+    values = {
+        "frame_rate": f"{sensor.frame_rate_hz:g} Hz",
+        "flipped": f"rows {'bottom-up' if sensor.flipped else 'top-down'}",
+        "bit_order": f"{'least' if sensor.bit_order is BitOrder.LSB else 'most'} significant bit first",
+    }
+    return f"assumed: {', '.join(values[name] for name in assumed)}" if assumed else "nothing assumed"

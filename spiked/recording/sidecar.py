@@ -1,5 +1,6 @@
 """The sidecar of a recording, `NAME.json` beside `NAME.dat`, and the `config.yaml` of SpikeCV's data sets."""
 
+import operator
 import os
 from collections import Counter
 from collections.abc import Iterable
@@ -12,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, Stri
 
 from spiked.camera import Pinhole
 from spiked.errors import ConfigurationError, RecordingError
+from spiked.recording.geometry import Assumable
 from spiked.sensor import BitOrder, Layout, Mosaic, Sensor
 
 RESERVED_BYTES = 256 << 10
@@ -78,6 +80,8 @@ class Sidecar(BaseModel):
     """Properties that the camera reported."""
     profile: dict[str, Any] | None = None
     """The camera profile that the recording was made with."""
+    assumed: tuple[Assumable, ...] = Field(default=(), exclude_if=operator.not_)
+    """Fields above with a default that neither a user nor the camera stated."""
 
     @classmethod
     def of(cls, sensor: Sensor, frames: int | None, **more: Any) -> "Sidecar":

@@ -61,11 +61,18 @@ def test_a_wrong_mosaic_is_said_and_corrected_on_request(tmp_path: Path) -> None
     true = Sensor(160, 96, 20000.0, mosaic=Mosaic.GRBG, intrinsics=SENSOR.intrinsics)
     said = Sensor(160, 96, 20000.0, mosaic=Mosaic.BGGR, intrinsics=SENSOR.intrinsics)
     camera = SimulatedCamera(true, 2, MotionKind.ARC, flow_px=0.25, parallax=0.5)
-    recording = record(tmp_path / "rec.dat", said, camera.next_frames(480))
+    recorded_frames = camera.next_frames(480)
+    recording = record(tmp_path / "rec.dat", said, recorded_frames)
     done = spiked("reconstruct", recording, "-o", tmp_path / "wrong", "--steps", 20)
     assert "--mosaic auto" in done.stderr and "GRBG" in done.stderr
     report = json.loads((tmp_path / "wrong" / "report.json").read_text())
     assert any("mosaic" in warning for warning in report["warnings"])
     done = spiked("reconstruct", recording, "-o", tmp_path / "right", "--steps", 20, "--mosaic", "auto")
-    assert "the mosaic detected from the pixels is GRBG" in " ".join(done.stderr.split())
-    assert json.loads((tmp_path / "right" / "report.json").read_text())["warnings"] == []
+    question = "by its pixels the mosaic is GRBG or GBRG, and they cannot say which (stated: BGGR): GRBG is taken"
+    assert question in " ".join(done.stderr.split())
+    (asked,) = json.loads((tmp_path / "right" / "report.json").read_text())["warnings"]
+    assert asked.startswith(question)
+    agreed = record(tmp_path / "agreed.dat", true, recorded_frames)
+    done = spiked("reconstruct", agreed, "-o", tmp_path / "agreed", "--steps", 20, "--mosaic", "auto")
+    assert "the pixels agree with the stated mosaic: GRBG" in done.stderr
+    assert json.loads((tmp_path / "agreed" / "report.json").read_text())["warnings"] == []

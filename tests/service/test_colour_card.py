@@ -61,6 +61,7 @@ def test_a_damaged_stream_is_recorded_bit_by_bit_and_seen_in_colour(
     assert (row.state, row.reason) == (CaptureState.COMPLETE, "")
     assert row.recording is not None and row.recording.lost_by_cause == {"usb": 4}
     recording = open_recording(data_store.captures.recording(row.id))
+    assert (recording.assumed, row.warnings) == ((), ())
     sensor = recording.sensor
     assert (sensor.mosaic, sensor.flipped, sensor.width) == (Mosaic.GRBG, False, 1000)
     sent = np.fromfile(scene, np.uint8).reshape(FRAMES, -1)
@@ -103,5 +104,7 @@ def test_a_stream_live_is_the_recording_of_its_file(data_store: DataStore, tmp_p
     with virtual_card(stream, pipe, rate=100):
         row = over(data_store, started.id).row
     recorded = data_store.captures.recording(row.id)
+    assert [text.partition(",")[0] for text in row.warnings] == ["nothing says which way up its rows come"]
+    assert open_recording(recorded).questions == row.warnings
     assert recorded.read_bytes() == stream.read_bytes()
     assert open_recording(recorded).sensor == open_recording(stream).sensor

@@ -6,6 +6,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 
 from spiked.errors import SpikedError
+from spiked.recording.geometry import orientation_questions
 from spiked.ring import DeviceState
 from spiked_service.captures.acquisition import AcquisitionSupervisor
 from spiked_service.captures.live_row import LiveRow
@@ -248,6 +249,8 @@ class LiveCapture:
             sensor = replace(opened.sensor, intrinsics=self.row.plan.intrinsics or opened.sensor.intrinsics)
             frames = opened.frames if self._stop_frame is None else self._stop_frame - self._first_frame
             self._row.set(sensor=sensor, frames_planned=frames)
+            if questions := orientation_questions(opened.assumed, sensor):
+                self._row.warn(*questions)
             try:
                 if Role.RECORDER in self._readers:
                     self._start_recorder(opened, recorder)
@@ -277,6 +280,7 @@ class LiveCapture:
             note=plan.name,
             profile=opened.profile,
             calibration=opened.calibration,
+            assumed=opened.assumed,
         )
         log = self._folder.capture(self.id) / "logs" / "recorder.log"
         self._recorder = RecorderSupervisor(command, log, self, standby)

@@ -16,7 +16,6 @@ from spiked.camera import StoredCameraOptions
 from spiked.errors import RecordingError, SpikedError
 from spiked.recording import sidecar_path
 from spiked.recording.sidecar import Sidecar
-from spiked.sensor import Sensor
 from spiked_service.base.ids import new_id
 from spiked_service.captures.captures import Captures
 from spiked_service.store.catalogue import Catalogue, StoreError
@@ -141,7 +140,8 @@ class Uploads:
                 checked.frames, checked.bytes, lost=sum(lost.values()), lost_by_cause=lost, sha256=checked.sha256
             )
             verdict = Quality(Grade(checked.grade), checked.reasons)
-            capture_id = self._move_to_capture(row, checked.sensor, recorded, verdict, stated.get("notes", ""))
+            more = {"sensor": checked.sensor, "warnings": checked.warnings, "notes": stated.get("notes", "")}
+            capture_id = self._move_to_capture(row, recorded, verdict, **more)
             captures.publish(capture_id)
             return self.get(upload_id)
 
@@ -153,10 +153,11 @@ class Uploads:
             self._folder.upload(upload_id).with_suffix(".json").unlink(missing_ok=True)
             self._catalogue.uploads.remove(upload_id)
 
-    def _move_to_capture(
-        self, upload: UploadRow, sensor: Sensor, recorded: Recorded, verdict: Quality, notes: str
-    ) -> str:
-        """Make a capture of an upload that was verified and has a sidecar, and return its id. Raises StoreError."""
+    def _move_to_capture(self, upload: UploadRow, recorded: Recorded, verdict: Quality, **more: Any) -> str:
+        """Make a capture of an upload that was verified and has a sidecar, and return its id. Raises StoreError.
+
+        `more` are further fields of the capture.
+        """
         part = self._folder.upload(upload.id)
         now = datetime.now(UTC)
         row = CaptureRow(
@@ -166,11 +167,10 @@ class Uploads:
             CaptureState.COMPLETE,
             now,
             name=upload.name,
-            notes=notes,
-            sensor=sensor,
             recording=recorded,
             verdict=verdict,
             ended_at=now,
+            **more,
         )
         try:
             self._folder.capture(row.id).mkdir()

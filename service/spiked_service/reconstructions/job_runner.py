@@ -163,6 +163,7 @@ class JobRunner:
             loss=event.loss,
             psnr_db=event.psnr_db,
             eta_s=event.eta_s,
+            warnings=event.warnings,
         )
         if event.stage is Stage.REFINING and before.stage is not Stage.REFINING and self._must_yield(self.row):
             self._yielded = True

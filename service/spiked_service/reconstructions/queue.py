@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 
+from spiked.recording.geometry import orientation_questions
 from spiked_service.base.errors import BusyError
 from spiked_service.base.ids import new_id
 from spiked_service.reconstructions.admission import check, intrinsics_of
@@ -87,6 +88,7 @@ class Reconstructions:
             options=options,
             intrinsics=intrinsics_of(options, capture),
             calibration=opened.calibration,
+            questions=orientation_questions(opened.assumed, opened.sensor),
             first_frame=first_frame,
             stop_frame=stop_frame,
             recorded=capture.plan.record,

@@ -294,6 +294,8 @@ class ReconstructionRow:
     """Frames to localise; None: all."""
     recognised: bool | None = None
     """Whether all show one place; None before that is known, and without maps."""
+    warnings: tuple[str, ...] = ()
+    """What it found out or had to assume, one sentence each."""
 
 
 @dataclass(frozen=True)

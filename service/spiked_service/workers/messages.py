@@ -9,6 +9,7 @@ from pydantic import BaseModel, Field, TypeAdapter
 from spiked.camera import StoredCameraOptions
 from spiked.profile import CameraProfile
 from spiked.recon import State
+from spiked.recording.geometry import Assumable
 from spiked.recording.sidecar import Sidecar
 from spiked.sensor import Intrinsics, Sensor
 from spiked_service.events.payloads import PosePayload
@@ -80,6 +81,8 @@ class RecorderCommand(_Command):
     """The profile of the camera, for the sidecar."""
     calibration: Path | None = None
     """Calibration of the camera; it is copied to the recording."""
+    assumed: tuple[Assumable, ...] = ()
+    """Properties of the sensor that nobody stated, for the sidecar."""
 
 
 class ReconstructionCommand(_Command):
@@ -96,6 +99,8 @@ class ReconstructionCommand(_Command):
     intrinsics: Intrinsics | None
     calibration: Path | None = None
     """Of the frames of a ring; a recording names its own."""
+    questions: tuple[str, ...] = ()
+    """What nothing states of the camera of a ring; a recording has its own."""
     first_frame: int = 0
     stop_frame: int | None = None
     recorded: bool = False
@@ -176,6 +181,8 @@ class RingOpened(BaseModel):
     can_block: bool
     profile: CameraProfile | None = None
     calibration: Path | None = None
+    assumed: tuple[Assumable, ...] = ()
+    """Properties of the sensor that nobody stated."""
 
 
 class Warned(BaseModel):
@@ -225,6 +232,7 @@ class ReconstructionStatus(BaseModel):
     version: int = Field(description="Number of the newest published scene and trajectory; 0: none yet.")
     psnr_db: float | None = None
     eta_s: float | None = None
+    warnings: tuple[str, ...] = ()
 
 
 class PoseEstimated(BaseModel):
@@ -317,6 +325,8 @@ class UploadChecked(BaseModel):
     grade: str
     """Grade as `spiked verify` gives it."""
     reasons: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+    """What nothing states of the camera, and what the pixels contradict."""
 
 
 class WorkerError(BaseModel):

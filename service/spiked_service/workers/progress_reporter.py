@@ -269,6 +269,7 @@ class ProgressReporter:
                 version=self._publisher.version,
                 psnr_db=psnr_db,
                 eta_s=self._eta_s(status),
+                warnings=tuple(self._reconstructor.warnings),
             )
         )
 

@@ -79,6 +79,25 @@ def test_an_upload_states_what_was_lost_and_why(service: Any, tmp_path: Path) ->
     assert recording.lost_by_cause == {"usb": 12, "disk": 3}
 
 
+def test_what_an_upload_does_not_state_is_asked_wherever_it_goes(service: Any, tmp_path: Path) -> None:
+    """Its sidecar, its capture, every reconstruction of it; not after it was stated."""
+    stated = moving_recording(tmp_path / "arc.dat")
+    bare = tmp_path / "bare" / "arc.dat"
+    bare.parent.mkdir()
+    bare.write_bytes(stated.read_bytes())
+    size = {"width": SENSOR.width, "height": SENSOR.height, "rate": 20_000.0}
+    for geometry, asked in ((GeometryModel(**size), True), (GeometryModel(**size, flipped=True), False)):
+        capture = service.client.upload(bare, geometry=geometry)
+        assert capture.verdict.grade == "good"
+        assert any("which way up its rows come" in text for text in capture.warnings) == asked
+        job = service.client.start_reconstruction(capture.id, options=ReconstructionOptions(steps=5))
+        job = service.client.wait_for_reconstruction(job.id, 120)
+        report = service.http.get(f"reconstructions/{job.id}").json()
+        assert any("which way up its rows come" in text for text in report["warnings"]) == asked
+        content = service.http.get(f"captures/{capture.id}/recording").content
+        assert content == bare.read_bytes()
+
+
 def test_an_upload_can_be_reconstructed(service: Any, tmp_path: Path) -> None:
     capture = service.client.upload(moving_recording(tmp_path / "arc.dat"))
     job = service.client.start_reconstruction(capture.id, options=ReconstructionOptions(steps=5))

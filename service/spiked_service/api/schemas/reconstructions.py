@@ -116,6 +116,7 @@ class ReconstructionOut(Out):
     progress: float = Field(description="0 to 1.")
     tracking_state: State
     reason: str = Field(description="Why it failed, waits or tracks badly; empty while all is well.")
+    warnings: list[str] = Field(description="What it found out about the camera, or had to assume.")
     priority: int
     options: ReconstructionOptions
     created_at: datetime

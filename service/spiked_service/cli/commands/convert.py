@@ -28,7 +28,7 @@ from spiked.recording import (
     sidecar_path,
 )
 from spiked.recording.arrays import SpikeArray, is_array, open_array, open_bits
-from spiked.recording.geometry import DEFAULT_RATE_HZ
+from spiked.recording.geometry import DEFAULT_RATE_HZ, Assumable, orientation_questions
 from spiked.sensor import Layout, Sensor
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
@@ -89,6 +89,8 @@ class Content:
     sidecar: dict[str, Any]
     """Further fields for a sidecar."""
     clock: tuple[ClockPair, ...] = ()
+    assumed: tuple[Assumable, ...] = ()
+    """Properties of the sensor that nobody stated."""
 
 
 class Writer(Protocol):
@@ -142,8 +144,11 @@ def convert(
     outputs.try_file("OUT", out)
     given = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic)
     content = read_content(source, source_form, given, array)
+    for question in orientation_questions(content.assumed, content.sensor):
+        report_warning(question)
     count, lost = write_content(content, out, to)
-    output.print(f"{out}: {count} frames, {lost} lost, {to}", markup=False)
+    size = f"{content.sensor.width}x{content.sensor.height}"
+    output.print(f"{out}: {count} frames of {size}, {lost} lost, {to}", markup=False)
 
 
 def read_content(path: Path, form: Form | None, given: RecordingGeometry, array: str | None = None) -> Content:
@@ -162,15 +167,18 @@ def read_content(path: Path, form: Form | None, given: RecordingGeometry, array:
                 raise ConfigurationError(f"{path}: of frames without rows give --width and --height")
             return _array_content(open_bits(path, given.width, given.height, given.bit_order), given, flipped=True)
         case Form.USB:
-            return _wire_content(path, UsbFraming, _wire_sensor(given, USB_WIDTH, USB_HEIGHT))
+            sensor = _wire_sensor(given, USB_WIDTH, USB_HEIGHT)
+            return _wire_content(path, UsbFraming, sensor, given.unstated(("frame_rate",)))
         case Form.PCIE:
-            return _wire_content(path, PcieFraming, _wire_sensor(given, PCIE_SIZE, PCIE_SIZE))
+            sensor = _wire_sensor(given, PCIE_SIZE, PCIE_SIZE)
+            return _wire_content(path, PcieFraming, sensor, given.unstated(("frame_rate", "flipped")))
         case Form.COMPACT | Form.ROW_TAGGED:
             given = replace(given, layout=Layout.COMPACT if form is Form.COMPACT else Layout.ROW_TAGGED)
     recording = open_recording(path, **given.stated())
     for warning in recording.warnings:
         report_warning(warning)
-    return Content(recording.sensor, _recorded(recording), _sidecar_fields(recording), recording.clock)
+    fields = _sidecar_fields(recording)
+    return Content(recording.sensor, _recorded(recording), fields, recording.clock, recording.assumed)
 
 
 def _array_content(found: SpikeArray, given: RecordingGeometry, flipped: bool) -> Content:
@@ -179,6 +187,8 @@ def _array_content(found: SpikeArray, given: RecordingGeometry, flipped: bool) -
     if found.width < found.columns:
         left_out = found.columns - found.width
         report_warning(f"{left_out} of {found.columns} columns are left out: a recording has a multiple of 8")
+    if found.trailing_bytes:
+        report_warning(f"the last {found.trailing_bytes} bytes are less than a frame and are left out")
     sensor = Sensor(
         found.width,
         found.height,
@@ -186,17 +196,21 @@ def _array_content(found: SpikeArray, given: RecordingGeometry, flipped: bool) -
         flipped=flipped if given.flipped is None else given.flipped,
         mosaic=given.mosaic,
     )
-    return Content(sensor, found.blocks(), {})
+    return Content(sensor, found.blocks(), {}, assumed=given.unstated(("frame_rate", "flipped")))
 
 
 def write_content(content: Content, out: Path, to: Form) -> tuple[int, int]:
-    """Write frames and gaps to a new file; returns the numbers of frames and of lost frames."""
+    """Write frames and gaps to a new file; returns the numbers of frames and of lost frames.
+
+    Nothing is left of a file that could not be written whole.
+    """
     first = next(content.items, None)
     if first is None:
         raise RecordingError("the input holds no whole frame; if its form was detected wrongly, give it with --from")
     count = lost = 0
     with ExitStack() as stack:
         writer = _writer(content, out, to)
+        stack.push(_remover(out))
         stack.callback(writer.close)
         for item in chain([first], content.items):
             if isinstance(item, Gap):
@@ -208,17 +222,29 @@ def write_content(content: Content, out: Path, to: Form) -> tuple[int, int]:
     return count, lost
 
 
+def _remover(out: Path) -> Callable[[type[BaseException] | None, BaseException | None, Any], None]:
+    """The end of a context that removes `out` and its sidecar after an error."""
+
+    def remove(kind: type[BaseException] | None, error: BaseException | None, traceback: Any) -> None:
+        if kind is not None:
+            out.unlink(missing_ok=True)
+            sidecar_path(out).unlink(missing_ok=True)
+
+    return remove
+
+
 def _detect_form(path: Path) -> Form | None:
-    """The wire format of a file of raw camera bytes; None for a recording."""
-    if sidecar_path(path).exists() or not path.is_file():
+    """The form of an array or of raw camera bytes; None for a recording."""
+    if not path.is_file():
         return None
-    head = np.zeros(0, np.uint8)
     try:
         head = np.fromfile(path, np.uint8, _BLOCK_BYTES)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}; check its permissions") from error
     if is_array(head[:8].tobytes()):
         return Form.ARRAY
+    if sidecar_path(path).exists():
+        return None
     framings: dict[Form, Callable[[], Framing]] = {Form.USB: UsbFraming, Form.PCIE: PcieFraming}
     for form, make in framings.items():
         if next(_parsed(make(), [head], _frame_bytes(form)), None) is not None:
@@ -237,15 +263,15 @@ def _wire_sensor(given: RecordingGeometry, width: int, height: int) -> Sensor:
             "bit order, or give the form of the file with --from"
         )
     flipped = True if given.flipped is None else given.flipped
-    return Sensor(width, height, given.frame_rate_hz or 20_000.0, flipped=flipped, mosaic=given.mosaic)
+    return Sensor(width, height, given.frame_rate_hz or DEFAULT_RATE_HZ, flipped=flipped, mosaic=given.mosaic)
 
 
-def _wire_content(path: Path, make: Callable[[], Framing], sensor: Sensor) -> Content:
+def _wire_content(path: Path, make: Callable[[], Framing], sensor: Sensor, assumed: tuple[Assumable, ...]) -> Content:
     if not path.is_file() or path.stat().st_size == 0:
         raise RecordingError(f"{path}: not a file, or empty; check the path")
     data = np.memmap(path, np.uint8, "r")
     blocks = (np.asarray(data[start : start + _BLOCK_BYTES]) for start in range(0, data.size, _BLOCK_BYTES))
-    return Content(sensor, _reported(make(), blocks, sensor.frame_bytes), {})
+    return Content(sensor, _reported(make(), blocks, sensor.frame_bytes), {}, assumed=assumed)
 
 
 def _reported(framing: Framing, blocks: Iterator[NDArray[np.uint8]], frame_bytes: int) -> Iterator[Item]:
@@ -305,7 +331,7 @@ def _sidecar_fields(recording: Recording) -> dict[str, Any]:
 
 class _RecordingFile:
     def __init__(self, content: Content, out: Path, layout: Layout) -> None:
-        fields = dict(content.sidecar)
+        fields = {**content.sidecar, "assumed": content.assumed}
         if "calibration" in fields:
             fields["calibration"] = os.path.relpath(fields["calibration"], out.resolve().parent)
         self._writer = RecordingWriter(out, replace(content.sensor, layout=layout), **fields)

@@ -138,8 +138,10 @@ def reconstruct(
     for warning in recording.warnings:
         report_warning(warning)
     sensor = g.with_optics(recording.sensor, fov, intrinsics, distortion)
+    questions = list(recording.questions)
     if mosaic is g.MosaicChoice.AUTO:
-        sensor = _by_pixels(recording, sensor)
+        sensor, question = _by_pixels(recording, sensor)
+        questions += question
     chosen = ReconstructionOptions(
         steps=steps,
         seed=seed,
@@ -154,7 +156,7 @@ def reconstruct(
     reconstructor = Reconstructor(
         sensor, replace(chosen.options(), poses=known, calibration=measured), recording=recording
     )
-    reconstructor.warnings += recording.questions
+    reconstructor.warnings += questions
     run = ReconstructionRun.begun(recording, reconstructor, out, parameters_of(context, described.geometry))
     _carry_out(run, _watched(file.name, watch_port) if watch else None)
 
@@ -269,17 +271,24 @@ def _report(reconstructor: Reconstructor, out: Path) -> None:
         report_error(SpikedError(f"no path was found: {failure}"))
 
 
-def _by_pixels(recording: Recording, sensor: Sensor) -> Sensor:
-    """The sensor with the mosaic detected from the first 160 frames."""
+def _by_pixels(recording: Recording, sensor: Sensor) -> tuple[Sensor, list[str]]:
+    """The sensor with the mosaic detected from the first 160 frames, and what the user is to be asked about it."""
     frames = recording.read(0, min(recording.frames, 160))
     windows = Windows(sensor, min(32, len(frames)))
     view = next(iter([*windows.feed(0, frames), *windows.flush()]))
     found = detect(view.rate, sensor.mosaic)
-    if found is not sensor.mosaic:
-        report_warning(
-            f"the mosaic detected from the pixels is {found}, not {sensor.mosaic}; red and blue may be exchanged"
-        )
-    return replace(sensor, mosaic=found)
+    stated = "grey" if sensor.mosaic is None else sensor.mosaic
+    if found is sensor.mosaic:
+        messages.print(f"the pixels agree with the stated mosaic: {stated}", markup=False)
+        return sensor, []
+    other = {Mosaic.BGGR: "RGGB", Mosaic.RGGB: "BGGR", Mosaic.GBRG: "GRBG", Mosaic.GRBG: "GBRG", None: ""}[found]
+    question = (
+        "the pixels show no mosaic: the sensor is taken as grey"
+        if found is None
+        else f"by its pixels the mosaic is {found} or {other}, and they cannot say which (stated: {stated}): {found} "
+        f"is taken; if red and blue are exchanged, give --mosaic {other}"
+    )
+    return replace(sensor, mosaic=found), [question]
 
 
 def _watched(title: str, port: int) -> "Watch":

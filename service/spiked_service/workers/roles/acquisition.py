@@ -49,6 +49,7 @@ def run_acquisition(command: AcquisitionCommand, channel: WorkerChannel) -> None
                     can_block=source.can_block,
                     profile=opened.profile,
                     calibration=opened.calibration,
+                    assumed=opened.assumed,
                 )
             )
         if is_camera(command.source):

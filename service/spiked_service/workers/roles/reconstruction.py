@@ -147,6 +147,7 @@ def _begin(
     live = command.ring is not None and not command.can_block
     options = options_of(command, recording)
     reconstructor = Reconstructor(replace(sensor, intrinsics=intrinsics), options, live=live, recording=recording)
+    reconstructor.warnings += command.questions if recording is None else recording.questions
     return _Work(reconstructor, ProgressReporter(reconstructor, command, channel), channel)
 
 

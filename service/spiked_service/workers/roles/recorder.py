@@ -74,7 +74,7 @@ def _camera_fields(command: RecorderCommand) -> dict[str, Any]:
 
     Raises RecordingError if it cannot be copied.
     """
-    fields: dict[str, Any] = {}
+    fields: dict[str, Any] = {"assumed": command.assumed}
     if command.profile is not None:
         fields["profile"] = command.profile.model_dump(mode="json", exclude_defaults=True)
     if command.calibration is not None:

@@ -1,9 +1,12 @@
 """The upload worker: verifies uploaded recordings, so that the service never parses uploaded data."""
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from spiked.errors import RecordingError
+from spiked.recon.frontend.mosaic_check import recorded_layout_warnings
 from spiked.recording import RecordingGeometry, verify
 from spiked.recording.sidecar import Sidecar, lost_by_cause, sidecar_path, write_sidecar
 from spiked_service.workers.channel import WorkerChannel
@@ -31,7 +34,9 @@ def run_upload(command: UploadCommand, channel: WorkerChannel) -> None:
     recording, sensor = found.recording, command.camera.sensor(found.recording.sensor)
     if max(sensor.width, sensor.height) > _LARGEST_SIDE:
         raise RecordingError(f"{sensor.width}x{sensor.height} pixels are more than {_LARGEST_SIDE} on a side")
-    more = {} if command.sidecar is None else {"note": command.sidecar.note, "device": command.sidecar.device}
+    more: dict[str, Any] = {"assumed": recording.assumed}
+    if command.sidecar is not None:
+        more |= {"note": command.sidecar.note, "device": command.sidecar.device}
     write_sidecar(beside, Sidecar.of(sensor, recording.frames, gaps=recording.gaps, clock=recording.clock, **more))
     channel.send(
         UploadChecked(
@@ -42,6 +47,7 @@ def run_upload(command: UploadCommand, channel: WorkerChannel) -> None:
             sha256=digest,
             grade=found.verdict.value,
             reasons=found.reasons,
+            warnings=(*recording.questions, *recorded_layout_warnings(replace(recording, sensor=sensor))),
         )
     )
 

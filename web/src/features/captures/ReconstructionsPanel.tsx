@@ -13,7 +13,7 @@ import { useFetch } from "../../shared/state/useFetch";
 import { ActionButton } from "../../shared/ui/access";
 import { Fetched } from "../../shared/ui/Fetched";
 import { Icon } from "../../shared/ui/icons";
-import { Badge, Empty, JobBadge, JobReason, jobTone, Panel } from "../../shared/ui/parts";
+import { Badge, Empty, JobBadge, JobReason, jobTone, Panel, Warnings } from "../../shared/ui/parts";
 import { Table } from "../../shared/ui/Table";
 import { OptionsForm } from "./OptionsForm";
 
@@ -144,6 +144,7 @@ function Row({
         )}
         {job.state === "queued" && <span className="dim reason">{progressText(job)}</span>}
         <JobReason job={job} />
+        <Warnings texts={job.warnings} />
       </td>
       <td className="number">{count(job.poses)}</td>
       <td className="number">{count(job.splats)}</td>

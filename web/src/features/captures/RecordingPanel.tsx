@@ -8,7 +8,7 @@ import { lengthOf, sourceOf } from "../../shared/state/capture";
 import { bytes, count, rate, when } from "../../shared/state/format";
 import { isFinished } from "../../shared/state/store";
 import { Icon } from "../../shared/ui/icons";
-import { gradeTone, Panel } from "../../shared/ui/parts";
+import { gradeTone, Panel, Warnings } from "../../shared/ui/parts";
 
 export function RecordingPanel({ capture }: { capture: Capture }): JSX.Element {
   const { recording, sensor, verdict } = capture;
@@ -24,6 +24,7 @@ export function RecordingPanel({ capture }: { capture: Capture }): JSX.Element {
         </div>
       )}
       {capture.reason !== "" && <p className={capture.state === "failed" ? "problem" : "dim"}>{capture.reason}</p>}
+      <Warnings texts={capture.warnings} />
       {recording !== null && (
         <img className="shot" src={calls.address.thumbnail(capture.id)} alt="A frame of the recording" />
       )}

@@ -4,7 +4,7 @@ import type { JSX } from "react";
 
 import type { Capture, Device, System } from "../../shared/api/types";
 import { bytes, count, duration, rate } from "../../shared/state/format";
-import { Badge, captureTone, deviceTone, gradeTone, Meter, Panel, Stat } from "../../shared/ui/parts";
+import { Badge, captureTone, deviceTone, gradeTone, Meter, Panel, Stat, Warnings } from "../../shared/ui/parts";
 
 const CAUSES = ["device", "usb", "ring", "disk"] as const;
 
@@ -123,11 +123,7 @@ export function FrameStats({ capture, rateHz }: { capture: Capture; rateHz: numb
           The source waits for the reconstruction: no frames are lost, and the capture runs slower than real time.
         </p>
       )}
-      {capture.warnings.map((warning) => (
-        <p key={warning} className="warning">
-          {warning}
-        </p>
-      ))}
+      <Warnings texts={capture.warnings} />
     </Panel>
   );
 }

@@ -6,7 +6,7 @@ import type { Reconstruction } from "../../shared/api/types";
 import { count, decibel, duration, percent, small } from "../../shared/state/format";
 import { progressText } from "../../shared/state/capture";
 import { go } from "../../shared/state/route";
-import { JobBadge, JobReason, Meter, Panel, Stat, trackingHint } from "../../shared/ui/parts";
+import { JobBadge, JobReason, Meter, Panel, Stat, trackingHint, Warnings } from "../../shared/ui/parts";
 import { Icon } from "../../shared/ui/icons";
 
 export function Progress({ job }: { job: Reconstruction | null }): JSX.Element {
@@ -45,6 +45,7 @@ export function Progress({ job }: { job: Reconstruction | null }): JSX.Element {
       {job.state === "queued" && <p>{progressText(job)}</p>}
       {job.state === "running" && follows && job.tracking_state !== "track" && <p>{trackingHint(job)}</p>}
       {(follows || !running) && <JobReason job={job} />}
+      <Warnings texts={job.warnings} />
       <button
         type="button"
         disabled={job.version === 0}

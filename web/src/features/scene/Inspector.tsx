@@ -7,7 +7,7 @@ import { nameOf } from "../../shared/state/capture";
 import { count, decibel, duration, percent } from "../../shared/state/format";
 import { toast } from "../../shared/state/toasts";
 import { Icon } from "../../shared/ui/icons";
-import { JobBadge, JobReason, Meter, Segmented, Stat, trackingMeaning } from "../../shared/ui/parts";
+import { JobBadge, JobReason, Meter, Segmented, Stat, trackingMeaning, Warnings } from "../../shared/ui/parts";
 import { type Bookmark, readBookmarks, writeBookmarks } from "./bookmarks";
 import type { Colouring } from "./path";
 import { MAX_WIDTH_PX, type LineStyle, SPEED_STYLES, STATE_STYLES, STATES } from "./stateStyles";
@@ -70,6 +70,7 @@ export function Inspector(props: InspectorProps): JSX.Element {
         <JobBadge job={job} />
       </header>
       <JobReason job={job} />
+      <Warnings texts={job.warnings} />
       <Versions {...props} />
       <dl className="stats">
         <Stat name="Splats shown" hint={`${count((pinned ?? job).splats)} in the scene`}>

@@ -2422,6 +2422,11 @@ export interface components {
              * @description Why it failed, waits or tracks badly; empty while all is well.
              */
             reason: string;
+            /**
+             * Warnings
+             * @description What it found out about the camera, or had to assume.
+             */
+            warnings: string[];
             /** Priority */
             priority: number;
             options: components["schemas"]["ReconstructionOptions"];
@@ -3129,6 +3134,11 @@ export interface components {
             profile?: {
                 [key: string]: unknown;
             } | null;
+            /**
+             * Assumed
+             * @default []
+             */
+            assumed?: ("frame_rate" | "flipped" | "bit_order")[];
         } & {
             [key: string]: unknown;
         };

@@ -92,6 +92,19 @@ export function JobReason({ job }: { job: Reconstruction }): JSX.Element | null 
   );
 }
 
+/** Warnings of a capture or a reconstruction. */
+export function Warnings({ texts }: { texts: readonly string[] }): JSX.Element {
+  return (
+    <>
+      {texts.map((text) => (
+        <p key={text} className="warning">
+          {text}
+        </p>
+      ))}
+    </>
+  );
+}
+
 /** The grade of a capture's recording; its state while there is no grade. */
 export function CaptureBadge({ capture: { state, verdict } }: { capture: Capture }): JSX.Element {
   return verdict === null ? (

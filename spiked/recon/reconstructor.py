@@ -106,7 +106,7 @@ class Reconstructor:
     def __setstate__(self, state: dict[str, object]) -> None:
         vars(self).update(state)
         self._preview = np.empty((self.sensor.height, self.sensor.width), np.float32)
-        self.odometry.keyframe_images.builder = _Pictures(self)
+        self.odometry.build_images_with(_Pictures(self))
 
     @property
     def frames(self) -> int:
@@ -308,6 +308,7 @@ class Reconstructor:
         if isinstance(path := self.path, Waypoints):
             self._choose_views(path)
         self._warn(report.path_warning(self.odometry.path_error))
+        self._warn(self.odometry.remark)
 
     def _refine(
         self,

@@ -32,11 +32,12 @@ class ThereAndBack:
 
     stage: Stage
     shake: HandShake
+    frames: int = FRAMES
 
     def poses(self, frames: ArrayLike) -> tuple[Array, Array]:
         """See `Motion.poses`."""
         times = np.atleast_1d(np.asarray(frames, np.float64))
-        share = np.sin(np.pi * times / FRAMES) ** 2
+        share = np.sin(np.pi * times / self.frames) ** 2
         up = self.stage.up / np.linalg.norm(self.stage.up)
         turned, moved = self.shake.poses(times)
         side = self.stage.rotation[:, 0] * WAY * self.stage.depth

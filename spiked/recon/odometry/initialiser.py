@@ -75,6 +75,10 @@ class Initialiser:
         self.map.triangulate(views)
         return True
 
+    def begin_at(self, view: int) -> None:
+        """Initialise from this view on."""
+        self._start = view
+
     def last_attempt(self) -> bool:
         """Attempt after the last view; if it fails, the reason says why the recording has no path."""
         count = len(self.map.views)

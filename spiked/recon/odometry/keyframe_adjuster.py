@@ -151,6 +151,18 @@ class KeyframeAdjuster:
         self.adjust()
         return closures
 
+    def join(self, views: list[TrackedView], closures: list[LoopClosure]) -> None:
+        """Go on after `views` got poses at once, by a second map that the closures join with this one."""
+        self._take_whole(now=True)
+        self.loops.add_kept(view for view in views if view.id in self.pictures)
+        self._link(closures)
+        self._open, self._whole_due = True, 0.0
+        self.adjust()
+
+    def settle(self) -> None:
+        """Take what runs on another thread."""
+        self._take_whole(now=True)
+
     def _link(self, closures: list[LoopClosure]) -> None:
         for closure in closures:
             closure.add_tracks()

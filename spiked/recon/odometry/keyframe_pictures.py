@@ -50,6 +50,21 @@ class KeyframePictures(MutableMapping[int, Picture]):
         """Bytes of the images in memory."""
         return self._bytes
 
+    def like(self) -> "KeyframePictures":
+        """An empty store with the same limit and builder."""
+        return KeyframePictures(self._most_bytes, self.builder)
+
+    def take(self, other: "KeyframePictures") -> None:
+        """Take over the images of another store, of later views."""
+        for view_id, picture in other._held.items():
+            if picture is None:
+                self._held[view_id] = None
+            else:
+                self[view_id] = picture
+
+    def __contains__(self, view_id: object) -> bool:
+        return view_id in self._held
+
     def __len__(self) -> int:
         return len(self._held)
 

@@ -1,6 +1,6 @@
 """Loop closure: views that see points of much earlier views again, and the correction of the path between them."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -107,8 +107,7 @@ class LoopSearch:
     def of(cls, sparse_map: SparseMap, pictures: Mapping[int, Picture]) -> "LoopSearch":
         """On the kept views so far, among which there are no loops."""
         made = cls(sparse_map, pictures, PlaceIndex(sparse_map))
-        for number in sorted(pictures):
-            made._add(sparse_map.views[number])
+        made.add_kept(sparse_map.views[number] for number in sorted(pictures))
         return made
 
     def search(self, view: TrackedView) -> list[LoopClosure]:
@@ -123,6 +122,22 @@ class LoopSearch:
         if (features := self._add(view)) is not None and found is None:
             found = self._find_by_features(view, features)
         return [] if found is None else self._confirmed(found)
+
+    def recognise(self, view: TrackedView, pictures: Mapping[int, Picture]) -> LoopClosure | None:
+        """Where a view without a pose was taken, by the places that look alike; `pictures` has its image, too.
+
+        The view is not added to the places.
+        """
+        found = [
+            find_by_path(self.map, pictures, self.index, view, pose, before_px=np.inf)
+            for pose, _ in self.index.drawn_poses(place_features(pictures[view.id]), np.inf)
+        ]
+        return self._best([one for one in found if one is not None])
+
+    def add_kept(self, views: Iterable[TrackedView]) -> None:
+        """Add kept views, in order of time, in which no place is searched."""
+        for view in views:
+            self._add(view)
 
     def closed(self) -> None:
         """The path was corrected by the newest closures."""
@@ -156,6 +171,10 @@ class LoopSearch:
             one = find_by_path(self.map, self.pictures, self.index, view, pose)
             if one is not None and self._plausible(one):
                 found.append(one)
+        return self._best(found)
+
+    def _best(self, found: list[LoopClosure]) -> LoopClosure | None:
+        """The one that most points agree with; None if another place explains the view about equally."""
         if not found:
             return None
         best = max(found, key=lambda one: len(one.ids))
@@ -195,12 +214,20 @@ def find_closures(sparse_map: SparseMap, pictures: Mapping[int, Picture], index:
 
 
 def find_by_path(
-    sparse_map: SparseMap, pictures: Mapping[int, Picture], index: PlaceIndex, view: TrackedView, expected: Pose
+    sparse_map: SparseMap,
+    pictures: Mapping[int, Picture],
+    index: PlaceIndex,
+    view: TrackedView,
+    expected: Pose,
+    before_px: float | None = None,
 ) -> LoopClosure | None:
-    """The loop of a view, taken to be at `expected`, with the earlier one of which it should see most points again."""
+    """The loop of a view, taken to be at `expected`, with the earlier one of which it should see most points again.
+
+    It lies before so much image motion; by default `LEAST_APART_PX` before the view.
+    """
     known = sparse_map.known_tracks(view)[0]
     depth = median((sparse_map.points[known] - expected.centre) @ expected.rotation[:, 2]) if len(known) else 1.0
-    before_px = sparse_map.travelled_px(view.id) - LEAST_APART_PX
+    before_px = sparse_map.travelled_px(view.id) - LEAST_APART_PX if before_px is None else before_px
     best, most = None, LEAST_INSIDE
     for other in index.near(expected, max(depth, LEAST_DEPTH), before_px, COMPARED):
         assert other.rotation is not None

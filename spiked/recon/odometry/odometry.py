@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spiked.evaluate import Similarity
 from spiked.pose import Array
 from spiked.recon.frontend.feature_tracks import Picture, Tracks
 from spiked.recon.frontend.spike_intervals import SpikeIntervals
@@ -17,12 +18,13 @@ from spiked.recon.frontend.track_timestamps import TrackTimestamps
 from spiked.recon.odometry.global_adjuster import GlobalAdjuster
 from spiked.recon.odometry.initialiser import Initialiser
 from spiked.recon.odometry.keyframe_adjuster import LEAST_MOTION_PX, LONG_FRAMES, LONG_VIEWS, KeyframeAdjuster
-from spiked.recon.odometry.keyframe_pictures import KeyframePictures
-from spiked.recon.odometry.loop_closure import LoopSearch
+from spiked.recon.odometry.keyframe_pictures import KeyframePictures, PictureBuilder
+from spiked.recon.odometry.loop_closure import LoopClosure, LoopSearch
 from spiked.recon.odometry.path_adjuster import PathAdjuster
-from spiked.recon.odometry.pnp import fit_pose
+from spiked.recon.odometry.pnp import PnPResult, fit_pose
 from spiked.recon.odometry.pose_tracker import LOCAL_BA_EVERY, PoseTracker
 from spiked.recon.odometry.relocaliser import Relocaliser
+from spiked.recon.odometry.second_map import SECOND_MAP_VIEWS, Meeting, join, unposed
 from spiked.recon.odometry.self_calibration import MAX_FOCAL_SIGMA, MAX_LENS_SIGMA_PX, EstimatedLens, Focal
 from spiked.recon.odometry.sparse_map import Pose, SparseMap, TrackedView
 from spiked.recon.odometry.tracking_state import State, TrackingState
@@ -65,6 +67,16 @@ class Odometry:
         """The adjuster of a long path."""
         self._relocaliser = Relocaliser(self._map, KeyframePictures() if pictures is None else pictures)
         self._tracker = PoseTracker(self._map, self._status, self._tracks, self._relocaliser, self._adjuster)
+        self._seed, self._live = seed, live
+        self._lost_views = 0
+        """Lost views in a row."""
+        self._second: Odometry | None = None
+        """A map of what a lost camera sees; it numbers views and tracks as this one does."""
+        self._meeting: Meeting | None = None
+        self._second_begin = 0
+        """First view that the second map may have."""
+        self.remark: str | None = None
+        """What of the recording the finished path leaves out, for users."""
         self.path_error: float | None = None
         """Predicted error of the finished path relative to its RMS radius; None before the end."""
 
@@ -84,6 +96,14 @@ class Odometry:
             yield view.ids
             yield view.pixels
         yield from self.keyframe_images.held()
+        if self._second is not None:
+            yield from self._second.fixed_arrays()
+
+    def build_images_with(self, builder: PictureBuilder) -> None:
+        """Set what builds images of keyframes anew."""
+        self.keyframe_images.builder = builder
+        if self._second is not None:
+            self._second.build_images_with(builder)
 
     @property
     def closures(self) -> list[tuple[float, float]]:
@@ -143,7 +163,7 @@ class Odometry:
     @property
     def long(self) -> bool:
         """The path is long: keyframes are adjusted."""
-        return self._keyframes is not None
+        return self._keyframes is not None or (self._second is not None and self._second.long)
 
     def waypoints(self) -> Waypoints | None:
         """The path interpolated between views with a pose; None before the bootstrap."""
@@ -156,6 +176,8 @@ class Odometry:
     def skip(self) -> None:
         """Frames are skipped before the next view; see `sparse`."""
         self._adjuster.interpolated = self._tracks.far = True
+        if self._second is not None:
+            self._second.skip()
 
     def add(
         self,
@@ -171,6 +193,8 @@ class Odometry:
         known: its pose, if given; intervals: time of each pixel's charge; after_gap: frames are missing before it.
         Returns the new element of `views`.
         """
+        if self._second is not None:
+            return self._add_to_second(self._second, time, length, picture, intervals, after_gap)
         view = self._track(time, length, picture, intervals, after_gap)
         if known is not None:
             view.pose = Pose(*known)
@@ -185,7 +209,86 @@ class Odometry:
         if self._relocaliser.remember(view, picture):
             self._close_loops(view)
         view.state = self.state
+        self._lost_views = self._lost_views + 1 if self.state is State.LOST else 0
+        if self._lost_views == SECOND_MAP_VIEWS:
+            self._begin_second()
         return view
+
+    def _begin_second(self) -> None:
+        """Begin a second map with the next view."""
+        second = Odometry(self.intrinsics, self._seed, live=self._live, pictures=self.keyframe_images.like())
+        second._map.lens_known = True
+        second._map.views = unposed(self.views)
+        second._map.reserve(len(self.points))
+        second._initialiser.begin_at(len(self.views))
+        second._tracks.next_id, second._tracks.far = self._tracks.next_id, self._tracks.far
+        loops = LoopSearch.of(self._map, self.keyframe_images) if self._keyframes is None else self._keyframes.loops
+        self._second, self._second_begin = second, len(self.views)
+        self._meeting = Meeting(self._map, loops, self.keyframe_images)
+
+    def _add_to_second(
+        self,
+        second: "Odometry",
+        time: float,
+        length: int,
+        picture: Picture,
+        intervals: SpikeIntervals | None,
+        after_gap: bool,
+    ) -> TrackedView:
+        """Let the second map track a view, and search it for a place of this one."""
+        assert self._meeting is not None
+        own = second.add(time, length, picture, intervals=intervals, after_gap=after_gap)
+        view = replace(own, pose=None, state=State.LOST, inliers=0.0, chi2=None, sigma_px=None)
+        self.views.append(view)
+        self._map.reserve(len(second.points))
+        self._status.set(time, State.LOST, _second_map_reason(second))
+        if (found := self._meeting.search(view, picture)) is not None:
+            if own.pose is None:
+                self._resume(second, view, found.ids, found.pixels, fit_pose(self._map, _seen(found), found.pose))
+            elif (by := self._meeting.agreed(found, second.map)) is not None:
+                self._join(second, by)
+        elif second.state is State.BOOT and (fit := self._relocaliser.find(view, picture)) is not None:
+            self._resume(second, view, view.ids, view.pixels, fit)
+        view.state = self.state
+        return view
+
+    def _resume(
+        self, second: "Odometry", view: TrackedView, ids: NDArray[np.int64], pixels: Array, fit: PnPResult
+    ) -> None:
+        """Go on in this map with a view that was recognised, and drop the second one, which did not know its pose."""
+        view.ids, view.pixels = ids, pixels
+        fit.store(view)
+        self._take_tracks(second)
+        self._tracks.resume(view.id, ids, pixels)
+        self._status.set(view.time, State.RELOC, f"found again by {len(ids)} points of earlier views")
+
+    def _join(self, second: "Odometry", by: Similarity) -> None:
+        """Take the second map into this one, and go on with its tracks."""
+        assert self._meeting is not None
+        meeting, begin, count = self._meeting, self._second_begin, len(second.map.posed())
+        if second._keyframes is not None:
+            second._keyframes.settle()
+        if self._keyframes is not None:
+            self._keyframes.settle()
+        join(self._map, second.map, begin, by)
+        self.keyframe_images.take(second.keyframe_images)
+        self._take_tracks(second)
+        self._adjust_keyframes(meeting.loops)
+        assert self._keyframes is not None
+        closures = [replace(one, before=one.later.pose or one.before) for one in meeting.closures]
+        self._keyframes.join(self.views[begin:], closures)
+        self._tracks.resume(self.views[-1].id, closures[-1].ids, closures[-1].pixels)
+        time = self.views[-1].time
+        self._status.set(time, State.RELOC, f"a known place is seen again: {count} views of a second map are joined")
+
+    def _take_tracks(self, second: "Odometry") -> None:
+        """Go on with the tracks of the second map, which ends."""
+        while second._second is not None:
+            second = second._second
+        self._tracks = self._tracker.tracks = second._tracks
+        self._timestamps = second._timestamps
+        self._second = self._meeting = None
+        self._lost_views = 0
 
     def _close_loops(self, view: TrackedView) -> None:
         """On a long path, search the newest view for places seen before; their points become its tracks."""
@@ -201,9 +304,13 @@ class Odometry:
             return
         posed = self._map.posed()
         if posed and (len(posed) >= LONG_VIEWS or posed[-1].time - posed[0].time >= LONG_FRAMES):
+            self._adjust_keyframes(LoopSearch.of(self._map, self.keyframe_images))
+
+    def _adjust_keyframes(self, loops: LoopSearch) -> None:
+        """Adjust keyframes from now on, if that is not done yet."""
+        if self._keyframes is None:
             self._relocaliser.least_motion_px = LEAST_MOTION_PX
-            pictures = self._relocaliser.keyframes
-            self._keyframes = KeyframeAdjuster(self._map, pictures, LoopSearch.of(self._map, pictures))
+            self._keyframes = KeyframeAdjuster(self._map, self.keyframe_images, loops)
             self._adjuster = self._tracker.adjuster = self._keyframes
 
     def _track(
@@ -227,9 +334,31 @@ class Odometry:
         """
         if self.state is State.BOOT and self._initialiser.last_attempt():
             self._adjuster.adjust()
+        if self._second is not None:
+            self._end_second(self._second, stop, save)
         self._adjuster.finish(stop, save)
         self.path_error = self._adjuster.path_error()
         self._reassess_views()
+
+    def _end_second(self, second: "Odometry", stop: Callable[[], bool], save: Callable[[], None]) -> None:
+        """No known place was seen again: the path is that of the map that spans more time."""
+        second.end(stop, save)
+        views = [view for view in second.views[self._second_begin :] if view.pose is not None]
+        ours = self._map.posed()
+        self._second = self._meeting = None
+        if not views:
+            return
+        if views[-1].time - views[0].time <= ours[-1].time - ours[0].time:
+            self.remark = _left_out(views)
+            return
+        for view in ours:
+            view.pose = None
+        self._map.points[:] = np.nan
+        join(self._map, second.map, self._second_begin, Similarity(1.0, np.eye(3), np.zeros(3)))
+        self.keyframe_images.take(second.keyframe_images)
+        self._adjuster, self._keyframes = second._adjuster, second._keyframes
+        self._status.set(self.views[-1].time, second.state, second.reason)
+        self.remark = _left_out(ours)
 
     def end_with_path(self, spline: Spline, middle: float) -> float | None:
         """After the last view with a given pose: take the given path; its median depth at `middle` (frames) becomes 1.
@@ -282,3 +411,25 @@ class Odometry:
         if self.lens is not None and self.lens.corner_sigma_px > MAX_LENS_SIGMA_PX:
             why.append(f"the distortion of the lens is only known to about {self.lens.corner_sigma_px:.0f} px")
         return why
+
+
+def _second_map_reason(second: Odometry) -> str:
+    """Why a camera whose pictures are tracked in a second map is lost."""
+    if second.state is State.BOOT:
+        return f"no known place is seen; for a second map: {second.reason}"
+    if second.state is State.LOST:
+        return f"no known place is seen, and a second map lost the camera, too: {second.reason}"
+    count = len(second.map.posed())
+    return f"{count} views have a pose in a second map: it is joined once a place of the first map is seen again"
+
+
+def _left_out(views: list[TrackedView]) -> str:
+    return (
+        f"frames {views[0].time:.0f} to {views[-1].time:.0f} belong to a second map, which no common place joins with "
+        "this one: they have no pose"
+    )
+
+
+def _seen(found: LoopClosure) -> TrackedView:
+    """The view with the points of the place alone."""
+    return replace(found.later, ids=found.ids, pixels=found.pixels)

@@ -32,7 +32,7 @@ from spiked.recon.mapping import mapper, pyramid, render_requests
 from spiked.recon.mapping.densification import DensifyStrategy
 from spiked.recon.mapping.schedule import Schedule
 from spiked.recon.mapping.seeding import Seeding
-from spiked.recon.odometry import initialisation, odometry, self_calibration, spline_fitting, stationarity
+from spiked.recon.odometry import assessment, initialisation, self_calibration, spline_fitting, stationarity
 from spiked.recon.options import MapOptions, Options
 from spiked.recording import durability, index
 from spiked.ring import writer
@@ -332,7 +332,7 @@ MIB = 1 << 20
 Claim = tuple[str, str, Callable[[], object]]
 CLAIMS: tuple[Claim, ...] = (
     ("README.md", "on port {}", lambda: default("port")),
-    ("README.md", "From {:.0f} % of predicted error on", lambda: 100 * odometry.WORST_PATH_ERROR),
+    ("README.md", "From {:.0f} % of predicted error on", lambda: 100 * assessment.WORST_PATH_ERROR),
     ("method.md", "windows of {} frames", lambda: f"{min(windowing.WINDOWS)} to {max(windowing.WINDOWS)}"),
     ("method.md", "(image motion under about {} px,", lambda: windowing.WINDOW_MOTION_PX[1]),
     ("method.md", "Up to {} corners", lambda: inspect.signature(feature_tracks.Tracks).parameters["target"].default),

@@ -12,7 +12,8 @@ import numpy as np
 from spiked.pose import Array, log_so3
 from spiked.recon.frontend.demosaic import fill_mosaic
 from spiked.recon.mapping.mapper import Mapper
-from spiked.recon.odometry.odometry import WORST_PATH_ERROR, Odometry
+from spiked.recon.odometry.assessment import WORST_PATH_ERROR
+from spiked.recon.odometry.odometry import Odometry
 from spiked.recon.odometry.self_calibration import EstimatedLens, Focal, corner_px
 from spiked.recon.odometry.sparse_map import TrackedView
 from spiked.recon.odometry.tracking_state import State

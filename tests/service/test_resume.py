@@ -25,7 +25,7 @@ def counted(self, reconstructor, now=False):
     if left == 0 and where != "closures":
         os.kill(os.getpid(), signal.SIGKILL)
 
-def killed(self, stop=None):
+def killed(self, *given):
     os.kill(os.getpid(), signal.SIGKILL)
 
 checkpoint.CheckpointSaver.save = counted

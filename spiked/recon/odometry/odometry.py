@@ -15,6 +15,7 @@ from spiked.pose import Array
 from spiked.recon.frontend.feature_tracks import Picture, Tracks
 from spiked.recon.frontend.spike_intervals import SpikeIntervals
 from spiked.recon.frontend.track_timestamps import TrackTimestamps
+from spiked.recon.odometry.assessment import assess
 from spiked.recon.odometry.global_adjuster import GlobalAdjuster
 from spiked.recon.odometry.initialiser import Initialiser
 from spiked.recon.odometry.keyframe_adjuster import LEAST_MOTION_PX, LONG_FRAMES, LONG_VIEWS, KeyframeAdjuster
@@ -25,17 +26,12 @@ from spiked.recon.odometry.pnp import PnPResult, fit_pose
 from spiked.recon.odometry.pose_tracker import LOCAL_BA_EVERY, PoseTracker
 from spiked.recon.odometry.relocaliser import Relocaliser
 from spiked.recon.odometry.second_map import SECOND_MAP_VIEWS, Meeting, join, unposed
-from spiked.recon.odometry.self_calibration import MAX_FOCAL_SIGMA, MAX_LENS_SIGMA_PX, EstimatedLens, Focal
+from spiked.recon.odometry.self_calibration import EstimatedLens, Focal
 from spiked.recon.odometry.sparse_map import Pose, SparseMap, TrackedView
 from spiked.recon.odometry.tracking_state import State, TrackingState
 from spiked.sensor import Intrinsics
 from spiked.spline import Spline, Waypoints
 
-WORST_PATH_ERROR = 0.03
-"""Predicted path error, relative to the path's RMS radius, above which the path is degraded and a warning is given
-(decision 7)."""
-FINAL_STATE_VIEWS = 8
-"""The final state is that of most of the last 8 views: one noisy view does not decide it (decision 10)."""
 MIN_GIVEN_POINTS = 10
 """Points in front of the camera that given poses have to explain."""
 
@@ -338,7 +334,7 @@ class Odometry:
             self._end_second(self._second, stop, save)
         self._adjuster.finish(stop, save)
         self.path_error = self._adjuster.path_error()
-        self._reassess_views()
+        assess(self._map, self._status, self.path_error)
 
     def _end_second(self, second: "Odometry", stop: Callable[[], bool], save: Callable[[], None]) -> None:
         """No known place was seen again: the path is that of the map that spans more time."""
@@ -377,40 +373,6 @@ class Odometry:
         self._map.rescale(unit)
         self._adjuster.spline = replace(spline, centres=spline.centres / unit)
         return unit
-
-    def _reassess_views(self) -> None:
-        """Recompute inliers, chi2 and state of every view with the final path and points; set the final state."""
-        assessed: list[str | None] = []
-        for view in self.views:
-            if view.pose is None:
-                continue
-            fit = fit_pose(self._map, view, view.pose, move=False)
-            reason = fit.degraded_reason(len(view.ids))
-            fit.store_quality(view)
-            if view.state in (State.TRACK, State.DEGRADED):
-                view.state = State.TRACK if reason is None else State.DEGRADED
-            assessed.append(reason)
-        if assessed and self.state in (State.TRACK, State.DEGRADED):
-            last = assessed[-FINAL_STATE_VIEWS:]
-            reasons = [reason for reason in last if reason is not None]
-            common = reasons[-1] if len(reasons) > len(last) - len(reasons) else None
-            self._status.assess(self.views[-1].time, common)
-            if why := self._path_degraded_reasons():
-                self._status.set(self.views[-1].time, State.DEGRADED, "; ".join(why))
-
-    def _path_degraded_reasons(self) -> list[str]:
-        """Why the final path is degraded as a whole, however well each view fits."""
-        why = []
-        if self.path_error is not None and self.path_error > WORST_PATH_ERROR:
-            about = f"about {self.path_error:.0%}"
-            why.append(f"the whole path's shape is only known to {about}: few tracks tie it together")
-        if self.focal is not None and self.focal.relative_sigma > MAX_FOCAL_SIGMA:
-            sigma = self.focal.relative_sigma
-            known = "that the recording does not determine" if sigma > 1 else f"only known to about {sigma:.0%}"
-            why.append(f"path and depths depend on a focal length {known}")
-        if self.lens is not None and self.lens.corner_sigma_px > MAX_LENS_SIGMA_PX:
-            why.append(f"the distortion of the lens is only known to about {self.lens.corner_sigma_px:.0f} px")
-        return why
 
 
 def _second_map_reason(second: Odometry) -> str:

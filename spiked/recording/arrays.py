@@ -5,8 +5,10 @@ Vidar files of widths that are no multiple of 8 have the bits of a frame one aft
 SpikeCV and Spike-Zoo).
 """
 
+import lzma
 import math
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -16,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spiked.camera import MOST_SIDE
 from spiked.errors import RecordingError
 from spiked.sensor import BitOrder
 
@@ -26,7 +29,20 @@ NUMPY_MAGIC, ZIP_MAGIC, HDF5_MAGIC = b"\x93NUMPY", b"PK\x03\x04", b"\x89HDF\r\n\
 LOOKED_AT = 64
 """Frames by which packed arrays are told from arrays of 0 and 1."""
 BLOCK_FRAMES = 64
-"""Frames that are converted at a time."""
+"""Frames that are converted at a time, at most."""
+BLOCK_BYTES = 16 << 20
+"""Bytes of the container that are converted at a time, at most, but a frame."""
+_UNREADABLE = (
+    OSError,
+    ValueError,
+    EOFError,
+    OverflowError,
+    RuntimeError,
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+)
+"""Errors of the libraries for files that are damaged, encrypted, or compressed in a way that they do not know."""
 
 
 @dataclass(frozen=True)
@@ -55,14 +71,19 @@ class SpikeArray:
 
         Raises RecordingError for other values than 0 and 1.
         """
-        for first in range(0, self.frames, BLOCK_FRAMES):
-            pixels = self._pixels(first, min(first + BLOCK_FRAMES, self.frames))
+        count = _block_frames(self.stored)
+        for first in range(0, self.frames, count):
+            pixels = self._pixels(first, min(first + count, self.frames))
             compact = np.packbits(pixels[:, :, : self.width], axis=2, bitorder="little")
             yield compact.reshape(len(compact), -1)
 
     def _pixels(self, begin: int, end: int) -> NDArray[np.uint8]:
         """uint8 [n, height, columns] of 0 and 1."""
-        block = np.asarray(self.stored[begin:end])
+        try:
+            block = np.asarray(self.stored[begin:end])
+        except _UNREADABLE as error:
+            message = f"{self.path}: frames {begin} to {end - 1} cannot be read, the file is damaged: {error}"
+            raise RecordingError(message) from error
         if self.packed is not None:
             order: Any = "little" if self.packed is BitOrder.LSB else "big"
             bits = np.unpackbits(block.reshape(len(block), -1), axis=1, bitorder=order)
@@ -70,7 +91,7 @@ class SpikeArray:
             return bits[:, : self.height * row].reshape(len(block), self.height, row)[:, :, : self.columns]
         if not ((block == 0) | (block == 1)).all():
             is_bytes = block.dtype == np.uint8
-            hint = f"; if eight pixels are in a byte, give --width {8 * self.columns}" if is_bytes else ""
+            hint = f"; if eight pixels are in a byte, give the width {8 * self.columns}" if is_bytes else ""
             raise RecordingError(
                 f"{self.path}: frames {begin} to {end - 1} have other values than 0 and 1: this is no array of "
                 f"spikes{hint}"
@@ -92,19 +113,21 @@ def open_array(
     leftmost pixel is in the highest bit unless `bit_order` says otherwise. Raises RecordingError.
     """
     stored = _array(path, name)
-    if stored.ndim != 3 or not all(stored.shape):
+    if stored.ndim != 3 or min(stored.shape) < 1:
         raise RecordingError(
             f"{path}: its array has the shape {list(stored.shape)}: spikes are [frames, rows, columns]"
         )
     frames, height, columns = stored.shape
     if stored.dtype.kind not in "buif":
         raise RecordingError(f"{path}: its array has elements of {stored.dtype}: spikes are 0 and 1")
+    if max(height, columns) > MOST_SIDE:
+        raise RecordingError(f"{path}: frames of {columns}x{height} are larger than {MOST_SIDE} on a side")
     holds = width is not None and columns == -(-width // 8)
-    packed = stored.dtype == np.uint8 and (holds or int(np.max(stored[:LOOKED_AT])) > 1)
+    packed = stored.dtype == np.uint8 and (holds or _largest(path, stored) > 1)
     if packed and width is not None and not holds:
-        raise RecordingError(f"{path}: rows of {columns} bytes do not hold {width} pixels: correct --width")
+        raise RecordingError(f"{path}: rows of {columns} bytes do not hold {width} pixels: correct the width")
     if not packed and width not in (None, columns):
-        raise RecordingError(f"{path}: its array has {columns} columns, not {width}: correct --width")
+        raise RecordingError(f"{path}: its array has {columns} columns, not {width}: correct the width")
     return _checked(
         SpikeArray(
             path,
@@ -123,7 +146,7 @@ def open_bits(path: Path, width: int, height: int, bit_order: BitOrder | None = 
     Raises RecordingError.
     """
     if width < 8 or height < 1:
-        raise RecordingError(f"{path}: frames of {width}x{height} pixels are impossible: correct --width and --height")
+        raise RecordingError(f"{path}: frames of {width}x{height} pixels are impossible: correct the width and the height")
     size = -(-width * height // 8)
     try:
         data = np.memmap(path, np.uint8, "r")
@@ -139,6 +162,20 @@ def open_bits(path: Path, width: int, height: int, bit_order: BitOrder | None = 
     return _checked(SpikeArray(path, stored, frames, height, width, bit_order or BitOrder.LSB, trailing))
 
 
+def _block_frames(stored: Any) -> int:
+    """Frames of the container to read at a time."""
+    frame = math.prod(stored.shape[1:]) * stored.dtype.itemsize
+    return max(1, min(BLOCK_FRAMES, BLOCK_BYTES // frame))
+
+
+def _largest(path: Path, stored: Any) -> int:
+    """The largest value of the first frames. Raises RecordingError."""
+    try:
+        return int(np.max(stored[: min(LOOKED_AT, _block_frames(stored))]))
+    except _UNREADABLE as error:
+        raise RecordingError(f"{path}: its first frames cannot be read, the file is damaged: {error}") from error
+
+
 def _checked(found: SpikeArray) -> SpikeArray:
     if not found.width:
         raise RecordingError(f"{found.path}: {found.columns} columns are too few: a recording has at least 8")
@@ -152,11 +189,11 @@ def _array(path: Path, name: str | None) -> Any:
             head = file.read(8)
         if head.startswith(NUMPY_MAGIC):
             if name is not None:
-                raise RecordingError(f"{path}: it is one array without a name: leave out --array")
+                raise RecordingError(f"{path}: it is one array without a name: leave the name out")
             return np.load(path, mmap_mode="r", allow_pickle=False)
         if head.startswith(ZIP_MAGIC):
             return _of_npz(path, name)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except _UNREADABLE as error:
         raise RecordingError(f"{path}: this is no readable array of NumPy: {error}") from error
     if head.startswith(HDF5_MAGIC):
         return _of_hdf5(path, name)
@@ -166,7 +203,7 @@ def _array(path: Path, name: str | None) -> Any:
 class _NpzArray:
     """An array of an `.npz` file, read in slices of frames from its beginning to its end, without unpacking it whole.
 
-    Raises ValueError, OSError and BadZipFile.
+    Raises what `_UNREADABLE` lists.
     """
 
     def __init__(self, path: Path, member: str) -> None:
@@ -232,8 +269,11 @@ def _of_hdf5(path: Path, name: str | None) -> Any:
     try:
         file = h5py.File(path, "r")
         file.visititems(lambda key, item: axes.update({key: item.ndim}) if isinstance(item, h5py.Dataset) else None)
-        return file[_choose(path, axes, name)]
-    except (OSError, RuntimeError) as error:
+        found = file[_choose(path, axes, name)]
+        if found.is_virtual or found.external:
+            raise RecordingError(f"{path}: {found.name} is stored in other files: copy it into one file (h5repack)")
+        return found
+    except (*_UNREADABLE, KeyError) as error:
         raise RecordingError(f"{path}: this is no readable HDF5 file: {error}") from error
 
 
@@ -246,4 +286,4 @@ def _choose(path: Path, axes: dict[str, int], name: str | None) -> str:
         return fitting[0]
     if not fitting:
         raise RecordingError(f"{path}: it has no array with three axes: spikes are [frames, rows, columns]")
-    raise RecordingError(f"{path}: it has several arrays, {', '.join(fitting)}: name one with --array")
+    raise RecordingError(f"{path}: it has several arrays, {', '.join(fitting)}: name one of them")

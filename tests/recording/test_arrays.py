@@ -118,7 +118,7 @@ def test_damaged_and_dangerous_files_are_refused(tmp_path: Path) -> None:
 
 def test_several_arrays_need_a_name(tmp_path: Path) -> None:
     np.savez(tmp_path / "two.npz", left=spikes(24), right=spikes(32))
-    assert "left, right: name one with --array" in converted(tmp_path / "two.npz", code=2)[1]
+    assert "left, right: name one of them" in converted(tmp_path / "two.npz", code=2)[1]
     assert "there is no array 'middle'" in converted(tmp_path / "two.npz", "--array", "middle", code=2)[1]
     made, _ = converted(tmp_path / "two.npz", "--array", "right")
     assert made is not None and made.sensor.width == 32
@@ -134,7 +134,7 @@ def test_what_is_stated_has_to_fit(tmp_path: Path) -> None:
     ):
         assert told in converted(tmp_path / "a.npy", *arguments, code=2)[1]
     (tmp_path / "b.dat").write_bytes(bytes(10))
-    assert "give --width and --height" in converted(tmp_path / "b.dat", "--from", "bits", code=2)[1]
+    assert "give the width and the height" in converted(tmp_path / "b.dat", "--from", "bits", code=2)[1]
     with pytest.raises(RecordingError, match="less than one frame"):
         open_bits(tmp_path / "b.dat", 100, 100)
     with pytest.raises(RecordingError, match="`spiked convert` reads arrays of spikes"):

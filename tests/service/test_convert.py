@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from spiked_service.cli.commands.convert import Form, read_content, write_content
 from spiked_service.cli.main import app
+from spiked_service.conversion.reading import Form, read_content
+from spiked_service.conversion.writing import write_content
 from typer.testing import CliRunner
 
 from spiked.errors import ConfigurationError, RecordingError
@@ -23,8 +24,8 @@ SENSORS = {
 }
 
 
-def converted(source: Path, out: Path, to: Form) -> Path:
-    write_content(read_content(source, None, RecordingGeometry()), out, to)
+def converted(source: Path, out: Path, to: Form, form: Form | None = None) -> Path:
+    write_content(read_content(source, form, RecordingGeometry(), print), out, to, print)
     return out
 
 
@@ -77,7 +78,7 @@ def test_a_size_that_a_form_cannot_hold_writes_nothing(tmp_path: Path) -> None:
 def test_what_holds_no_frame_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.bin").write_bytes(bytes(20_000))
     with pytest.raises(RecordingError, match="no whole frame"):
-        write_content(read_content(tmp_path / "a.bin", Form.USB, RecordingGeometry()), tmp_path / "b.dat", Form.COMPACT)
+        converted(tmp_path / "a.bin", tmp_path / "b.dat", Form.COMPACT, Form.USB)
     assert not (tmp_path / "b.dat").exists()
 
 

@@ -1,0 +1,1 @@
+"""Conversion between recordings, raw camera bytes and arrays of spikes."""

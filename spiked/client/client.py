@@ -38,6 +38,8 @@ from spiked.errors import SpikedError
 
 _CHUNK_BYTES = 8 << 20
 """Bytes of an upload in one request."""
+_ARRAYS = (".npy", ".npz", ".h5", ".hdf5")
+"""Names of files of arrays, which have no sidecar."""
 _HASH_BYTES = 1 << 20
 """Bytes read at a time."""
 _POLL_S = 0.2
@@ -235,22 +237,29 @@ class Spiked(MapMethods, ResultMethods):
         name: str | None = None,
         notes: str = "",
         geometry: GeometryModel | None = None,
+        form: str | None = None,
+        array: str | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> CaptureOut:
         """Send a recording, with the sidecar beside it if there is one; it becomes a capture.
 
+        Other files with frames are converted: `form` is `usb`, `pcie`, `array` or `bits`, by default detected; `array`
+        is the name of one of several arrays.
         `progress` is told of bytes sent and bytes in all. A connection that breaks is taken up where it broke.
         """
         path = Path(path)
+        recording = form in (None, "compact", "row_tagged") and path.suffix not in _ARRAYS
         beside = path.with_suffix(".json")
         size = path.stat().st_size
         body = {
             "name": name or path.name,
             "notes": notes,
             "bytes": size,
-            "sidecar": json.loads(beside.read_bytes()) if beside.exists() else None,
+            "sidecar": json.loads(beside.read_bytes()) if recording and beside.exists() else None,
             "geometry": plain(geometry),
             "sha256": _sha256(path),
+            "form": form,
+            "array": array,
         }
         upload = self._connection.post("uploads", body, UploadOut)
         with path.open("rb") as file:

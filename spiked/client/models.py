@@ -153,6 +153,19 @@ class FisheyeLens(BaseModel):
     k4: float = 0.0
 
 
+class Form(StrEnum):
+    """
+    How frames are stored in a file.
+    """
+
+    compact = "compact"
+    row_tagged = "row_tagged"
+    usb = "usb"
+    pcie = "pcie"
+    array = "array"
+    bits = "bits"
+
+
 class FrameRangeOut(BaseModel):
     """
     Frames `first` to `first + count - 1`, by absolute index.
@@ -1562,7 +1575,7 @@ class GeometryModel(BaseModel):
 
 class UploadRequest(BaseModel):
     """
-    A recording that is about to come.
+    A recording, or another file with the frames of one, that is about to come.
     """
 
     model_config = ConfigDict(
@@ -1570,7 +1583,17 @@ class UploadRequest(BaseModel):
     )
     name: Annotated[str, Field(description="What the capture will be called.")]
     notes: str = ""
-    bytes: Annotated[int, Field(description="Size of the whole `.dat`.")]
+    bytes: Annotated[int, Field(description="Size of the whole file.")]
     sidecar: UploadSidecar | None = None
     geometry: Annotated[GeometryModel | None, Field(description="Wins over the sidecar.")] = None
     sha256: Annotated[str | None, Field(description="Of the whole file, in hex; checked at the end.")] = None
+    form: Annotated[
+        Form | None,
+        Field(
+            description="Raw bytes of a camera (`usb`, `pcie`), arrays of NumPy or HDF5 (`array`) and frames without ends of rows (`bits`) are converted to a recording. Default: a recording if it has a sidecar or a stated layout, otherwise detected."
+        ),
+    ] = None
+    array: Annotated[
+        str | None,
+        Field(description="Name of the array of spikes, where the file has several with three axes."),
+    ] = None

@@ -146,7 +146,9 @@ def open_bits(path: Path, width: int, height: int, bit_order: BitOrder | None = 
     Raises RecordingError.
     """
     if width < 8 or height < 1:
-        raise RecordingError(f"{path}: frames of {width}x{height} pixels are impossible: correct the width and the height")
+        raise RecordingError(
+            f"{path}: frames of {width}x{height} pixels are impossible: correct the width and the height"
+        )
     size = -(-width * height // 8)
     try:
         data = np.memmap(path, np.uint8, "r")
@@ -164,14 +166,14 @@ def open_bits(path: Path, width: int, height: int, bit_order: BitOrder | None = 
 
 def _block_frames(stored: Any) -> int:
     """Frames of the container to read at a time."""
-    frame = math.prod(stored.shape[1:]) * stored.dtype.itemsize
+    frame: int = math.prod(stored.shape[1:]) * stored.dtype.itemsize
     return max(1, min(BLOCK_FRAMES, BLOCK_BYTES // frame))
 
 
-def _largest(path: Path, stored: Any) -> int:
+def _largest(path: Path, stored: Any) -> float:
     """The largest value of the first frames. Raises RecordingError."""
     try:
-        return int(np.max(stored[: min(LOOKED_AT, _block_frames(stored))]))
+        return float(np.max(stored[: min(LOOKED_AT, _block_frames(stored))]))
     except _UNREADABLE as error:
         raise RecordingError(f"{path}: its first frames cannot be read, the file is damaged: {error}") from error
 

@@ -18,17 +18,20 @@ from spiked.recording import sidecar_path
 from spiked.recording.sidecar import Sidecar
 from spiked_service.base.ids import new_id
 from spiked_service.captures.captures import Captures
+from spiked_service.conversion.reading import Form
 from spiked_service.store.catalogue import Catalogue, StoreError
-from spiked_service.store.disk_space import DiskSpace
+from spiked_service.store.disk_space import DiskFullError, DiskSpace
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import CaptureRow, CaptureState, Grade, Origin, Plan, Quality, Recorded, UploadRow
-from spiked_service.workers.messages import UploadChecked, UploadCommand, WorkerError, WorkerEvent
+from spiked_service.workers.messages import UploadChecked, UploadCommand, UploadConverts, WorkerError, WorkerEvent
 from spiked_service.workers.process import WorkerProcess
 
 _WRITE_BYTES = 1 << 20
 """Most bytes per write."""
 _CHECK_S = 3600.0
 """Time for the check of an upload."""
+_EXIT_S = 1.0
+"""Time for a worker to exit; later it is killed."""
 
 
 class UploadError(SpikedError):
@@ -66,13 +69,25 @@ class Uploads:
         self._busy: set[str] = set()
 
     def create(
-        self, name: str, notes: str, size: int, sidecar: str | None, geometry: str | None, sha256: str | None
+        self,
+        name: str,
+        notes: str,
+        size: int,
+        sidecar: str | None,
+        geometry: str | None,
+        sha256: str | None,
+        form: Form | None = None,
+        array: str | None = None,
     ) -> UploadRow:
-        """Create an upload of `size` bytes and reserve the space. Raises UploadTooLargeError, DiskFullError."""
+        """Create an upload of `size` bytes and reserve the space. Raises UploadTooLargeError, DiskFullError.
+
+        `form` and `array` as for `read_content`.
+        """
         if size > self._limit_bytes():
             raise UploadTooLargeError(f"{size} bytes exceed the limit of {self._limit_bytes()} for an upload")
         now = datetime.now(UTC)
-        stated = json.dumps({"notes": notes, "geometry": json.loads(geometry) if geometry else None})
+        camera = json.loads(geometry) if geometry else None
+        stated = json.dumps({"notes": notes, "geometry": camera, "form": form, "array": array})
         row = UploadRow(new_id(), name, size, now, now, sidecar=sidecar, geometry=stated, sha256=sha256)
         with self._disk_space.for_upload(size):
             with _store_errors(row.id):
@@ -123,8 +138,9 @@ class Uploads:
     def complete(self, upload_id: str, captures: Captures) -> UploadRow:
         """Verify a whole upload in a worker and make a capture of it. Does nothing to a completed upload.
 
-        Raises UnknownIdError, UploadError while bytes are missing, UploadBusyError, StoreError, and RecordingError if
-        it is not a recording: the upload is kept and can be completed with another geometry.
+        A file of another form is converted; then the upload itself is removed. Raises UnknownIdError, UploadError while
+        bytes are missing, UploadBusyError, StoreError, DiskFullError if the recording does not fit, and RecordingError
+        if it holds none: the upload is kept.
         """
         self.get(upload_id)
         with self._exclusive(upload_id):
@@ -134,14 +150,15 @@ class Uploads:
             if row.offset_bytes != row.bytes:
                 raise UploadError(f"{row.offset_bytes} of {row.bytes} bytes were received; send the rest first")
             stated = json.loads(row.geometry or "{}")
-            checked = _checked(self._folder.upload(upload_id), row, stated.get("geometry"))
+            check = _Check(self._folder.upload(upload_id), row, stated, self._limit_bytes(), self._disk_space)
+            checked = check.run()
             lost = checked.lost
             recorded = Recorded(
                 checked.frames, checked.bytes, lost=sum(lost.values()), lost_by_cause=lost, sha256=checked.sha256
             )
             verdict = Quality(Grade(checked.grade), checked.reasons)
             more = {"sensor": checked.sensor, "warnings": checked.warnings, "notes": stated.get("notes", "")}
-            capture_id = self._move_to_capture(row, recorded, verdict, **more)
+            capture_id = self._move_to_capture(row, checked.converted, recorded, verdict, **more)
             captures.publish(capture_id)
             return self.get(upload_id)
 
@@ -149,11 +166,13 @@ class Uploads:
         """Remove an upload and its bytes; a capture made of it is kept. Raises UnknownIdError."""
         self.get(upload_id)
         with self._exclusive(upload_id):
-            self._folder.upload(upload_id).unlink(missing_ok=True)
-            self._folder.upload(upload_id).with_suffix(".json").unlink(missing_ok=True)
+            for suffix in (".part", ".json", ".dat"):
+                self._folder.upload(upload_id).with_suffix(suffix).unlink(missing_ok=True)
             self._catalogue.uploads.remove(upload_id)
 
-    def _move_to_capture(self, upload: UploadRow, recorded: Recorded, verdict: Quality, **more: Any) -> str:
+    def _move_to_capture(
+        self, upload: UploadRow, converted: bool, recorded: Recorded, verdict: Quality, **more: Any
+    ) -> str:
         """Make a capture of an upload that was verified and has a sidecar, and return its id. Raises StoreError.
 
         `more` are further fields of the capture.
@@ -176,13 +195,14 @@ class Uploads:
             self._folder.capture(row.id).mkdir()
             data = self._folder.recording(row.id)
             part.with_suffix(".json").replace(sidecar_path(data))
-            part.replace(data)
+            (part.with_suffix(".dat") if converted else part).replace(data)
         except OSError as error:
             self._folder.remove(self._folder.capture(row.id))
             raise StoreError(f"upload {upload.id} cannot be moved to its capture: {error.strerror}") from error
         with self._catalogue.transaction():
             self._catalogue.captures.put(row)
             self._catalogue.uploads.set(upload.id, capture_id=row.id)
+        part.unlink(missing_ok=True)  # there is one, if it was converted
         return row.id
 
     def _confirm(self, upload_id: str, offset_bytes: int) -> UploadRow:
@@ -254,43 +274,65 @@ def _too_much(row: UploadRow) -> UploadError:
     )
 
 
-def _checked(path: Path, row: UploadRow, geometry: dict[str, Any] | None) -> UploadChecked:
-    """Verify the file in a worker, so that the service never parses uploaded data."""
-    command = UploadCommand(
-        path=path,
-        sha256=row.sha256,
-        sidecar=None if row.sidecar is None else Sidecar.model_validate_json(row.sidecar),
-        camera=_camera(geometry or {}),
-    )
-    found: list[UploadChecked] = []
-    errors: list[str] = []
-    trouble: list[str | None] = []
-    exited = threading.Event()
+class _Check:
+    """Verifies and converts the file of an upload in a worker, so that the service never parses uploaded data."""
 
-    def handle(event: WorkerEvent) -> None:
-        match event:
-            case UploadChecked():
-                found.append(event)
-            case WorkerError():
-                errors.append(event.reason)
+    def __init__(
+        self, path: Path, row: UploadRow, stated: dict[str, Any], limit_bytes: int, disk_space: DiskSpace
+    ) -> None:
+        self._row = row
+        self._disk_space = disk_space
+        self._command = UploadCommand(
+            path=path,
+            sha256=row.sha256,
+            sidecar=None if row.sidecar is None else Sidecar.model_validate_json(row.sidecar),
+            camera=_camera(stated.get("geometry") or {}),
+            form=stated.get("form"),
+            array=stated.get("array"),
+            limit_bytes=limit_bytes,
+        )
+        self._checked: UploadChecked | None = None
+        self._reason: str | None = None
+        self._full: DiskFullError | None = None
+        self._over = threading.Event()
 
-    def on_exit(reason: str | None) -> None:
-        trouble.append(reason)
-        exited.set()
-
-    log = path.with_suffix(".log")
-    worker = WorkerProcess(command, log, handle, on_exit)
-    try:
-        if not exited.wait(_CHECK_S):
+    def run(self) -> UploadChecked:
+        """Raises UploadError, RecordingError, DiskFullError."""
+        log = self._command.path.with_suffix(".log")
+        worker = WorkerProcess(self._command, log, self._handle, self._on_exit)
+        try:
+            if not self._over.wait(_CHECK_S):
+                raise UploadError(f"the check of upload {self._row.id} took more than {_CHECK_S:.0f} s; try again")
+        finally:
             worker.dismiss()
-            raise UploadError(f"the check of upload {row.id} took more than {_CHECK_S:.0f} s; try again")
-    finally:
-        worker.kill_after(1.0)
-        log.unlink(missing_ok=True)
-    if not found:
-        why = (errors or [trouble[0] or "its worker exited without output"])[0].replace(str(path), row.name)
-        raise RecordingError(f"upload {row.id} cannot be used as a recording: {why}")
-    return found[0]
+            worker.kill_after(_EXIT_S)
+            log.unlink(missing_ok=True)
+            self._disk_space.release(self._command.converted)
+            if self._checked is None:
+                self._command.converted.unlink(missing_ok=True)
+        if self._full is not None:
+            raise self._full
+        if self._checked is None:
+            why = (self._reason or "its worker exited without output").replace(str(self._command.path), self._row.name)
+            raise RecordingError(f"upload {self._row.id} cannot be used as a recording: {why}")
+        return self._checked
+
+    def _handle(self, event: WorkerEvent) -> None:
+        match event:
+            case UploadConverts():
+                try:
+                    self._disk_space.reserve_converted(self._command.converted, event.bytes)
+                except DiskFullError as error:
+                    self._full = error
+                    self._over.set()
+            case UploadChecked():
+                self._checked = event
+            case WorkerError():
+                self._reason = event.reason
+
+    def _on_exit(self, reason: str | None) -> None:
+        self._reason = self._reason or reason
+        self._over.set()
 
 
 @contextmanager

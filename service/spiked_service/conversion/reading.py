@@ -42,6 +42,9 @@ READ_ONLY = (Form.ARRAY, Form.BITS)
 """Forms that are not written."""
 
 
+RECORDINGS = (Form.COMPACT, Form.ROW_TAGGED)
+"""Forms that are recordings as they are."""
+
 Warn = Callable[[str], None]
 """Takes a sentence for the user."""
 Item = NDArray[np.uint8] | Gap
@@ -164,9 +167,7 @@ def _wire_content(
     return Content(sensor, items, {}, data.size // sensor.frame_bytes, assumed=assumed)
 
 
-def _reported(
-    framing: Framing, blocks: Iterator[NDArray[np.uint8]], frame_bytes: int, warn: Warn
-) -> Iterator[Item]:
+def _reported(framing: Framing, blocks: Iterator[NDArray[np.uint8]], frame_bytes: int, warn: Warn) -> Iterator[Item]:
     yield from _parsed(framing, blocks, frame_bytes)
     c = framing.counters
     if c.skipped_bytes or c.duplicates:

@@ -73,14 +73,23 @@ class DiskSpace:
         Raises DiskFullError.
         """
         with self._lock:
-            left = min(_CAPTURES_RESERVE_BYTES, self._folder.space().total_bytes // 10)
-            free = self.storable_bytes - left - self._reserved()
-            if size > free:
-                raise DiskFullError(
-                    f"{size} bytes do not fit: the disk of {self._folder.path} has {max(0, free)} bytes free for "
-                    f"uploads{self._others()}: free disk space, or send it later"
-                )
+            self._refuse_upload(size)
             yield
+
+    def reserve_converted(self, path: Path, size: int) -> None:
+        """Reserve `size` bytes for the recording that an upload is converted to. Raises DiskFullError."""
+        with self._lock:
+            self._refuse_upload(size)
+            self._recordings[path] = size
+
+    def _refuse_upload(self, size: int) -> None:
+        left = min(_CAPTURES_RESERVE_BYTES, self._folder.space().total_bytes // 10)
+        free = self.storable_bytes - left - self._reserved()
+        if size > free:
+            raise DiskFullError(
+                f"{size} bytes do not fit: the disk of {self._folder.path} has {max(0, free)} bytes free for "
+                f"uploads{self._others()}: free disk space, or send it later"
+            )
 
     def _others(self) -> str:
         reserved = self._reserved()

@@ -164,6 +164,9 @@ class DataFolder:
             for part in base.rglob("*.part"):
                 part.unlink(missing_ok=True)
                 removed += 1
+        for converted in self._uploads.glob("*.dat"):
+            converted.unlink(missing_ok=True)
+            removed += 1
         return removed
 
     def close(self) -> None:

@@ -12,6 +12,7 @@ from spiked.recon import State
 from spiked.recording.geometry import Assumable
 from spiked.recording.sidecar import Sidecar
 from spiked.sensor import Intrinsics, Sensor
+from spiked_service.conversion.reading import Form
 from spiked_service.events.payloads import PosePayload
 from spiked_service.results.versions import Published
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
@@ -153,6 +154,17 @@ class UploadCommand(_Command):
     sidecar: Sidecar | None
     camera: StoredCameraOptions
     """Wins over the sidecar."""
+    form: Form | None
+    """None: a recording with a sidecar or a stated layout, otherwise detected."""
+    array: str | None
+    """Name of an array in the file."""
+    limit_bytes: int
+    """Most bytes of the recording that the file is converted to."""
+
+    @property
+    def converted(self) -> Path:
+        """The recording that the file is converted to, unless it is one."""
+        return self.path.with_suffix(".dat")
 
 
 Command = Annotated[
@@ -312,10 +324,19 @@ class Logged(BaseModel):
     """Role, capture id and reconstruction id."""
 
 
+class UploadConverts(BaseModel):
+    """The uploaded file is about to be converted to a recording of at most so many bytes."""
+
+    type: Literal["upload_converts"] = "upload_converts"
+    bytes: int
+
+
 class UploadChecked(BaseModel):
     """Result of the check of an uploaded recording."""
 
     type: Literal["upload_checked"] = "upload_checked"
+    converted: bool
+    """Whether the recording is `UploadCommand.converted`, not the uploaded file."""
     sensor: Sensor
     frames: int
     bytes: int
@@ -348,6 +369,7 @@ WorkerEvent = Annotated[
     | VersionPublished
     | PreviewTaken
     | Logged
+    | UploadConverts
     | UploadChecked
     | WorkerError,
     Field(discriminator="type"),

@@ -41,6 +41,8 @@ def upload_routes(uploads: Uploads, captures: Captures, route_class: type[APIRou
             None if body.sidecar is None else body.sidecar.model_dump_json(),
             None if body.geometry is None else body.geometry.options().model_dump_json(exclude_none=True),
             body.sha256,
+            body.form,
+            body.array,
         )
         response.headers["Location"] = request.url_for("get_upload", upload_id=row.id).path
         return _out(row)

@@ -1,12 +1,14 @@
 """Recordings from elsewhere."""
 
 from datetime import datetime
+from typing import Annotated
 
 from pydantic import ConfigDict, Field, StrictInt
 
 from spiked.camera import Rate, StoredCameraOptions
 from spiked.recording.sidecar import Sidecar
 from spiked_service.api.schemas.base import Id, In, IntrinsicsModel, Name, Notes, Out, camera_example, examples
+from spiked_service.conversion.reading import Form
 
 MAX_UPLOAD_BYTES = 1 << 42
 """Upper bound of the schema, 4 TiB; `limit_upload_bytes` is the limit in effect."""
@@ -34,7 +36,7 @@ class UploadSidecar(Sidecar):
 
 
 class UploadRequest(In):
-    """A recording that is about to come."""
+    """A recording, or another file with the frames of one, that is about to come."""
 
     model_config = examples(
         {
@@ -52,11 +54,20 @@ class UploadRequest(In):
 
     name: Name = Field(min_length=1, description="What the capture will be called.")
     notes: Notes = ""
-    bytes: StrictInt = Field(ge=1, le=MAX_UPLOAD_BYTES, description="Size of the whole `.dat`.")
+    bytes: StrictInt = Field(ge=1, le=MAX_UPLOAD_BYTES, description="Size of the whole file.")
     sidecar: UploadSidecar | None = None
     geometry: GeometryModel | None = Field(None, description="Wins over the sidecar.")
     sha256: str | None = Field(
         None, pattern="^[0-9a-f]{64}$", description="Of the whole file, in hex; checked at the end."
+    )
+    form: Form | None = Field(
+        None,
+        description="Raw bytes of a camera (`usb`, `pcie`), arrays of NumPy or HDF5 (`array`) and frames without ends "
+        "of rows (`bits`) are converted to a recording. Default: a recording if it has a sidecar or a stated layout, "
+        "otherwise detected.",
+    )
+    array: Annotated[str, Field(min_length=1, max_length=200)] | None = Field(
+        None, description="Name of the array of spikes, where the file has several with three axes."
     )
 
 

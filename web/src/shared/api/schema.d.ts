@@ -1731,6 +1731,12 @@ export interface components {
             k4?: number;
         };
         /**
+         * Form
+         * @description How frames are stored in a file.
+         * @enum {string}
+         */
+        Form: "compact" | "row_tagged" | "usb" | "pcie" | "array" | "bits";
+        /**
          * FrameRangeOut
          * @description Frames `first` to `first + count - 1`, by absolute index.
          */
@@ -3037,7 +3043,7 @@ export interface components {
         };
         /**
          * UploadRequest
-         * @description A recording that is about to come.
+         * @description A recording, or another file with the frames of one, that is about to come.
          * @example {
          *       "bytes": 16000000,
          *       "geometry": {
@@ -3068,7 +3074,7 @@ export interface components {
             notes?: string;
             /**
              * Bytes
-             * @description Size of the whole `.dat`.
+             * @description Size of the whole file.
              */
             bytes: number;
             sidecar?: components["schemas"]["UploadSidecar"] | null;
@@ -3079,6 +3085,13 @@ export interface components {
              * @description Of the whole file, in hex; checked at the end.
              */
             sha256?: string | null;
+            /** @description Raw bytes of a camera (`usb`, `pcie`), arrays of NumPy or HDF5 (`array`) and frames without ends of rows (`bits`) are converted to a recording. Default: a recording if it has a sidecar or a stated layout, otherwise detected. */
+            form?: components["schemas"]["Form"] | null;
+            /**
+             * Array
+             * @description Name of the array of spikes, where the file has several with three axes.
+             */
+            array?: string | null;
         };
         /**
          * UploadSidecar

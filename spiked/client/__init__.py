@@ -5,8 +5,10 @@ from spiked.client.connection import ApiError, ServiceUnreachableError
 from spiked.client.events import Event
 from spiked.client.models import (
     CaptureOut,
+    CaptureRequest,
     CaptureState,
     GeometryModel,
+    GroupOut,
     ImageFormat,
     IntrinsicsModel,
     JobState,
@@ -24,9 +26,11 @@ from spiked.client.models import (
 __all__ = [
     "ApiError",
     "CaptureOut",
+    "CaptureRequest",
     "CaptureState",
     "Event",
     "GeometryModel",
+    "GroupOut",
     "ImageFormat",
     "IntrinsicsModel",
     "JobState",

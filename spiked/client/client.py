@@ -18,10 +18,12 @@ from spiked.client.maps import MapMethods
 from spiked.client.models import (
     CaptureOut,
     CapturePage,
+    CaptureRequest,
     CaptureState,
     DeviceOut,
     DevicesOut,
     GeometryModel,
+    GroupOut,
     IntrinsicsModel,
     JobState,
     ProfileModel,
@@ -122,14 +124,31 @@ class Spiked(MapMethods, ResultMethods):
         }
         return self._connection.post("captures", body, CaptureOut)
 
+    def start_group(self, captures: Sequence[CaptureRequest]) -> GroupOut:
+        """Start captures on several devices together, or none of them."""
+        return self._connection.post("groups", {"captures": [plain(one) for one in captures]}, GroupOut)
+
+    def group(self, group_id: str) -> GroupOut:
+        """Captures that were started together; when all have ended, with the offset of each against the first."""
+        return self._connection.get(f"groups/{group_id}", GroupOut)
+
+    def stop_group(self, group_id: str) -> GroupOut:
+        """End the acquisition of all its captures."""
+        return self._connection.post(f"groups/{group_id}:stop", None, GroupOut)
+
     def captures(
-        self, *, query: str | None = None, state: CaptureState | None = None, deleted: bool = False
+        self,
+        *,
+        query: str | None = None,
+        state: CaptureState | None = None,
+        deleted: bool = False,
+        group: str | None = None,
     ) -> Iterator[CaptureOut]:
         """All captures, newest first; pages are fetched as they are needed."""
         cursor = None
         while True:
             page = self._connection.get(
-                "captures", CapturePage, q=query, state=state, deleted=deleted or None, cursor=cursor
+                "captures", CapturePage, q=query, state=state, deleted=deleted or None, cursor=cursor, group=group
             )
             yield from page.items
             cursor = page.next_cursor

@@ -305,6 +305,30 @@ class Mosaic(StrEnum):
     GBRG = "GBRG"
 
 
+class OffsetOut(BaseModel):
+    """
+    When the frames of a capture came, by the clock of the machine.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    capture_id: Annotated[str, Field(description="UUID version 7: ids sort by time.")]
+    offset_s: Annotated[
+        float | None,
+        Field(
+            description="From the first recorded frame of the group's first capture to its own; negative if it began earlier. Null if it is not known."
+        ),
+    ]
+    sigma_s: Annotated[
+        float | None,
+        Field(
+            description="Standard deviation, from the jitter of the clock pairs; null with fewer than 4 of a recording."
+        ),
+    ]
+    reason: Annotated[str, Field(description="Why the offset is not known.")]
+
+
 class OpencvLens(BaseModel):
     """
     Distortion by OpenCV's polynomial: radial k1, k2, k3 and tangential p1, p2.
@@ -1480,6 +1504,10 @@ class CaptureOut(BaseModel):
     reconstruction_ids: Annotated[list[str], Field(description="Oldest first.")]
     counters: CountersOut | None
     sensor: Annotated[SensorOut | None, Field(description="Null until the source is open.")]
+    group: Annotated[
+        str | None,
+        Field(description="Id of the group of captures that were started together."),
+    ]
 
 
 class CapturePage(BaseModel):
@@ -1571,6 +1599,33 @@ class GeometryModel(BaseModel):
         Field(description="Which bit of a byte is the leftmost of its eight pixels."),
     ] = None
     frame_rate_hz: Annotated[float | None, Field(deprecated=True, description="Deprecated: use rate.")] = None
+
+
+class GroupOut(BaseModel):
+    """
+    A group, with its captures in the order of the request.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    id: Annotated[str, Field(description="UUID version 7: ids sort by time.")]
+    captures: list[CaptureOut]
+    offsets: Annotated[
+        list[OffsetOut] | None,
+        Field(description="Of all captures but the first, against the first. Null until all have ended."),
+    ]
+
+
+class GroupRequest(BaseModel):
+    """
+    Captures to start together, or none of them.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    captures: Annotated[list[CaptureRequest], Field(description="A device each.")]
 
 
 class UploadRequest(BaseModel):

@@ -240,11 +240,10 @@ def test_two_cameras_share_a_time_base(
     except PermissionError:
         pytest.skip("needs real-time priority for the virtual cameras")
     http = daemon("--no-capture", seen=rig).http
-    ids = []
-    for port in ports:
-        source = f"usb:{port}?rate={RATE}&transfer_kib=64"
-        plan = {"source": source, "frames": 10 * RATE, "reconstruct": False}
-        ids.append(http.post("captures", json=plan).json()["id"])
+    sources = [f"usb:{port}?rate={RATE}&transfer_kib=64" for port in ports]
+    plans = [{"source": source, "frames": 10 * RATE, "reconstruct": False} for source in sources]
+    group = http.post("groups", json={"captures": plans}).json()
+    ids = [one["id"] for one in group["captures"]]
     began_s = []
     recordings = []
     for number, capture_id in enumerate(ids):
@@ -261,6 +260,8 @@ def test_two_cameras_share_a_time_base(
     error_us = 1e6 * (found.seconds - true_s)
     figure("offset of two cameras", f"{error_us:+.0f} us", f"one frame, {1e6 / RATE:.0f} us")
     assert found.sigma_s is not None
+    (told,) = http.get(f"groups/{group['id']}").json()["offsets"]
+    assert (told["offset_s"], told["sigma_s"]) == (found.seconds, found.sigma_s)
     figure("its standard deviation", f"{1e6 * found.sigma_s:.0f} us", "")
     assert abs(error_us) < 1e6 / RATE, (found.seconds, true_s)
 

@@ -20,6 +20,7 @@ from spiked_service.api.routes.devices import device_routes
 from spiked_service.api.routes.docs import mount_docs
 from spiked_service.api.routes.doctor import doctor_routes
 from spiked_service.api.routes.events import event_routes
+from spiked_service.api.routes.groups import group_routes
 from spiked_service.api.routes.health import health_routes, metrics_routes
 from spiked_service.api.routes.maps import map_routes
 from spiked_service.api.routes.options import option_routes
@@ -67,6 +68,7 @@ def _api(services: Services) -> APIRouter:
     api = APIRouter(prefix="/api/v1", dependencies=[Depends(authorise)])
     api.include_router(device_routes(captures, services.sources, folder.profiles, once))
     api.include_router(capture_routes(captures, services.sources, once))
+    api.include_router(group_routes(captures, services.sources, once))
     api.include_router(recording_routes(captures, folder, once))
     api.include_router(preview_routes(captures, folder, results, views, once))
     api.include_router(capture_result_routes(results, views, once))

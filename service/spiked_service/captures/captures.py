@@ -16,7 +16,7 @@ from spiked_service.captures.recent import RecentCaptures
 from spiked_service.captures.sources import device_of, realtime
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue import Reconstructions
-from spiked_service.store.catalogue import Catalogue, Page, StoreError
+from spiked_service.store.catalogue import Catalogue, Page, StoreError, UnknownIdError
 from spiked_service.store.disk_space import DiskSpace, recording_bytes
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import CaptureRow, CaptureState, Origin, Plan
@@ -25,6 +25,8 @@ from spiked_service.workers.messages import PreviewTaken
 
 _CLOSE_S = 1.0
 """Workers exit within 0.8 s of their dismissal (`channel._EXIT_S`); later they are killed."""
+MOST_GROUPED = 16
+"""Captures in a group, at most."""
 _TICK_S = 0.5
 """Interval at which states follow the counters and live captures are published."""
 
@@ -84,19 +86,70 @@ class Captures:
                 try:
                     capture.acquire()
                 except OSError as error:
-                    del self._live[capture.id]
-                    self._catalogue.captures.remove(capture.id)
-                    self._folder.remove(self._folder.capture(capture.id))
-                    self._disk_space.release(self._folder.recording(capture.id))
+                    self._undo(capture)
                     raise BusyError(f"no worker can be started: {error.strerror}; end other programs") from error
         if armed_device is not None:
             armed_device.trigger(capture, plan)
         return self.publish(capture.id)
 
-    def _create(self, plan: Plan, size: int | None) -> LiveCapture:
+    def start_group(self, plans: Sequence[Plan]) -> str:
+        """Start a capture on each of several devices, or none at all; returns the id of the group.
+
+        Raises as `start`, and ConfigurationError for a device that is named twice or that is armed.
+        """
+        devices = [device_of(plan.source) for plan in plans]
+        for device in devices:
+            if devices.count(device) > 1:
+                raise ConfigurationError(f"{device} is named twice in the group: name each device once")
+        sources = [open_camera(plan.source, profiles=self._folder.profiles).source for plan in plans]
+        sizes = [recording_bytes(plan, one.sensor, one.frames) for plan, one in zip(plans, sources, strict=True)]
+        group = new_id()
+        created: list[LiveCapture] = []
+        with self._lock:
+            self._refuse_if_busy(*devices)
+            for device, plan in zip(devices, plans, strict=True):
+                if device in self._armed or plan.pretrigger_s:
+                    raise ConfigurationError(
+                        f"{device} is armed or has a pre-trigger time: groups start now; disarm it"
+                    )
+            try:
+                for plan, size in zip(plans, sizes, strict=True):
+                    created.append(self._create(plan, size, group))
+                for capture in created:
+                    capture.acquire()
+            except (OSError, StoreError) as error:
+                for capture in created:
+                    if capture.holds_device:  # its worker runs; its row says why it is short
+                        capture.stop()
+                    else:
+                        self._undo(capture)
+                if isinstance(error, StoreError):
+                    raise
+                raise BusyError(f"no worker can be started: {error.strerror}; end other programs") from error
+        for capture in created:
+            self.publish(capture.id)
+        return group
+
+    def group(self, group_id: str) -> Sequence[Snapshot]:
+        """The captures of a group in the order of the request. Raises UnknownIdError."""
+        rows = self._catalogue.capture_page(MOST_GROUPED, group=group_id).items
+        if not rows:
+            raise UnknownIdError(f"there is no group {group_id} of captures")
+        return [self.snapshot(row) for row in sorted(rows, key=lambda row: row.id)]
+
+    def _undo(self, capture: LiveCapture) -> None:
+        """Remove a capture that has not begun."""
+        del self._live[capture.id]
+        self._catalogue.captures.remove(capture.id)
+        self._folder.remove(self._folder.capture(capture.id))
+        self._disk_space.release(self._folder.recording(capture.id))
+
+    def _create(self, plan: Plan, size: int | None, group: str | None = None) -> LiveCapture:
         """Create a capture with its row and folder, and reserve `size` bytes. Raises StoreError."""
         now = datetime.now(UTC)
-        row = CaptureRow(new_id(), Origin.LIVE, plan, CaptureState.STARTING, now, name=plan.name, notes=plan.notes)
+        row = CaptureRow(
+            new_id(), Origin.LIVE, plan, CaptureState.STARTING, now, name=plan.name, notes=plan.notes, group=group
+        )
         if plan.record:
             self._disk_space.reserve_recording(self._folder.recording(row.id), size)
         try:
@@ -168,9 +221,10 @@ class Captures:
         query: str | None = None,
         state: CaptureState | None = None,
         deleted: bool = False,
+        group: str | None = None,
     ) -> Page[CaptureRow]:
         """Newest first."""
-        return self._catalogue.capture_page(limit, cursor, query, state, deleted)
+        return self._catalogue.capture_page(limit, cursor, query, state, deleted, group)
 
     def live(self) -> Sequence[Snapshot]:
         """Captures that have not ended, oldest first."""
@@ -272,16 +326,18 @@ class Captures:
         with self._lock:
             return [*self._live.values(), *self._armed.values()]
 
-    def _refuse_if_busy(self, device: str) -> None:
+    def _refuse_if_busy(self, *devices: str) -> None:
         if self._closing.is_set():
             raise BusyError("the service is stopping; restart it to capture")
         for other in self._live.values():
-            if device_of(other.row.source) == device and not other.row.state.over and other.holds_device:
+            device = device_of(other.row.source)
+            if device in devices and not other.row.state.over and other.holds_device:
                 raise BusyError(f"capture {other.id} is still running on {device}: stop it, or wait for its end")
         in_use = {device_of(other.row.source) for other in self._live.values() if other.holds_device} | set(self._armed)
-        if len(in_use - {device}) >= self.limit:
+        if len(in_use | set(devices)) > self.limit:
+            wanted = f" and {len(devices)} are asked for" if len(devices) > 1 else ""
             raise BusyError(
-                f"{len(in_use)} devices are in use, the most that are allowed: stop a capture, disarm a device, "
+                f"{len(in_use)} devices are in use{wanted}, {self.limit} are allowed: stop a capture, disarm a device, "
                 "or raise the setting limit_captures"
             )
 

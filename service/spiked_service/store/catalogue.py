@@ -154,12 +154,16 @@ class Catalogue:
         query: str | None = None,
         state: CaptureState | None = None,
         deleted: bool = False,
+        group: str | None = None,
     ) -> Page[CaptureRow]:
         """Captures, newest first; `query` is looked for in name, notes and source; deleted ones only if asked for."""
         where, values = ["deleted_at IS NOT NULL" if deleted else "deleted_at IS NULL"], list[Any]()
         if state is not None:
             where.append("state = ?")
             values.append(str(state))
+        if group is not None:
+            where.append("json_extract(document, '$.group') = ?")
+            values.append(group)
         if query:
             fields = ("$.name", "$.notes", "$.plan.source")
             where.append("(" + " OR ".join(f"instr(lower(json_extract(document, '{f}')), ?)" for f in fields) + ")")

@@ -229,6 +229,8 @@ class CaptureRow:
     ended_at: datetime | None = None
     deleted_at: datetime | None = None
     """Can be restored until retention purges it."""
+    group: str | None = None
+    """Id of the group of captures that were started together."""
 
     @property
     def source(self) -> str:

@@ -24,7 +24,7 @@ def capture_routes(captures: Captures, sources: Sources, route_class: type[APIRo
         body: CaptureRequest, request: Request, response: Response, idempotency_key: IdempotencyKey = None
     ) -> CaptureOut:
         """Start a capture. A device runs one capture at a time."""
-        snapshot = captures.start(_plan(body, sources))
+        snapshot = captures.start(plan_of(body, sources))
         response.headers["Location"] = request.url_for("get_capture", capture_id=snapshot.row.id).path
         return CaptureOut.of(snapshot)
 
@@ -37,9 +37,12 @@ def capture_routes(captures: Captures, sources: Sources, route_class: type[APIRo
         ] = None,
         state: CaptureState | None = None,
         deleted: Annotated[bool, Query(description="List removed captures instead.")] = False,
+        group: Annotated[
+            str | None, Query(max_length=64, description="Captures that were started together, by their group's id.")
+        ] = None,
     ) -> CapturePage:
         """Captures, newest first."""
-        page = captures.list(limit, cursor, q, state, deleted)
+        page = captures.list(limit, cursor, q, state, deleted, group)
         items = [CaptureOut.of(captures.snapshot(row)) for row in page.items]
         return CapturePage(items=items, next_cursor=page.next_cursor)
 
@@ -79,7 +82,8 @@ def _add_end_routes(router: APIRouter, captures: Captures) -> None:
         return CaptureOut.of(captures.get(capture_id))
 
 
-def _plan(body: CaptureRequest, sources: Sources) -> Plan:
+def plan_of(body: CaptureRequest, sources: Sources) -> Plan:
+    """What a request asks for. Raises UnknownIdError for an unknown device."""
     return Plan(
         source=sources.named(body.source, body.device, body.camera),
         frames=body.frames,

@@ -340,6 +340,7 @@ class CaptureOut(Out):
     reconstruction_ids: list[str] = Field(description="Oldest first.")
     counters: CountersOut | None
     sensor: SensorOut | None = Field(description="Null until the source is open.")
+    group: str | None = Field(None, description="Id of the group of captures that were started together.")
 
     @classmethod
     def of(cls, snapshot: Snapshot) -> "CaptureOut":
@@ -364,6 +365,7 @@ class CaptureOut(Out):
             reconstruction_ids=[one.id for one in snapshot.reconstructions],
             counters=CountersOut.of(snapshot.counters),
             sensor=SensorOut.of(row.sensor),
+            group=row.group,
         )
 
 

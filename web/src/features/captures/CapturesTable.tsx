@@ -155,6 +155,11 @@ function Row({
           {capture.name !== "" && capture.keep && " · "}
           {capture.keep && "kept"}
         </span>
+        {capture.group !== null && (
+          <span className="dim" title={`Started together with the others of group ${capture.group}`}>
+            group {capture.group.slice(-6)}
+          </span>
+        )}
         {capture.notes !== "" && (
           <span className="dim notes" title={capture.notes}>
             {capture.notes}

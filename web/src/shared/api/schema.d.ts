@@ -236,6 +236,72 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/api/v1/groups": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        get?: never;
+        put?: never;
+        /**
+         * Start Group
+         * @description Start captures on several devices together, or none: the answer says which cannot start and why.
+         *
+         *     Scope of a token: `operate`.
+         */
+        post: operations["start_group_api_v1_groups_post"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/groups/{group_id}": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Group
+         * @description Its captures and, when all have ended, the offset of each against the first.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["get_group_api_v1_groups__group_id__get"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/groups/{group_id}:stop": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        get?: never;
+        put?: never;
+        /**
+         * Stop Group
+         * @description End the acquisition of all its captures, as `captures/ID:stop` does.
+         *
+         *     Scope of a token: `operate`.
+         */
+        post: operations["stop_group_api_v1_groups__group_id__stop_post"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
     "/api/v1/captures/{capture_id}/recording": {
         parameters: {
             query?: never;
@@ -1382,6 +1448,11 @@ export interface components {
             counters: components["schemas"]["CountersOut"] | null;
             /** @description Null until the source is open. */
             sensor: components["schemas"]["SensorOut"] | null;
+            /**
+             * Group
+             * @description Id of the group of captures that were started together.
+             */
+            group: string | null;
         };
         /**
          * CapturePage
@@ -1827,6 +1898,46 @@ export interface components {
          */
         Grade: "good" | "degraded" | "bad";
         /**
+         * GroupOut
+         * @description A group, with its captures in the order of the request.
+         */
+        GroupOut: {
+            /**
+             * Id
+             * @description UUID version 7: ids sort by time.
+             * @example 01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10
+             */
+            id: string;
+            /** Captures */
+            captures: components["schemas"]["CaptureOut"][];
+            /**
+             * Offsets
+             * @description Of all captures but the first, against the first. Null until all have ended.
+             */
+            offsets: components["schemas"]["OffsetOut"][] | null;
+        };
+        /**
+         * GroupRequest
+         * @description Captures to start together, or none of them.
+         * @example {
+         *       "captures": [
+         *         {
+         *           "source": "sim:?seed=1"
+         *         },
+         *         {
+         *           "source": "sim:?seed=2"
+         *         }
+         *       ]
+         *     }
+         */
+        GroupRequest: {
+            /**
+             * Captures
+             * @description A device each.
+             */
+            captures: components["schemas"]["CaptureRequest"][];
+        };
+        /**
          * HealthOut
          * @description Health of the service.
          */
@@ -2066,6 +2177,33 @@ export interface components {
          * @enum {string}
          */
         Mosaic: "RGGB" | "BGGR" | "GRBG" | "GBRG";
+        /**
+         * OffsetOut
+         * @description When the frames of a capture came, by the clock of the machine.
+         */
+        OffsetOut: {
+            /**
+             * Capture Id
+             * @description UUID version 7: ids sort by time.
+             * @example 01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10
+             */
+            capture_id: string;
+            /**
+             * Offset S
+             * @description From the first recorded frame of the group's first capture to its own; negative if it began earlier. Null if it is not known.
+             */
+            offset_s: number | null;
+            /**
+             * Sigma S
+             * @description Standard deviation, from the jitter of the clock pairs; null with fewer than 4 of a recording.
+             */
+            sigma_s: number | null;
+            /**
+             * Reason
+             * @description Why the offset is not known.
+             */
+            reason: string;
+        };
         /**
          * OpencvLens
          * @description Distortion by OpenCV's polynomial: radial k1, k2, k3 and tangential p1, p2.
@@ -4032,6 +4170,8 @@ export interface operations {
                 state?: components["schemas"]["CaptureState"] | null;
                 /** @description List removed captures instead. */
                 deleted?: boolean;
+                /** @description Captures that were started together, by their group's id. */
+                group?: string | null;
             };
             header?: never;
             path?: never;
@@ -4650,6 +4790,323 @@ export interface operations {
                 };
                 content: {
                     "application/json": components["schemas"]["CaptureOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It conflicts with the current state. */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    start_group_api_v1_groups_post: {
+        parameters: {
+            query?: never;
+            header?: {
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                "idempotency-key"?: string;
+            };
+            path?: never;
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["GroupRequest"];
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            201: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["GroupOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It conflicts with the current state. */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_group_api_v1_groups__group_id__get: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                group_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["GroupOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    stop_group_api_v1_groups__group_id__stop_post: {
+        parameters: {
+            query?: never;
+            header?: {
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                "idempotency-key"?: string;
+            };
+            path: {
+                group_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            202: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["GroupOut"];
                 };
             };
             /** @description The request is malformed. */

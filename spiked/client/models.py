@@ -323,7 +323,7 @@ class OffsetOut(BaseModel):
     sigma_s: Annotated[
         float | None,
         Field(
-            description="Standard deviation, from the jitter of the clock pairs; null with fewer than 4 of a recording."
+            description="Standard deviation, from the jitter of the clock pairs; null with fewer than 4 of a recording. Delays that all pairs of a recording share are not in it: on a busy machine the error was up to 8 times larger."
         ),
     ]
     reason: Annotated[str, Field(description="Why the offset is not known.")]

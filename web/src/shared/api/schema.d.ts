@@ -2195,7 +2195,7 @@ export interface components {
             offset_s: number | null;
             /**
              * Sigma S
-             * @description Standard deviation, from the jitter of the clock pairs; null with fewer than 4 of a recording.
+             * @description Standard deviation, from the jitter of the clock pairs; null with fewer than 4 of a recording. Delays that all pairs of a recording share are not in it: on a busy machine the error was up to 8 times larger.
              */
             sigma_s: number | null;
             /**

@@ -23,7 +23,7 @@ from pydantic import (
 from spiked.distortion import Distortion
 from spiked.errors import ConfigurationError
 from spiked.lens import Lens, distortion_of, lens_of
-from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
+from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Response, Sensor
 
 __all__ = ["CameraFiles", "CameraOptions", "LocalPath", "Pinhole", "PinholeText", "Rate", "Side", "StoredCameraOptions"]
 
@@ -104,6 +104,8 @@ class CameraOptions(BaseModel):
     """Colour mosaic of the upright image; none: a grey sensor."""
     flipped: bool | None = Field(default=None, validation_alias=AliasChoices("flipped", "flip"))
     """Rows come bottom-up; false: top-down."""
+    response: Annotated[Response, Strict(False)] | None = None
+    """How light becomes spikes: integrate-and-fire of spike cameras, or bernoulli of single-photon cameras."""
     fov: float | None = Field(default=None, ge=1, le=170)
     """Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated."""
     intrinsics: PinholeText | None = None
@@ -131,6 +133,7 @@ class CameraOptions(BaseModel):
             mosaic=self.mosaic or base.mosaic,
             flipped=base.flipped if self.flipped is None else self.flipped,
             intrinsics=optics,
+            response=self.response or base.response,
         )
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from spiked.distortion import Distortion
 from spiked.errors import ConfigurationError
 
-__all__ = ["BitOrder", "Intrinsics", "Layout", "Mosaic", "Sensor"]
+__all__ = ["BitOrder", "Intrinsics", "Layout", "Mosaic", "Response", "Sensor"]
 
 Image = NDArray[np.float32]
 """Upright image [H, W] or [H, W, C] of rates, radiance or what is derived from them, float32."""
@@ -38,6 +38,16 @@ class BitOrder(StrEnum):
 
     LSB = "lsb"
     MSB = "msb"
+
+
+class Response(StrEnum):
+    """How light becomes spikes."""
+
+    INTEGRATE_AND_FIRE = "integrate-and-fire"
+    """Charge is gathered from frame to frame; a pixel fires when it reaches a threshold: spike cameras."""
+    BERNOULLI = "bernoulli"
+    """A pixel fires with p = 1 - exp(-flux), whatever it did before: single-photon cameras. `flux` is the number of
+    photons that it is expected to detect in a frame."""
 
 
 class Mosaic(StrEnum):
@@ -152,6 +162,7 @@ class Sensor:
     """Rows are stored bottom-up."""
     mosaic: Mosaic | None = None
     intrinsics: Intrinsics | None = None
+    response: Response = Response.INTEGRATE_AND_FIRE
 
     def __post_init__(self) -> None:
         if self.width <= 0 or self.height <= 0 or self.width % 8:

@@ -11,7 +11,7 @@ from spiked.errors import ConfigurationError
 from spiked.pose import Array
 from spiked.recon import report
 from spiked.recon.blas import one_blas_thread
-from spiked.recon.frontend.feature_tracks import Picture, picture, white_of
+from spiked.recon.frontend.feature_tracks import Picture, picture, smoothed, white_of
 from spiked.recon.frontend.mosaic_check import layout_warnings
 from spiked.recon.frontend.recorded_views import RecordedFrames, RecordedViews
 from spiked.recon.frontend.windowing import View, Windows, luminance
@@ -29,7 +29,7 @@ from spiked.recon.view_choice import choose
 from spiked.recon.view_store import ViewStore
 from spiked.render import Camera, rasteriser_for
 from spiked.scene import Scene
-from spiked.sensor import Image, Intrinsics, Sensor
+from spiked.sensor import Image, Intrinsics, Response, Sensor
 from spiked.spline import Path, Waypoints
 from spiked.trajectory import Trajectory
 
@@ -216,6 +216,8 @@ class Reconstructor:
         """The image [H, W] of a view that tracks are followed in, uint8."""
         sharp = view.sharp
         grey = luminance(view.preview_rate(self._preview), self.sensor.mosaic) if sharp is None else sharp
+        if self.sensor.response is Response.BERNOULLI:
+            grey = smoothed(grey, float(np.median(view.deviation)))
         return picture(grey, white_of(grey))
 
     def _warn(self, warning: str | None) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from spiked.camera import StoredCameraOptions
 from spiked.errors import RecordingError
-from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
+from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Response, Sensor
 
 DEFAULT_RATE_HZ = 20_000.0
 """Frame rate where neither sidecar nor options state one: that of both cameras."""
@@ -37,6 +37,8 @@ class RecordingGeometry:
     mosaic: Mosaic | None = None
     """Colour filter pattern of the upright image."""
     intrinsics: Intrinsics | None = None
+    response: Response | None = None
+    """How light becomes spikes."""
 
     @classmethod
     def of(cls, options: StoredCameraOptions) -> "RecordingGeometry":
@@ -50,6 +52,7 @@ class RecordingGeometry:
             options.flipped,
             options.mosaic,
             None if options.intrinsics is None else options.intrinsics.intrinsics(),
+            options.response,
         )
 
     def stated(self) -> dict[str, Any]:

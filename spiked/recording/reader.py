@@ -34,7 +34,7 @@ from spiked.recording.sidecar import (
     recorded_calibration,
     sidecar_path,
 )
-from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
+from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Response, Sensor
 
 REVERSED_BITS = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)[:, ::-1], axis=1)[:, 0]
 """Each byte with its bits reversed, uint8 [256]."""
@@ -175,12 +175,13 @@ def open_recording(
     flipped: bool | None = None,
     mosaic: Mosaic | None = None,
     intrinsics: Intrinsics | None = None,
+    response: Response | None = None,
 ) -> Recording:
     """Open a `.dat` file. Geometry comes from the arguments, else the sidecar or SpikeCV's config.yaml, else the size.
 
     Raises RecordingError with one line about the error in the file, its sidecar or the arguments.
     """
-    given = RecordingGeometry(width, height, frame_rate_hz, layout, bit_order, flipped, mosaic, intrinsics)
+    given = RecordingGeometry(width, height, frame_rate_hz, layout, bit_order, flipped, mosaic, intrinsics, response)
     recording = open_unchecked(Path(path), given)
     if recording.contradictions:
         raise RecordingError(f"{recording.path}: {recording.contradictions[0]}")

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, Stri
 from spiked.camera import Pinhole
 from spiked.errors import ConfigurationError, RecordingError
 from spiked.recording.geometry import Assumable
-from spiked.sensor import BitOrder, Layout, Mosaic, Sensor
+from spiked.sensor import BitOrder, Layout, Mosaic, Response, Sensor
 
 RESERVED_BYTES = 256 << 10
 """Disk space reserved for the final sidecar: enough for some thousand gaps."""
@@ -67,6 +67,10 @@ class Sidecar(BaseModel):
     cfa: Mosaic | None = None
     """Colour pattern of the upright image."""
     intrinsics: Pinhole | None = None
+    response: Response = Field(
+        Response.INTEGRATE_AND_FIRE, exclude_if=lambda value: value is Response.INTEGRATE_AND_FIRE
+    )
+    """How light becomes spikes."""
     pixel_centre: StrictFloat = Field(0.5, ge=0, le=0.5)
     """Coordinate of the first pixel's centre in the convention of the intrinsics."""
     note: str = ""
@@ -96,6 +100,7 @@ class Sidecar(BaseModel):
             flipped=sensor.flipped,
             cfa=sensor.mosaic,
             intrinsics=Pinhole.of(sensor.intrinsics),
+            response=sensor.response,
             **more,
         )
 
@@ -112,6 +117,7 @@ class Sidecar(BaseModel):
             self.flipped,
             self.cfa,
             None if k is None else replace(k.intrinsics(), cx=k.cx + shift, cy=k.cy + shift),
+            self.response,
         )
 
 

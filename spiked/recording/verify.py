@@ -13,7 +13,7 @@ from spiked.recording.geometry import RecordingGeometry, tags_agree
 from spiked.recording.index import index_path, read_index
 from spiked.recording.reader import Recording, open_unchecked
 from spiked.recording.recover import damaged_blocks
-from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic
+from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Response
 
 _CHUNK_BYTES = 4 << 20
 """Bytes read at a time."""
@@ -59,13 +59,14 @@ def verify(
     flipped: bool | None = None,
     mosaic: Mosaic | None = None,
     intrinsics: Intrinsics | None = None,
+    response: Response | None = None,
 ) -> Verification:
     """Check every frame of a recording. The arguments are those of `open_recording`.
 
     A file that contradicts its sidecar or has wrong row numbers is bad. Raises RecordingError for a file that cannot be
     read as a recording at all.
     """
-    given = RecordingGeometry(width, height, frame_rate_hz, layout, bit_order, flipped, mosaic, intrinsics)
+    given = RecordingGeometry(width, height, frame_rate_hz, layout, bit_order, flipped, mosaic, intrinsics, response)
     recording = open_unchecked(Path(path), given)
     scan = _scan(recording)
     sensor = recording.sensor

@@ -72,7 +72,7 @@ class RecordingWriter:
         sidecar = recovered.sidecar
         self = cls.__new__(cls)
         kept = {"format", "width", "height", "frame_rate", "frames", "bit_order", "flipped", "cfa", "intrinsics"}
-        kept |= {"pixel_centre", "gaps", "clock"}
+        kept |= {"response", "pixel_centre", "gaps", "clock"}
         more = {name: getattr(sidecar, name) for name in sidecar.model_fields_set - kept}
         self._prepare(Path(path), sidecar.sensor(), durability, more)
         self.frames = recovered.frames

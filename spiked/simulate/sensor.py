@@ -1,6 +1,7 @@
 """An integrate-and-fire sensor with the noise of a real one: radiance images in, packed binary frames out.
 
 The model is that of section E of the supplement of "3D Gaussian Splatting from Unposed Spike Streams" (CVPR 2026).
+A single-photon camera (`Response.BERNOULLI`) has no charge to keep: its pixels fire with p = 1 - exp(-flux).
 Charge is counted in nominal thresholds, so that one unit of charge is one spike. Each frame a pixel receives
 `q = gain * radiance + dark` plus shot noise of variance `q / electrons_a_spike`; when its charge reaches its
 threshold it fires and the threshold is subtracted, so no charge is lost between frames. A pixel that crosses its
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 import spiked.native._simulate as _simulate
 from spiked.errors import ConfigurationError
-from spiked.sensor import BitOrder, Image, Layout, Sensor
+from spiked.sensor import BitOrder, Image, Layout, Response, Sensor
 
 _BOLTZMANN_J_PER_K = 1.380649e-23
 """Exact by definition of the SI."""
@@ -207,6 +208,9 @@ class SpikeSensor:
         if out is None:
             out = np.empty((count, sensor.frame_bytes), np.uint8)
         frames = np.arange(self.next_frame, self.next_frame + count, dtype=np.int64)
+        if sensor.response is Response.BERNOULLI:
+            self._count_photons(first, last, weights, frames, out)
+            return out
         _simulate.expose(
             first=first,
             last=last,
@@ -229,3 +233,16 @@ class SpikeSensor:
         )
         self.next_frame += count
         return out
+
+    def _count_photons(
+        self, first: Image, last: Image, weights: Image, frames: NDArray[np.int64], out: NDArray[np.uint8]
+    ) -> None:
+        """As `expose`, for a pixel that fires with p = 1 - exp(-flux)."""
+        sensor, gains = self.sensor, self.lighting.gains(frames, self.sensor.frame_rate_hz)
+        for number, weight, gain, stored in zip(frames.tolist(), weights, gains, out, strict=True):
+            flux = self._gain * gain * (first + weight * (last - first)) + self._dark
+            drawn = np.random.default_rng([self._key, number]).random(flux.shape, np.float32)
+            fired = drawn < -np.expm1(-flux)
+            rows = fired[::-1] if sensor.flipped else fired
+            stored[:] = np.packbits(rows, axis=1, bitorder="little").ravel()
+        self.next_frame += len(frames)

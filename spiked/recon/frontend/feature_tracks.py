@@ -44,6 +44,8 @@ THUMBNAIL_SCALE = 0.25
 """Size of the images of `search` over the full size."""
 REACH_PX = 0.6
 """Largest forward-backward distance of a good track."""
+TRACKED_NOISE, MOST_BLUR_PX = 0.02, 2.5
+"""Noise of white photon images to which they are blurred, and how far at most, px (decision 27)."""
 NO_WARPS = np.zeros((0, 2, 2), np.float32)
 """Templates are used as they are."""
 
@@ -53,6 +55,14 @@ def picture(rate: NDArray[np.float32], white: float) -> Picture:
     out = np.empty(rate.shape, np.uint8)
     _spikes.picture(np.ascontiguousarray(rate, np.float32), white, out)
     return out
+
+
+def smoothed(rate: NDArray[np.float32], deviation: float) -> NDArray[np.float32]:
+    """Rates [H, W] with a white noise of this standard deviation, blurred so far that it becomes `TRACKED_NOISE` of
+    white: a Gaussian of s px divides it by 2 sqrt(pi) s."""
+    noise = deviation / white_of(rate)
+    sigma_px = min(max(noise / (TRACKED_NOISE * 2 * np.sqrt(np.pi)), 0.5), MOST_BLUR_PX)
+    return np.asarray(cv2.GaussianBlur(rate, (0, 0), sigma_px), np.float32)
 
 
 def white_of(rate: NDArray[np.float32]) -> float:

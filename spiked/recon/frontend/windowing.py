@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from spiked.blocks import Window, aligned_window
 from spiked.calibration import Calibration
 from spiked.recon.frontend.motion_compensation import BINOMIAL, MotionCompensator, drift, speed
+from spiked.recon.frontend.photon_counts import PhotonCounts
 from spiked.recon.frontend.spike_intervals import SpikeIntervals
-from spiked.sensor import Image, Mosaic, Sensor
+from spiked.sensor import Image, Mosaic, Response, Sensor
 
 SITE_SHARES = np.array([0.25, 0.5, 0.25], np.float32)
 """Share of the red, green and blue sites in a mosaic."""
@@ -31,6 +32,13 @@ PROBE_FRAMES = 16
 """Frames of the first motion estimate."""
 WINDOWS = (4, 8, 16, 32, 64)
 """Lengths of a view in frames (decision 2)."""
+PHOTON_WINDOWS = (32, 64, 128, 256)
+"""Lengths of a view of a single-photon camera in frames (decision 27)."""
+FIRST_PHOTON_WINDOW = 256
+"""Length of the first of these views, at most."""
+PHOTON_NOISE, PHOTON_MOTION_PX = 0.07, 4.0
+"""Noise of a pixel over twice the mean rate down to which such views are lengthened, and the motion in a view from which on
+they are not, or are shortened (decision 27)."""
 WARP_FRAMES = 12
 """Frames on either side of a view's middle that the map is fitted to where the motion is fast (decision 8)."""
 FIRST_WINDOW = 16
@@ -55,8 +63,8 @@ class View:
 
     begin: int
     end: int
-    intervals: SpikeIntervals
-    """The spikes between which each pixel's charge was measured."""
+    intervals: SpikeIntervals | PhotonCounts
+    """The spikes between which each pixel's charge was measured; how often it fired, of a single-photon camera."""
     spikes_a_pixel: float
     """Mean spike count of a pixel in the window."""
     calibration: Calibration | None = None
@@ -122,14 +130,17 @@ class View:
 
 def make_view(
     window: Window,
+    response: Response,
     after_gap: bool,
     calibration: Calibration | None = None,
     sharp: Image | None = None,
     first: int = 0,
     frames: NDArray[np.uint8] | None = None,
 ) -> View:
-    """The view of a spike-aligned window, in light instead of spikes where the camera is calibrated."""
-    intervals, count = SpikeIntervals.of(window), float(cv2.mean(window.count)[0])
+    """The view of a window, in light instead of spikes where the camera is calibrated."""
+    counted = response is Response.BERNOULLI
+    intervals = PhotonCounts.of(window) if counted else SpikeIntervals.of(window)
+    count = float(cv2.mean(window.count)[0])
     return View(window.begin, window.end, intervals, count, calibration, after_gap, sharp, first, frames)
 
 
@@ -141,8 +152,13 @@ class Windows:
 
     def __init__(self, sensor: Sensor, length: int | None, calibration: Calibration | None = None) -> None:
         """Raises CalibrationError when the calibration is of another sensor."""
-        self.sensor, self.length, self.sharpen = sensor, length or FIRST_WINDOW, False
-        self._follows, self._probed = length is None, length is not None
+        counted = sensor.response is Response.BERNOULLI
+        self._wanted = float(PHOTON_WINDOWS[1])
+        """Frames without which photons are too noisy."""
+        self.sensor, self.sharpen = sensor, False
+        self.length = length or (PHOTON_WINDOWS[1] if counted else FIRST_WINDOW)
+        # Frames of a single-photon camera are too noisy to tell their motion from.
+        self._follows, self._probed, self._sees_motion = length is None, length is not None, not counted
         self.spaced = False
         """Views lie up to `SPACING_PX` apart, and frames between them are left out."""
         self._spacing = 0
@@ -206,7 +222,7 @@ class Windows:
         length = min(self.length, len(frames))
         begin = first_frame + (len(frames) - length) // 2
         window = aligned_window(frames, self.sensor, first_frame, begin, begin + length)
-        view = make_view(window, self._gap, self._calibration)
+        view = make_view(window, self.sensor.response, self._gap, self._calibration)
         self._frames, self._first, self._next, self._gap = self._store[:0], stop, stop, False
         self._probed, self._compensator = True, None
         return view
@@ -223,9 +239,13 @@ class Windows:
         speed_px = motion_px / frames
         most = MOST_SPACING_S * self.sensor.frame_rate_hz
         self._spacing = int(min(SPACING_PX / speed_px, most)) if self.spaced else 0
-        self.sharpen = speed_px > FAST_PX[not self.sharpen]
+        self.sharpen = self._sees_motion and speed_px > FAST_PX[not self.sharpen]
         if self.sharpen:
             self.length = WINDOWS[0] if speed_px > FASTEST_PX[self.length > WINDOWS[0]] else WINDOWS[1]
+            return
+        if not self._sees_motion:
+            fitting = [n for n in PHOTON_WINDOWS if n <= self._wanted and n * speed_px <= PHOTON_MOTION_PX]
+            self.length = min(max([PHOTON_WINDOWS[0], *fitting]), 2 * self.length)
             return
         index = max(WINDOWS.index(self.length), 1)
         in_window = speed_px * self.length
@@ -237,6 +257,14 @@ class Windows:
 
     def _probe(self) -> None:
         """Estimate the motion of the first frames; only fast motion changes the view length."""
+        if not self._sees_motion:
+            fired = float(np.bitwise_count(self._frames[:PROBE_FRAMES]).mean()) / 8
+            self._wanted = _frames_wanted(fired)
+            self.length = max(
+                n for n in PHOTON_WINDOWS if n <= max(min(self._wanted, FIRST_PHOTON_WINDOW), PHOTON_WINDOWS[0])
+            )
+            self._probed = True
+            return
         speed_px = speed(self._frames[:PROBE_FRAMES], self.sensor)
         if speed_px > FAST_PX[1]:
             self.follow(speed_px, 1.0)
@@ -249,7 +277,7 @@ class Windows:
 
     def _shorten(self, begin: int) -> None:
         """Shorten a long view in which the camera starts to move: it would be blurred."""
-        while self._follows and not self.sharpen and self.length > FIRST_WINDOW:
+        while self._follows and self._sees_motion and not self.sharpen and self.length > FIRST_WINDOW:
             frames = self._frames[begin - self._first : begin - self._first + self.length]
             if drift(frames, self.sensor) < MOTION_ONSET_PX:
                 return
@@ -273,7 +301,10 @@ class Windows:
             if sharp is None and self.sharpen and final:
                 continue  # the motion after the last frame is unknown, and a blurred view is worse than none
             first, frames = self._around((begin + end) // 2, stop) if sharp is not None else (0, None)
-            yield make_view(window, self._gap, self._calibration, sharp, first, frames)
+            view = make_view(window, self.sensor.response, self._gap, self._calibration, sharp, first, frames)
+            if not self._sees_motion:
+                self._wanted = _frames_wanted(view.spikes_a_pixel / (end - begin))
+            yield view
             self._gap = False
         keep = max(self._first, min(self._next - SEARCH_FRAMES, stop))
         self._frames, self._first = self._frames[keep - self._first :], keep
@@ -292,6 +323,13 @@ class Windows:
             self._compensator = MotionCompensator(self.sensor, self.length)
         self._compensator.estimate(self._frames[: stop - self._first], self._first, time)
         return self._compensator.sharp(self._frames, self._first, time)
+
+
+def _frames_wanted(fired: float) -> float:
+    """Frames that bring the noise of pixels, which fire with this mean probability, down to `PHOTON_NOISE`."""
+    fired = min(max(fired, 1e-4), 0.999)
+    flux = -np.log(1 - fired)
+    return float(1.5 * fired / (1 - fired) / (2 * PHOTON_NOISE * flux) ** 2)
 
 
 def grey(image: Image) -> Image:

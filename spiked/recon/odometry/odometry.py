@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from spiked.evaluate import Similarity
 from spiked.pose import Array
 from spiked.recon.frontend.feature_tracks import Picture, Tracks
+from spiked.recon.frontend.photon_counts import PhotonCounts
 from spiked.recon.frontend.spike_intervals import SpikeIntervals
 from spiked.recon.frontend.track_timestamps import TrackTimestamps
 from spiked.recon.odometry.assessment import assess
@@ -181,7 +182,7 @@ class Odometry:
         length: int,
         picture: Picture,
         known: tuple[Array, Array] | None = None,
-        intervals: SpikeIntervals | None = None,
+        intervals: SpikeIntervals | PhotonCounts | None = None,
         after_gap: bool = False,
     ) -> TrackedView:
         """Track one view of `length` frames around `time` and estimate its pose.
@@ -228,7 +229,7 @@ class Odometry:
         time: float,
         length: int,
         picture: Picture,
-        intervals: SpikeIntervals | None,
+        intervals: SpikeIntervals | PhotonCounts | None,
         after_gap: bool,
     ) -> TrackedView:
         """Let the second map track a view, and search it for a place of this one."""
@@ -310,7 +311,12 @@ class Odometry:
             self._adjuster = self._tracker.adjuster = self._keyframes
 
     def _track(
-        self, time: float, length: int, picture: Picture, intervals: SpikeIntervals | None, after_gap: bool
+        self,
+        time: float,
+        length: int,
+        picture: Picture,
+        intervals: SpikeIntervals | PhotonCounts | None,
+        after_gap: bool,
     ) -> TrackedView:
         """Append a view with its tracks, moved to its time."""
         number = len(self.views)

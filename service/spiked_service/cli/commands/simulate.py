@@ -11,7 +11,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from spiked.errors import ConfigurationError
 from spiked.render.cpu import usable_cores
-from spiked.sensor import Mosaic, Sensor
+from spiked.sensor import Mosaic, Response, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
 from spiked.simulate.camera import DEFAULT_GAIN, LONG_FRAMES, LONG_STEP_PX, default_step_px
 from spiked.simulate.record import camera_of_files
@@ -40,6 +40,9 @@ def simulate(
     height: Annotated[int, typer.Option(help="Height in pixels.")] = 250,
     rate: Annotated[float, typer.Option(help="Frame rate in Hz.")] = 20_000.0,
     mosaic: Annotated[Mosaic | None, typer.Option(help="Colour mosaic of the upright image. Default: grey.")] = None,
+    response: Annotated[
+        Response, typer.Option(help="How light becomes spikes; bernoulli: a single-photon camera.")
+    ] = Response.INTEGRATE_AND_FIRE,
     fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees. Default: 60.")] = None,
     intrinsics: Annotated[str | None, typer.Option(help="fx,fy,cx,cy in pixels.", metavar="FX,FY,CX,CY")] = None,
     distortion: DistortionText = None,
@@ -74,7 +77,7 @@ def simulate(
     - `spiked simulate -o walk --scene flat.ply --poses walk.tum --fov 60 --frames 200000 --views 40`
     """
     outputs.try_folder("--out", out)
-    sensor = Sensor(width, height, rate, mosaic=mosaic)
+    sensor = Sensor(width, height, rate, mosaic=mosaic, response=response)
     if intrinsics is None and fov is None:
         fov = _FOV_DEG
     sensor = with_optics(sensor, fov, intrinsics, distortion)

@@ -520,6 +520,15 @@ class ReloadedOut(BaseModel):
     ]
 
 
+class Response(StrEnum):
+    """
+    How light becomes spikes.
+    """
+
+    integrate_and_fire = "integrate-and-fire"
+    bernoulli = "bernoulli"
+
+
 class SceneFormat(StrEnum):
     """
     How a scene is written.
@@ -808,6 +817,7 @@ class UploadSidecar(BaseModel):
     flipped: bool
     cfa: Mosaic | None = None
     intrinsics: Pinhole | None = None
+    response: Response = Response.integrate_and_fire
     pixel_centre: float = 0.5
     note: str = ""
     first_frame: int = 0
@@ -1119,6 +1129,12 @@ class ProfileModel(BaseModel):
         Field(description="Colour mosaic of the upright image; none: a grey sensor."),
     ] = None
     flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
+    response: Annotated[
+        Response | None,
+        Field(
+            description="How light becomes spikes: integrate-and-fire of spike cameras, or bernoulli of single-photon cameras."
+        ),
+    ] = None
     fov: Annotated[
         float | None,
         Field(
@@ -1390,6 +1406,12 @@ class StatedCameraModel(BaseModel):
         Field(description="Colour mosaic of the upright image; none: a grey sensor."),
     ] = None
     flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
+    response: Annotated[
+        Response | None,
+        Field(
+            description="How light becomes spikes: integrate-and-fire of spike cameras, or bernoulli of single-photon cameras."
+        ),
+    ] = None
     fov: Annotated[
         float | None,
         Field(
@@ -1581,6 +1603,12 @@ class GeometryModel(BaseModel):
         Field(description="Colour mosaic of the upright image; none: a grey sensor."),
     ] = None
     flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
+    response: Annotated[
+        Response | None,
+        Field(
+            description="How light becomes spikes: integrate-and-fire of spike cameras, or bernoulli of single-photon cameras."
+        ),
+    ] = None
     fov: Annotated[
         float | None,
         Field(

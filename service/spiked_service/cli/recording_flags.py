@@ -15,7 +15,7 @@ from spiked.distortion import Distortion
 from spiked.errors import ConfigurationError
 from spiked.profile import CameraProfile
 from spiked.recording import Recording, RecordingGeometry, open_recording, recorded_calibration, sidecar_path
-from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
+from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Response, Sensor
 
 _PANEL = "Geometry of a recording without a sidecar"
 
@@ -47,6 +47,7 @@ FrameLayout = Annotated[
 ]
 Bits = Annotated[BitOrder | None, _flag("bit_order", "--bit-order")]
 Flipped = Annotated[bool | None, _flag("flipped", "--flipped/--upright")]
+SensorResponse = Annotated[Response | None, _flag("response", "--response")]
 Colours = Annotated[Mosaic | None, _flag("mosaic", "--mosaic")]
 
 
@@ -133,6 +134,7 @@ _FIELDS = {
     "bit_order": "bit_order",
     "flipped": "flipped",
     "mosaic": "mosaic",
+    "response": "response",
 }
 """Options of a camera, and the fields of `RecordingGeometry`."""
 

@@ -17,7 +17,7 @@ from spiked.errors import ConfigurationError, RecordingError
 from spiked.recording import ClockPair, Gap, Recording, RecordingGeometry, open_recording, read_sidecar, sidecar_path
 from spiked.recording.arrays import SpikeArray, is_array, open_array, open_bits
 from spiked.recording.geometry import DEFAULT_RATE_HZ, Assumable
-from spiked.sensor import Layout, Sensor
+from spiked.sensor import Layout, Response, Sensor
 
 _BLOCK_BYTES = 1 << 20
 """Bytes read at a time."""
@@ -113,12 +113,16 @@ def _array_content(found: SpikeArray, given: RecordingGeometry, warn: Warn, flip
         warn(f"{left_out} of {found.columns} columns are left out: a recording has a multiple of 8")
     if found.trailing_bytes:
         warn(f"the last {found.trailing_bytes} bytes are less than a frame and are left out")
+    is_cube = found.packed is not None and not flipped
+    if is_cube and given.response is None:
+        warn(f"a photon cube: its response is taken as {Response.BERNOULLI}; of a spike camera state another")
     sensor = Sensor(
         found.width,
         found.height,
         given.frame_rate_hz or DEFAULT_RATE_HZ,
         flipped=flipped if given.flipped is None else given.flipped,
         mosaic=given.mosaic,
+        response=given.response or (Response.BERNOULLI if is_cube else Response.INTEGRATE_AND_FIRE),
     )
     return Content(sensor, found.blocks(), {}, found.frames, assumed=given.unstated(("frame_rate", "flipped")))
 
@@ -153,7 +157,14 @@ def _wire_sensor(given: RecordingGeometry, width: int, height: int) -> Sensor:
             "bit order, or give the form of the file"
         )
     flipped = True if given.flipped is None else given.flipped
-    return Sensor(width, height, given.frame_rate_hz or DEFAULT_RATE_HZ, flipped=flipped, mosaic=given.mosaic)
+    return Sensor(
+        width,
+        height,
+        given.frame_rate_hz or DEFAULT_RATE_HZ,
+        flipped=flipped,
+        mosaic=given.mosaic,
+        response=given.response or Response.INTEGRATE_AND_FIRE,
+    )
 
 
 def _wire_content(

@@ -1,12 +1,15 @@
 """Options of the map."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from spiked.recon.mapping.densification import DensifyStrategy
 from spiked.recon.mapping.loss import RateLoss, WarpedChargeLoss
 from spiked.recon.mapping.pruning import Pruning
 from spiked.recon.mapping.schedule import Schedule
 from spiked.recon.mapping.seeding import Seeding
+
+PHOTON_SPLATS = 0.375
+"""Splats of a map made of photon counts, over those of one made of spikes (decision 27)."""
 
 
 @dataclass(frozen=True)
@@ -52,3 +55,8 @@ class MapOptions:
     """Which splats are removed."""
     schedule: Schedule = field(default_factory=Schedule)
     """What happens when in a refinement."""
+
+    def for_photons(self) -> "MapOptions":
+        """Of a single-photon camera: structural similarity with so noisy images would fit their noise, and fewer splats
+        leave less of it (decision 27)."""
+        return replace(self, ssim=0.0, splats_a_pixel=PHOTON_SPLATS * self.splats_a_pixel)

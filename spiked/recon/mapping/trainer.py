@@ -15,7 +15,7 @@ from spiked.recon.mapping.render_requests import RenderPlanner
 from spiked.recon.mapping.seeding import SweptView
 from spiked.recon.view_store import ViewStore
 from spiked.render import Camera
-from spiked.sensor import LEAST_DEPTH, Image, Intrinsics, Sensor
+from spiked.sensor import LEAST_DEPTH, Image, Intrinsics, Response, Sensor
 from spiked.spline import Path, Waypoints
 from spiked.undistortion import Undistortion, widest_undistortion
 
@@ -45,7 +45,7 @@ class MapTrainer:
         assert sensor.intrinsics is not None
         self.sensor = sensor
         self.views = views
-        self.options = options
+        self.options = options.for_photons() if sensor.response is Response.BERNOULLI else options
         self.version = 0
         """Increases when the map changes."""
         self._seed, self._threads, self._calibration = seed, threads, calibration

@@ -51,6 +51,7 @@ def convert(
     bit_order: g.Bits = None,
     flipped: g.Flipped = None,
     mosaic: g.Colours = None,
+    response: g.SensorResponse = None,
 ) -> None:
     """Convert between recordings (compact, row_tagged) and raw camera bytes (usb 400x250, pcie 1000x1000).
 
@@ -74,7 +75,7 @@ def convert(
     - `spiked convert vidar.dat rec.dat --from bits --width 346 --height 260`
     """
     outputs.try_file("OUT", out)
-    given = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic)
+    given = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic, response=response)
     content = read_content(source, source_form, given, report_warning, array)
     for question in orientation_questions(content.assumed, content.sensor):
         report_warning(question)

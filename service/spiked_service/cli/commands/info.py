@@ -9,6 +9,7 @@ import typer
 from spiked.recon.frontend.mosaic_check import recorded_layout_warnings
 from spiked.recording import Recording, RecordingGeometry
 from spiked.recording.time_base import MeasuredRate, measured_rate
+from spiked.sensor import Response
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import output, report_warning
 
@@ -25,6 +26,7 @@ def info(
     bit_order: g.Bits = None,
     flipped: g.Flipped = None,
     mosaic: g.Colours = None,
+    response: g.SensorResponse = None,
     profile: g.Profile = None,
 ) -> None:
     """Print geometry, length, spike rate and gaps of a recording, and the origin of the geometry.
@@ -35,7 +37,7 @@ def info(
 
     - `spiked info rec.dat --width 640 --height 360 --rate 40000 --mosaic BGGR`
     """
-    stated = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic)
+    stated = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic, response=response)
     recording = g.open_described(file, stated, profile).recording
     for warning in recording.warnings:
         report_warning(warning)
@@ -62,6 +64,7 @@ def rows(recording: Recording) -> list[tuple[str, str]]:
         ("file", str(recording.path)),
         ("geometry", f"{sensor.width}x{sensor.height}, {recording.origin.sentence}"),
         ("layout", f"{sensor.layout}, rows {order}, {sensor.bit_order} first, {sensor.frame_bytes} bytes a frame"),
+        *([] if sensor.response is Response.INTEGRATE_AND_FIRE else [("response", str(sensor.response))]),
         ("colour", str(sensor.mosaic) if sensor.mosaic else "grey"),
         ("frames", f"{recording.frames} at {sensor.frame_rate_hz:g} Hz, {seconds:.4f} s"),
         *([] if measured is None else [("clock", _clock(measured, sensor.frame_rate_hz))]),

@@ -40,6 +40,7 @@ def localise(
     bit_order: g.Bits = None,
     flipped: g.Flipped = None,
     mosaic: g.Colours = None,
+    response: g.SensorResponse = None,
     profile: g.Profile = None,
     calibration: g.CalibrationFile = None,
 ) -> None:
@@ -60,7 +61,7 @@ def localise(
     if json_out is not None:
         outputs.try_file("--json", json_out)
     known = MapFolder.read(map_folder)
-    stated = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic)
+    stated = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic, response=response)
     described = g.open_described(file, stated, profile)
     recording = described.recording
     measured = g.read_calibration(calibration, described)

@@ -93,6 +93,7 @@ def reconstruct(
     bit_order: g.Bits = None,
     flipped: g.Flipped = None,
     mosaic: g.ColoursOrAuto = None,
+    response: g.SensorResponse = None,
     profile: g.Profile = None,
     calibration: g.CalibrationFile = None,
 ) -> None:
@@ -132,7 +133,7 @@ def reconstruct(
         _check_map(map, out)
     colours = None if mosaic in (None, g.MosaicChoice.AUTO) else Mosaic(mosaic)
     described = g.open_described(
-        file, RecordingGeometry(width, height, rate, layout, bit_order, flipped, colours), profile
+        file, RecordingGeometry(width, height, rate, layout, bit_order, flipped, colours, response=response), profile
     )
     recording = described.recording
     for warning in recording.warnings:

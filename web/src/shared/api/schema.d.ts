@@ -1864,6 +1864,8 @@ export interface components {
              * @description Rows come bottom-up; false: top-down.
              */
             flipped?: boolean | null;
+            /** @description How light becomes spikes: integrate-and-fire of spike cameras, or bernoulli of single-photon cameras. */
+            response?: components["schemas"]["Response"] | null;
             /**
              * Fov
              * @description Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated.
@@ -2401,6 +2403,8 @@ export interface components {
              * @description Rows come bottom-up; false: top-down.
              */
             flipped?: boolean | null;
+            /** @description How light becomes spikes: integrate-and-fire of spike cameras, or bernoulli of single-photon cameras. */
+            response?: components["schemas"]["Response"] | null;
             /**
              * Fov
              * @description Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated.
@@ -2778,6 +2782,12 @@ export interface components {
             needs_restart: string[];
         };
         /**
+         * Response
+         * @description How light becomes spikes.
+         * @enum {string}
+         */
+        Response: "integrate-and-fire" | "bernoulli";
+        /**
          * RestartRequest
          * @description Begin a reconstruction anew, with other options if they are given.
          * @example {
@@ -2958,6 +2968,8 @@ export interface components {
              * @description Rows come bottom-up; false: top-down.
              */
             flipped?: boolean | null;
+            /** @description How light becomes spikes: integrate-and-fire of spike cameras, or bernoulli of single-photon cameras. */
+            response?: components["schemas"]["Response"] | null;
             /**
              * Fov
              * @description Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated.
@@ -3250,6 +3262,8 @@ export interface components {
             flipped: boolean;
             cfa?: components["schemas"]["Mosaic"] | null;
             intrinsics?: components["schemas"]["Pinhole"] | null;
+            /** @default integrate-and-fire */
+            response?: components["schemas"]["Response"];
             /**
              * Pixel Centre
              * @default 0.5

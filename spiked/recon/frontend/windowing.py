@@ -37,8 +37,8 @@ PHOTON_WINDOWS = (32, 64, 128, 256)
 FIRST_PHOTON_WINDOW = 256
 """Length of the first of these views, at most."""
 PHOTON_NOISE, PHOTON_MOTION_PX = 0.07, 4.0
-"""Noise of a pixel over twice the mean rate down to which such views are lengthened, and the motion in a view from which
-on they are not, or are shortened (decision 27)."""
+"""Noise of a pixel over twice the mean rate down to which such views are lengthened, and the motion in one above which
+they are not, or are shortened (decision 27)."""
 WARP_FRAMES = 12
 """Frames on either side of a view's middle that the map is fitted to where the motion is fast (decision 8)."""
 FIRST_WINDOW = 16

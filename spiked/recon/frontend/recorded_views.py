@@ -75,7 +75,7 @@ def build_view(
     window = aligned_window(frames, sensor, of.first, of.begin, of.end)
     image = _sharp(of, frames, sensor) if sharp and warped is not None else None
     first = 0 if of.warped is None else of.warped[0]
-    return make_view(window, sensor.response, of.after_gap, calibration, image, first, warped)
+    return make_view(window, of.after_gap, calibration, image, first, warped, sensor.response)
 
 
 def _sharp(of: ViewFrames, frames: NDArray[np.uint8], sensor: Sensor) -> Image | None:

@@ -130,12 +130,12 @@ class View:
 
 def make_view(
     window: Window,
-    response: Response,
     after_gap: bool,
     calibration: Calibration | None = None,
     sharp: Image | None = None,
     first: int = 0,
     frames: NDArray[np.uint8] | None = None,
+    response: Response = Response.INTEGRATE_AND_FIRE,
 ) -> View:
     """The view of a window, in light instead of spikes where the camera is calibrated."""
     counted = response is Response.BERNOULLI
@@ -222,7 +222,7 @@ class Windows:
         length = min(self.length, len(frames))
         begin = first_frame + (len(frames) - length) // 2
         window = aligned_window(frames, self.sensor, first_frame, begin, begin + length)
-        view = make_view(window, self.sensor.response, self._gap, self._calibration)
+        view = make_view(window, self._gap, self._calibration, response=self.sensor.response)
         self._frames, self._first, self._next, self._gap = self._store[:0], stop, stop, False
         self._probed, self._compensator = True, None
         return view
@@ -301,7 +301,7 @@ class Windows:
             if sharp is None and self.sharpen and final:
                 continue  # the motion after the last frame is unknown, and a blurred view is worse than none
             first, frames = self._around((begin + end) // 2, stop) if sharp is not None else (0, None)
-            view = make_view(window, self.sensor.response, self._gap, self._calibration, sharp, first, frames)
+            view = make_view(window, self._gap, self._calibration, sharp, first, frames, self.sensor.response)
             if not self._sees_motion:
                 self._wanted = _frames_wanted(view.spikes_a_pixel / (end - begin))
             yield view

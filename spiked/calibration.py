@@ -10,16 +10,46 @@ from numpy.typing import NDArray
 from spiked.blocks import aligned_window
 from spiked.errors import CalibrationError
 from spiked.recording import Recording
-from spiked.sensor import Image, Sensor
+from spiked.sensor import Image, Response, Sensor
 
-__all__ = ["Calibration", "mean_rate"]
+__all__ = ["Calibration", "CalibrationSummary", "mean_rate"]
 
-LONGEST_FRAMES = 60_000
-"""Frames of a recording that are used: offsets have 16 bits."""
+LEAST_FRAMES, LONGEST_FRAMES = 200, 60_000
+"""Frames that a recording needs, and of which no more are used."""
+READ_FRAMES = 1024
+"""Frames that are counted at once."""
 HOT_SHARE = 0.2
 """A pixel is hot if its dark rate exceeds this share of the even light's median rate."""
+HOT_RATE = 0.04
+"""The same without an even light, spikes a frame: the share of a light at which pixels fire every fifth frame."""
+DARK, ALIKE = 0.02, 0.5
+"""Median rate, spikes a frame, up to which a recording counts as dark by itself; above it, the correlation of pixels
+that are two apart has to be less than this: dark currents of pixels are independent, light is not."""
+BRIGHTEST = {Response.INTEGRATE_AND_FIRE: 0.95, Response.BERNOULLI: 3.0}
+"""Largest median rate of an even light: above it pixels fire in nearly every frame."""
 GAIN_LIMITS = (0.2, 4.0)
 """Pixels whose gain relative to the median lies outside are dead, or stuck."""
+
+
+@dataclass(frozen=True)
+class CalibrationSummary:
+    """Figures of a calibration."""
+
+    gain_spread: float
+    """Standard deviation of the logarithm of good pixels' gains: 0.01 is 1 %."""
+    dark_rate: float
+    """Median over the pixels, spikes a frame."""
+    useless: int
+    """Pixels to leave out: dead, stuck or hot."""
+    pixels: int
+    """Of the sensor."""
+
+    def __str__(self) -> str:
+        """As a sentence without its full stop."""
+        return (
+            f"gains differ by {100 * self.gain_spread:.1f} % (standard deviation), dark rate {self.dark_rate:.4f} "
+            f"spikes a frame, {self.useless} of {self.pixels} pixels dead or hot"
+        )
 
 
 @dataclass(frozen=True)
@@ -81,38 +111,110 @@ class Calibration:
         return cls(gain.astype(np.float32), dark.astype(np.float32), dead.astype(bool))
 
     @classmethod
-    def measure(cls, flat: Recording, dark: Recording | None) -> "Calibration":
-        """From a recording of an even light and one with the cap on. Raises CalibrationError for unsuitable ones."""
-        light = mean_rate(flat)
-        sensor = flat.sensor
-        if dark is not None and (dark.sensor.width, dark.sensor.height) != (sensor.width, sensor.height):
+    def measure(
+        cls, flat: Recording | None, dark: Recording | None, before: "Calibration | None" = None
+    ) -> "Calibration":
+        """From a recording of an even light, one with the lens covered, or both. Raises CalibrationError.
+
+        What a recording that is not given would say is taken from `before`: without it gains are 1, dark rates 0.
+        """
+        if flat is None and dark is None:
+            raise CalibrationError("a calibration needs a recording of an even light, one in the dark, or both")
+        if flat is not None and dark is not None and _size(dark) != _size(flat):
             raise CalibrationError(
                 f"{dark.path} is of {dark.sensor.width}x{dark.sensor.height} pixels and {flat.path} of "
-                f"{sensor.width}x{sensor.height}: they must be of one camera"
+                f"{flat.sensor.width}x{flat.sensor.height}: they must be of one camera"
             )
-        offset = np.zeros_like(light) if dark is None else mean_rate(dark)
-        net = light - offset
-        typical = _typical(net, sensor)
+        for recording in (flat, dark):
+            if before is not None and recording is not None:
+                before.check(recording.sensor)
+        light = None if flat is None else mean_rate(flat)
+        if dark is not None:
+            offset = _dark_rate(dark, light)
+        elif before is not None:
+            offset = before.dark
+        else:
+            offset = np.zeros_like(light) if light is not None else np.empty(0, np.float32)
+        if flat is not None and light is not None:
+            return cls._of_light(flat, light, offset)
+        hot = offset > HOT_RATE
+        if before is None:
+            return cls(np.ones_like(offset), offset, hot)
+        return cls(before.gain, offset, before.dead | hot)
+
+    @classmethod
+    def _of_light(cls, flat: Recording, light: Image, offset: Image) -> "Calibration":
+        """From the rates [H, W] in an even light and in the dark."""
         if float(np.median(light)) < 0.005:
             raise CalibrationError(f"{flat.path} is too dark for a calibration: its median rate is below 0.005")
-        if float(np.median(light)) > 0.95:
+        if float(np.median(light)) > BRIGHTEST[flat.sensor.response]:
             raise CalibrationError(f"{flat.path} is saturated: use less light, pixels should fire every 2 to 20 frames")
-        if dark is not None and float(np.median(offset)) > 0.5 * float(np.median(light)):
-            raise CalibrationError(f"{dark.path} is not dark: it is more than half as bright as {flat.path}")
-        gain = net / typical
+        net = light - offset
+        gain = net / _typical(net, flat.sensor)
         dead = (gain < GAIN_LIMITS[0]) | (gain > GAIN_LIMITS[1]) | (offset > HOT_SHARE * float(np.median(light)))
         gain = np.where(dead, 1, gain)
         gain[~dead] /= np.exp(np.log(gain[~dead]).mean())
         return cls(gain.astype(np.float32), offset.astype(np.float32), dead)
 
+    def summary(self) -> CalibrationSummary:
+        """Its figures."""
+        good = ~self.dead
+        spread = float(np.std(np.log(self.gain[good]))) if good.any() else 0.0
+        return CalibrationSummary(spread, float(np.median(self.dark)), int(self.dead.sum()), self.dead.size)
+
 
 def mean_rate(recording: Recording) -> Image:
-    """Spikes a frame of each pixel over a recording, [H, W], from the charge between its first and last spike."""
-    frames = min(recording.frames, LONGEST_FRAMES)
-    if frames < 200:
-        raise CalibrationError(f"{recording.path} has {frames} frames: a calibration needs 200 or more, better 10,000")
-    window = aligned_window(recording.read(0, frames), recording.sensor, 0, 0, frames)
-    return np.where(window.valid, window.rate(fill=True), window.count / np.float32(frames)).astype(np.float32)
+    """Light of each pixel over a recording, [H, W]: spikes a frame, or photons a frame of a single-photon camera.
+
+    Spikes are counted between a pixel's first and last one, so that the rate has no error of a half spike.
+    """
+    frames, sensor = min(recording.frames, LONGEST_FRAMES), recording.sensor
+    if frames < LEAST_FRAMES:
+        raise CalibrationError(
+            f"{recording.path} has {frames} frames: a calibration needs {LEAST_FRAMES} or more, better 10,000"
+        )
+    count, first, last = (np.zeros((sensor.height, sensor.width), np.int32) for _ in range(3))
+    for begin in range(0, frames, READ_FRAMES):
+        length = min(READ_FRAMES, frames - begin)
+        window = aligned_window(recording.read(begin, length), sensor, begin, begin, begin + length)
+        fired = window.count > 0
+        np.copyto(first, window.start_offset.astype(np.int32) + begin, where=fired & (count == 0))
+        np.copyto(last, window.stop_offset.astype(np.int32) + begin, where=fired)
+        count += window.count
+    if sensor.response is Response.BERNOULLI:
+        return np.asarray(-np.log((frames - count + 0.5) / (frames + 0.5)), np.float32)
+    rate = np.asarray(count / frames, np.float32)
+    np.divide(count - 1, last - first, out=rate, where=count > 1, dtype=np.float32)
+    return rate
+
+
+def _size(recording: Recording) -> tuple[int, int]:
+    return recording.sensor.width, recording.sensor.height
+
+
+def _dark_rate(dark: Recording, light: Image | None) -> Image:
+    """Rates [H, W] with the lens covered. Raises CalibrationError if it was not."""
+    rate = mean_rate(dark)
+    typical = float(np.median(rate))
+    if light is None:
+        if typical > DARK and _likeness(rate) > ALIKE:
+            raise CalibrationError(
+                f"{dark.path} is not dark: pixels fire {typical:.3f} times a frame, and their neighbours do alike; "
+                "cover the lens"
+            )
+    elif typical > 0.5 * float(np.median(light)):
+        raise CalibrationError(f"{dark.path} is not dark: it is more than half as bright as the even light")
+    return rate
+
+
+def _likeness(rate: Image) -> float:
+    """Correlation of pixels that are two apart, which have one colour on a mosaic; outliers are clipped."""
+    low, high = np.percentile(rate, [5, 95])
+    clipped = np.clip(rate, low, high)
+    if float(np.std(clipped)) == 0 or min(rate.shape) < 4:
+        return 0.0
+    pairs = ((clipped[:, 2:], clipped[:, :-2]), (clipped[2:], clipped[:-2]))
+    return float(np.mean([np.corrcoef(a.ravel(), b.ravel())[0, 1] for a, b in pairs]))
 
 
 def around(image: Image, good: NDArray[np.bool_]) -> Image:

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spiked.calibration import Calibration, around
+from spiked.calibration import Calibration, around, mean_rate
 from spiked.errors import CalibrationError
 from spiked.recording import Recording, RecordingWriter, open_recording
-from spiked.sensor import Sensor
+from spiked.sensor import Response, Sensor
 from spiked.simulate import PixelMaps, SensorNoise
 from spiked.simulate.sensor import SpikeSensor
 
@@ -96,3 +96,48 @@ def test_a_missing_pixel_takes_the_mean_of_the_nearest_good_ones() -> None:
     good[2, 2] = False
     image[2, 2] = 1e6
     np.testing.assert_allclose(around(image, good)[2, 2], 12.0)
+
+
+def test_a_dark_recording_alone_gives_dark_rates_and_hot_pixels(tmp_path: Path) -> None:
+    pixels = uneven()
+    dark = record(tmp_path / "dark.dat", pixels, 0.0)
+    measured = Calibration.measure(None, dark)
+    assert (measured.gain == 1).all()
+    np.testing.assert_array_equal(measured.dead, pixels.dark > 0.1)
+    assert np.abs(measured.dark - pixels.dark / pixels.threshold)[pixels.gain > 0].max() < 0.001
+
+
+def test_a_new_dark_frame_keeps_the_gains_of_before_and_the_other_way_round(tmp_path: Path) -> None:
+    pixels = uneven()
+    flat, dark = record(tmp_path / "flat.dat", pixels, 0.2), record(tmp_path / "dark.dat", pixels, 0.0)
+    both = Calibration.measure(flat, dark)
+    renewed = Calibration.measure(None, dark, Calibration.measure(flat, None))
+    assert float(np.abs(np.log(renewed.gain / both.gain))[~both.dead].max()) < 0.1
+    np.testing.assert_array_equal(renewed.dark, both.dark)
+    np.testing.assert_array_equal(Calibration.measure(flat, None, Calibration.measure(None, dark)).gain, both.gain)
+
+
+def test_a_lit_recording_is_not_taken_for_a_dark_one(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match="is not dark: pixels fire"):
+        Calibration.measure(None, record(tmp_path / "lit.dat", uneven(), 0.1))
+
+
+def test_a_camera_with_much_dark_current_can_be_calibrated(tmp_path: Path) -> None:
+    warm = SpikeSensor(SENSOR, 3, SensorNoise(dark=0.1, dark_spread=0.02))
+    measured = Calibration.measure(None, record(tmp_path / "dark.dat", warm, 0.0))
+    assert 0.09 < float(np.median(measured.dark)) < 0.11
+
+
+def test_a_calibration_needs_something_to_measure() -> None:
+    with pytest.raises(CalibrationError, match="an even light, one in the dark, or both"):
+        Calibration.measure(None, None)
+
+
+@pytest.mark.parametrize("flux", [0.05, 1.0])
+def test_photons_of_a_single_photon_camera_are_counted_by_its_response(tmp_path: Path, flux: float) -> None:
+    sensor = Sensor(64, 48, 97_000.0, response=Response.BERNOULLI)
+    frames = np.random.default_rng(1).random((6000, 48, 64)) < 1 - np.exp(-flux)
+    with RecordingWriter(tmp_path / "flat.dat", sensor) as writer:
+        writer.append(np.packbits(frames, axis=2, bitorder="little").reshape(6000, -1))
+    rate = mean_rate(open_recording(tmp_path / "flat.dat"))
+    assert float(rate.mean()) == pytest.approx(flux, rel=0.01)

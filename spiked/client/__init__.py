@@ -4,6 +4,7 @@ from spiked.client.client import Spiked
 from spiked.client.connection import ApiError, ServiceUnreachableError
 from spiked.client.events import Event
 from spiked.client.models import (
+    CalibratedOut,
     CaptureOut,
     CaptureRequest,
     CaptureState,
@@ -25,6 +26,7 @@ from spiked.client.models import (
 
 __all__ = [
     "ApiError",
+    "CalibratedOut",
     "CaptureOut",
     "CaptureRequest",
     "CaptureState",

@@ -16,6 +16,8 @@ from spiked.client.connection import ApiError, Connection, plain
 from spiked.client.events import Event, events_in
 from spiked.client.maps import MapMethods
 from spiked.client.models import (
+    CalibratedOut,
+    CalibrationRequest,
     CaptureOut,
     CapturePage,
     CaptureRequest,
@@ -88,6 +90,12 @@ class Spiked(MapMethods, ResultMethods):
     def set_profile(self, device: str, profile: ProfileModel) -> None:
         """Replace the camera profile of a device."""
         self._connection.request("PUT", f"devices/{quote(device, safe='')}/profile", json=plain(profile))
+
+    def calibrate(self, device: str, *, dark: str | None = None, flat: str | None = None) -> CalibratedOut:
+        """Measure gains and dark rates of a camera by captures in the dark and of an even light; one or both."""
+        body = plain(CalibrationRequest(dark=dark, flat=flat))
+        path = f"devices/{quote(device, safe='')}/profile:calibrate"
+        return CalibratedOut.model_validate(self._connection.request("POST", path, json=body).json())
 
     def options(self) -> dict[str, Any]:
         """JSON Schema of the options of a reconstruction."""

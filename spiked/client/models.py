@@ -31,6 +31,54 @@ class BitOrder(StrEnum):
     msb = "msb"
 
 
+class CalibrationOut(BaseModel):
+    """
+    Figures of a calibration.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    gain_spread: Annotated[
+        float,
+        Field(description="Standard deviation of the logarithm of good pixels' gains."),
+    ]
+    dark_rate: Annotated[
+        float,
+        Field(description="Spikes a frame without light, median over the pixels."),
+    ]
+    useless: Annotated[int, Field(description="Pixels that are left out: dead, stuck or hot.")]
+    pixels: Annotated[int, Field(description="Of the sensor.")]
+
+
+class CalibrationPicture(StrEnum):
+    """
+    What a picture of a calibration shows.
+    """
+
+    gain = "gain"
+    dark = "dark"
+    useless = "useless"
+
+
+class CalibrationRequest(BaseModel):
+    """
+    The captures to calibrate a camera by: one of them or both.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    dark: Annotated[
+        str | None,
+        Field(description="Capture with the lens covered: dark rates and hot pixels."),
+    ] = None
+    flat: Annotated[
+        str | None,
+        Field(description="Capture of an even light: gains and dead pixels."),
+    ] = None
+
+
 class CameraModel(BaseModel):
     """
     Where a camera is, camera to world, OpenCV axes: c2w, or position and quaternion_wxyz, or frame.
@@ -1487,6 +1535,19 @@ class ViewRequest(BaseModel):
             description="Value shown as white in all formats but EXR. If not given: for color the scene's own, for alpha 1, for depth the largest of the picture. The header X-White says what was used."
         ),
     ] = None
+
+
+class CalibratedOut(BaseModel):
+    """
+    The completed profile of a device, and what was measured.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    file: Annotated[str, Field(description="Its file in the folder `profiles` of the data folder.")]
+    profile: ProfileModel
+    measured: CalibrationOut
 
 
 class CaptureOut(BaseModel):

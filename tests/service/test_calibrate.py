@@ -12,6 +12,7 @@ from spiked.recording import RecordingWriter
 from spiked.sensor import Intrinsics, Mosaic, Sensor
 from spiked.simulate import MotionKind, SensorNoise, SimulatedCamera
 from spiked.simulate.sensor import SpikeSensor
+from tests.still_recordings import pixels, place, still
 
 SENSOR = Sensor(160, 96, 20000.0, intrinsics=Intrinsics.from_fov(160, 96, 60))
 
@@ -31,13 +32,13 @@ def record(path: Path, sensor: Sensor, frames: "np.ndarray") -> Path:
 def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of the sensor that the recordings below are made with."""
     folder = tmp_path_factory.mktemp("calibration")
-    pixels = SpikeSensor(SENSOR, 2, SensorNoise(dead_share=0.005))
+    sensor = SpikeSensor(SENSOR, 2, SensorNoise(dead_share=0.005))
     for name, light in (("flat", 0.2), ("dark", 0.0)):
         image = np.full((96, 160), light, np.float32)
-        record(folder / f"{name}.dat", SENSOR, pixels.expose(image, image, np.zeros(3000, np.float32)))
+        record(folder / f"{name}.dat", SENSOR, sensor.expose(image, image, np.zeros(3000, np.float32)))
     done = spiked("calibrate", folder / "flat.dat", "--dark", folder / "dark.dat", "-o", folder / "camera.npz")
     assert done.returncode == 0, done.stderr
-    dead = int((pixels.gain == 0).sum())
+    dead = int((sensor.gain == 0).sum())
     assert f"{dead} of 15360 pixels dead or hot" in done.stdout
     return folder / "camera.npz"
 
@@ -76,3 +77,71 @@ def test_a_wrong_mosaic_is_said_and_corrected_on_request(tmp_path: Path) -> None
     done = spiked("reconstruct", agreed, "-o", tmp_path / "agreed", "--steps", 20, "--mosaic", "auto")
     assert "the pixels agree with the stated mosaic: GRBG" in done.stderr
     assert json.loads((tmp_path / "agreed" / "report.json").read_text())["warnings"] == []
+
+
+def test_a_person_is_led_through_a_calibration(tmp_path: Path) -> None:
+    covered, wall = still(tmp_path / "dark.dat", SENSOR, 0), still(tmp_path / "wall.dat", SENSOR, 0.2)
+    scene = SimulatedCamera(SENSOR, 2, MotionKind.ARC)
+    lit = record(tmp_path / "scene.dat", SENSOR, scene.next_frames(600))
+    camera = tmp_path / "camera.dat"
+    place(camera, lit)
+    command = [sys.executable, "-m", "spiked_service", "calibrate", "--device", f"replay:{camera}", "--seconds", "0.02"]
+    command += ["-o", str(tmp_path / "c.npz"), "--write-profile", str(tmp_path / "profile.json")]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, **pipes) as wizard:
+        assert wizard.stdin is not None and wizard.stdout is not None and wizard.stderr is not None
+
+        def answer(text: str, until: str) -> None:
+            """Write a line, and read until the wizard has said something."""
+            wizard.stdin.write(f"{text}\n")
+            wizard.stdin.flush()
+            said = ""
+            while until not in said:
+                line = wizard.stderr.readline()
+                assert line, f"{until!r} was not said, but {said}"
+                said += line
+
+        assert "Cover the lens" in wizard.stderr.readline()
+        answer("", "is not dark")  # the lens was not covered
+        assert "Cover the lens" in wizard.stderr.readline()
+        place(camera, covered)
+        answer("", "Uncover it")
+        place(camera, wall)
+        out, told = wizard.communicate("\n")
+    assert wizard.returncode == 0, told
+    truth = pixels(SENSOR)
+    useless = int(((truth.gain == 0) | (truth.dark > 0.1)).sum())
+    assert f"{useless} of 15360 pixels dead or hot" in out
+    assert json.loads((tmp_path / "profile.json").read_text())["calibration"] == "c.npz"
+    assert [file.name for file in tmp_path.iterdir() if file.name.startswith(".")] == []
+
+
+def test_a_dark_recording_completes_a_calibration(tmp_path: Path) -> None:
+    wall, covered = still(tmp_path / "wall.dat", SENSOR, 0.2), still(tmp_path / "dark.dat", SENSOR, 0)
+    out = tmp_path / "c.npz"
+    assert spiked("calibrate", wall, "-o", out).returncode == 0
+    with np.load(out) as first:
+        gain, dead = first["gain"], first["dead"]
+    done = spiked("calibrate", "--dark", covered, "-o", out)
+    assert done.returncode == 0, done.stderr
+    with np.load(out) as second:
+        np.testing.assert_array_equal(second["gain"], gain)
+        assert second["dead"].sum() > dead.sum() and float(np.median(second["dark"])) > 0.001
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ((), "with one in the dark, or --device"),
+        (("--board", "9x6"), "--board needs a recording"),
+        (("--device", "sim:", "--dark", "x.dat"), "leave out recordings"),
+        (("--device", "sim:", "--rate", "20000"), "with the device"),
+        (("--device", "sim:"), "nobody answers"),
+        (("--device", "nothing:"), "nothing:"),
+    ],
+)
+def test_a_calibration_of_nothing_is_refused(tmp_path: Path, arguments: tuple[str, ...], told: str) -> None:
+    command = [sys.executable, "-m", "spiked_service", "calibrate", "-o", str(tmp_path / "c.npz"), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
+    assert done.returncode == 2 and told in done.stderr and "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []

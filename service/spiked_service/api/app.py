@@ -66,7 +66,7 @@ def _api(services: Services) -> APIRouter:
     results, views = services.results, services.views
     once = idempotent(services.idempotency_keys)
     api = APIRouter(prefix="/api/v1", dependencies=[Depends(authorise)])
-    api.include_router(device_routes(captures, services.sources, folder.profiles, once))
+    api.include_router(device_routes(captures, services.sources, folder, once))
     api.include_router(capture_routes(captures, services.sources, once))
     api.include_router(group_routes(captures, services.sources, once))
     api.include_router(recording_routes(captures, folder, once))

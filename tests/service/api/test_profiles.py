@@ -4,12 +4,15 @@ import time
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from spiked.calibration import Calibration
 from spiked.client import ApiError, ProfileModel, Spiked, StatedCameraModel
 from spiked.profile import CameraProfile
+from spiked.sensor import Sensor
+from tests.still_recordings import still
 
 DEVICE = "sim:"
 PATH = "devices/sim%3A/profile"
@@ -98,3 +101,64 @@ def test_a_profile_survives_a_restart(tmp_path: Path, daemon_class: Any) -> None
 def test_a_device_that_is_not_there_has_no_profile(service: Any) -> None:
     with pytest.raises(ApiError, match="there is no device"):
         service.client.profile("usb9")
+
+
+SENSOR = Sensor(96, 64, 20_000.0)
+
+
+def test_a_device_is_calibrated_by_captures(service: Any, folder: Path, tmp_path: Path) -> None:
+    client = service.client
+    dark, flat = (client.upload(still(tmp_path / f"{light}.dat", SENSOR, light)).id for light in (0, 0.2))
+    client.set_profile(DEVICE, ProfileModel(model="toy", width=96, height=64))
+    try:
+        assert service.http.get(f"{PATH}/calibration").status_code == 404
+        first = client.calibrate(DEVICE, dark=dark)
+        assert (first.profile.model, first.measured.gain_spread) == ("toy", 0.0)
+        assert 0 < first.measured.useless < 60 and 0.001 < first.measured.dark_rate < 0.003
+        both = client.calibrate(DEVICE, flat=flat)  # the dark rates of before stay
+        assert both.measured.dark_rate == first.measured.dark_rate
+        assert both.measured.useless > first.measured.useless and both.measured.gain_spread > 0.01
+        whole = Calibration.read(folder / str(both.profile.calibration))
+        flags = {
+            "useless": (whole.dead, 255, 255),
+            "dark": (whole.dark > 0.1, 200, 255),
+            "gain": (whole.dead, 127, 128),
+        }
+        for kind, (marked, least, most) in flags.items():
+            answer = service.http.get(f"{PATH}/calibration?kind={kind}")
+            picture = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_UNCHANGED)
+            assert picture is not None and picture.shape == (64, 96)
+            assert (picture[marked] >= least).all() and (picture[marked] <= most).all() and marked.any()
+            tag = {"if-none-match": answer.headers["etag"]}
+            assert service.http.get(f"{PATH}/calibration?kind={kind}", headers=tag).status_code == 304
+        taken = client.wait_for_capture(client.start_capture("sim:", frames=64, reconstruct=False).id, 60)
+        sidecar = service.http.get(f"captures/{taken.id}/recording/sidecar").json()
+        assert sidecar["calibration"] == "calibration.npz"
+    finally:
+        service.http.delete(PATH)
+        for file in folder.iterdir():
+            file.unlink()
+
+
+def test_what_cannot_calibrate_a_device_leaves_it_as_it_was(service: Any, folder: Path, tmp_path: Path) -> None:
+    client = service.client
+    flat = client.upload(still(tmp_path / "a.dat", SENSOR, 0.2)).id
+    other = client.upload(still(tmp_path / "b.dat", Sensor(64, 64, 20_000.0), 0)).id
+    scene = client.wait_for_capture(client.start_capture("sim:", frames=400, reconstruct=False).id, 60).id
+    client.set_profile(DEVICE, ProfileModel(model="before", width=96, height=64))
+    try:
+        for body, status, told in (
+            ({}, 422, "in the dark"),
+            ({"dark": None}, 422, "in the dark"),
+            ({"dark": 3}, 422, "dark"),
+            ({"dark": "nothing"}, 404, "nothing"),
+            ({"dark": scene}, 422, "is not dark"),
+            ({"dark": other, "flat": flat}, 422, "they must be of one camera"),
+            ({"dark": other}, 422, "96x64"),
+        ):
+            refused = service.http.post(f"{PATH}:calibrate", json=body)
+            assert refused.status_code == status and told in refused.text, refused.text
+        assert client.profile(DEVICE) == ProfileModel(model="before", width=96, height=64)
+        assert [file.name for file in folder.iterdir()] == ["sim%3A.json"]
+    finally:
+        service.http.delete(PATH)

@@ -4,23 +4,27 @@ import threading
 from dataclasses import asdict
 from http import HTTPStatus
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import fastapi
-from fastapi import APIRouter
+from fastapi import APIRouter, Request, Response
 from fastapi.routing import APIRoute
-from spiked_driver import open_camera
-from spiked_driver.source_kind import Device, SourceSpec
-from spiked_driver.spec import stored_profile
+from spiked_driver.source_kind import Device
 
-from spiked.camera import CameraFiles
+from spiked.calibration import Calibration
 from spiked.errors import SpikedError
-from spiked.profile import CameraProfile, profile_path
+from spiked.profile import CameraProfile
 from spiked.ring import DeviceState
+from spiked_service.api import files
 from spiked_service.api.idempotency import IdempotencyKey
 from spiked_service.api.problems import ConflictError, problems
+from spiked_service.api.routes.parameters import BINARY, NOT_MODIFIED
+from spiked_service.api.routes.recordings import closed_recording
 from spiked_service.api.schemas.captures import (
     ArmRequest,
+    CalibratedOut,
+    CalibrationOut,
+    CalibrationRequest,
     CapabilityOut,
     CountersOut,
     DeviceOut,
@@ -29,12 +33,14 @@ from spiked_service.api.schemas.captures import (
     ProfileOut,
 )
 from spiked_service.api.sources import Sources
-from spiked_service.base.ids import new_id
+from spiked_service.captures.camera_profiles import CameraProfiles
 from spiked_service.captures.captures import Captures
-from spiked_service.captures.sources import device_of, unpaced, with_options
+from spiked_service.captures.sources import device_of, unpaced
 from spiked_service.events.bus import Bus, Topic
 from spiked_service.events.logging import logger
+from spiked_service.results.calibration_picture import CalibrationPicture, calibration_picture
 from spiked_service.store.catalogue import UnknownIdError
+from spiked_service.store.folder import DataFolder
 
 DeviceId = Annotated[str, fastapi.Path(description="As `GET devices` names it, percent-encoded.", max_length=4096)]
 
@@ -43,7 +49,14 @@ _LOOK_S = 2.0
 _log = logger("spiked.devices")
 
 
-def device_routes(captures: Captures, sources: Sources, profiles: Path, route_class: type[APIRoute]) -> APIRouter:
+_CALIBRATION: dict[int | str, dict[str, Any]] = {
+    200: {"description": "The picture.", "content": {"image/png": BINARY}},
+    **NOT_MODIFIED,
+    **problems(404),
+}
+
+
+def device_routes(captures: Captures, sources: Sources, folder: DataFolder, route_class: type[APIRoute]) -> APIRouter:
     """Routes below `devices`."""
     router = APIRouter(prefix="/devices", tags=["devices"], route_class=route_class)
 
@@ -70,7 +83,7 @@ def device_routes(captures: Captures, sources: Sources, profiles: Path, route_cl
         captures.disarm(unpaced(device.source))
         return shown(captures, device)
 
-    _add_profile_routes(router, sources, profiles)
+    _add_profile_routes(router, sources, captures, folder, CameraProfiles(folder.profiles))
 
     @router.get("/{device_id:device}", responses=problems(404))
     def get_device(device_id: DeviceId) -> DeviceOut:
@@ -80,14 +93,15 @@ def device_routes(captures: Captures, sources: Sources, profiles: Path, route_cl
     return router
 
 
-def _add_profile_routes(router: APIRouter, sources: Sources, profiles: Path) -> None:
-    """Routes that read, write and remove the profile of a device."""
+def _add_profile_routes(
+    router: APIRouter, sources: Sources, captures: Captures, folder: DataFolder, profiles: CameraProfiles
+) -> None:
+    """Routes that read, write, measure and remove the profile of a device."""
 
     @router.get("/{device_id:device}/profile", responses=problems(404))
     def get_device_profile(device_id: DeviceId) -> ProfileOut:
         """What captures of the device take from its profile."""
-        path = _profile_of(sources, profiles, device_id)
-        return ProfileOut(file=path.name, profile=ProfileModel(**CameraProfile.read(path).model_dump()))
+        return _profile_out(profiles.file(_find(sources, device_id)))
 
     @router.put("/{device_id:device}/profile", responses=problems(404, 409))
     def set_device_profile(device_id: DeviceId, body: ProfileModel) -> ProfileOut:
@@ -99,31 +113,46 @@ def _add_profile_routes(router: APIRouter, sources: Sources, profiles: Path) -> 
         if body.serial is not None and device.serial is not None and body.serial != device.serial:
             raise ConflictError(f"the profile is of camera {body.serial}, and {device_id} is camera {device.serial}")
         if body.calibration is not None:
-            sources.check_file(str(profiles / body.calibration), profiles)
-        address = SourceSpec.parse(device.source).address
-        path = profile_path(profiles, address, device.serial)
-        # Opened with the profile before it replaces the one before: an impossible one is refused.
-        trial = path.with_name(f".{path.name}.{new_id()}.part")
-        try:
-            body.write(trial)
-            open_camera(with_options(device.source, CameraFiles(profile=trial)))
-            trial.replace(path)
-        finally:
-            trial.unlink(missing_ok=True)
-        return ProfileOut(file=path.name, profile=body)
+            sources.check_file(str(profiles.folder / body.calibration), profiles.folder)
+        return ProfileOut(file=profiles.replace(device, body).name, profile=body)
 
     @router.delete("/{device_id:device}/profile", status_code=HTTPStatus.NO_CONTENT, responses=problems(404))
     def remove_device_profile(device_id: DeviceId) -> None:
         """Remove the profile of the device."""
-        _profile_of(sources, profiles, device_id).unlink(missing_ok=True)
+        profiles.remove(_find(sources, device_id))
+
+    @router.post("/{device_id:device}/profile:calibrate", responses=problems(404, 409))
+    def calibrate_device(
+        device_id: DeviceId, body: CalibrationRequest, idempotency_key: IdempotencyKey = None
+    ) -> CalibratedOut:
+        """Measure gains, dark rates and defects from recordings, and store them with the profile of the device.
+
+        Captures of the device are corrected by them from then on. What the recordings do not say stays as it was.
+        """
+        device = _find(sources, device_id)
+        flat, dark = (
+            None if one is None else closed_recording(captures, folder, one) for one in (body.flat, body.dark)
+        )
+        file, measured = profiles.calibrate(device, flat, dark)
+        shown = CalibrationOut(**asdict(measured.summary()))
+        return CalibratedOut(**_profile_out(file).model_dump(), measured=shown)
+
+    @router.get("/{device_id:device}/profile/calibration", responses=_CALIBRATION, response_class=Response)
+    def get_device_calibration(
+        device_id: DeviceId, request: Request, kind: CalibrationPicture = CalibrationPicture.DARK
+    ) -> Response:
+        """A picture of what is known of each pixel, as PNG."""
+        path = profiles.calibration(_find(sources, device_id))
+        if path is None:
+            raise UnknownIdError(f"device {device_id} has no calibration; POST profile:calibrate makes one")
+        tag = files.etag(kind, files.stamp(path))
+        if files.unchanged(request, tag):
+            return files.not_modified(tag)
+        return files.content(request, calibration_picture(Calibration.read(path), kind), "image/png", tag)
 
 
-def _profile_of(sources: Sources, profiles: Path, device_id: str) -> Path:
-    """The file of a device's profile. Raises UnknownIdError without one."""
-    path = stored_profile(_find(sources, device_id), profiles)
-    if path is None:
-        raise UnknownIdError(f"device {device_id} has no profile; PUT one")
-    return path
+def _profile_out(path: Path) -> ProfileOut:
+    return ProfileOut(file=path.name, profile=ProfileModel(**CameraProfile.read(path).model_dump()))
 
 
 def _find(sources: Sources, device_id: str) -> Device:

@@ -1,4 +1,4 @@
-"""`options`: the options of a reconstruction and of each kind of source, as JSON Schema."""
+"""`options`: the options of a reconstruction, of each kind of source and of a camera profile, as JSON Schema."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ from fastapi import APIRouter
 from spiked_driver.source_kinds import KINDS
 
 from spiked_service.api.problems import problems
-from spiked_service.api.schemas.captures import SourceKindOut, SourceKindsOut
+from spiked_service.api.schemas.captures import ProfileModel, SourceKindOut, SourceKindsOut
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 
 
@@ -31,21 +31,23 @@ def whole(schema: dict[str, Any]) -> dict[str, Any]:
 
 
 _SCHEMA = whole(ReconstructionOptions.model_json_schema())
-_EXAMPLE = {"type": "object", "title": "JSON Schema", "additionalProperties": True, "examples": [_SCHEMA]}
+_PROFILE = whole(ProfileModel.model_json_schema())
+
+
+def _answer(schema: dict[str, Any]) -> dict[int | str, dict[str, Any]]:
+    """Of a route that answers with this JSON schema."""
+    example = {"type": "object", "title": "JSON Schema", "additionalProperties": True, "examples": [schema]}
+    return {
+        200: {"description": "JSON Schema 2020-12.", "content": {"application/json": {"schema": example}}},
+        **problems(),
+    }
 
 
 def option_routes() -> APIRouter:
     """`options`."""
     router = APIRouter()
 
-    @router.get(
-        "/options",
-        tags=["reconstructions"],
-        responses={
-            200: {"description": "JSON Schema 2020-12.", "content": {"application/json": {"schema": _EXAMPLE}}},
-            **problems(),
-        },
-    )
+    @router.get("/options", tags=["reconstructions"], responses=_answer(_SCHEMA))
     def get_options() -> dict[str, Any]:
         """The options of a reconstruction as JSON Schema: names, types, limits, defaults and meaning."""
         return _SCHEMA
@@ -67,5 +69,10 @@ def option_routes() -> APIRouter:
                 for kind in KINDS
             ]
         )
+
+    @router.get("/options/profile", tags=["devices"], responses=_answer(_PROFILE))
+    def get_profile_options() -> dict[str, Any]:
+        """The fields of a camera profile as JSON Schema."""
+        return _PROFILE
 
     return router

@@ -5,6 +5,7 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 from fastapi.routing import APIRoute
 
+from spiked.recording import Recording, open_recording
 from spiked.recording.sidecar import sidecar_path
 from spiked_service.api import files
 from spiked_service.api.problems import ConflictError, NotReadyError, problems
@@ -54,6 +55,12 @@ def recording_routes(captures: Captures, folder: DataFolder, route_class: type[A
         return verdict
 
     return router
+
+
+def closed_recording(captures: Captures, folder: DataFolder, capture_id: str) -> Recording:
+    """The whole recording of a capture. Raises ConflictError while it is written, NotReadyError without one."""
+    _check_closed(captures, capture_id)
+    return open_recording(folder.recording(capture_id))
 
 
 def _check_closed(captures: Captures, capture_id: str) -> None:

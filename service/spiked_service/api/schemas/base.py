@@ -49,11 +49,16 @@ def examples(*given: dict[str, Any], rules: list[dict[str, Any]] | None = None) 
 
 
 def exactly_one_of(**fields: str) -> list[dict[str, Any]]:
-    """Rules: one of the fields is given, and no other; each with its type in JSON.
+    """Rules: one of the fields is given, and no other; each with its type in JSON."""
+    return [*at_least_one_of(*fields), *at_most_one_of(**fields)]
+
+
+def at_least_one_of(*fields: str) -> list[dict[str, Any]]:
+    """Rules: one of the fields is given, or several.
 
     All rules say what must not be: of other forms generators of clients make a type for each case.
     """
-    return [_never(dict.fromkeys(fields, "null"), required=False), *at_most_one_of(**fields)]
+    return [_never(dict.fromkeys(fields, "null"), required=False)]
 
 
 def at_most_one_of(**fields: str) -> list[dict[str, Any]]:

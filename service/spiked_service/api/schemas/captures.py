@@ -19,6 +19,7 @@ from spiked_service.api.schemas.base import (
     Notes,
     Out,
     PageOut,
+    at_least_one_of,
     at_most_one_of,
     camera_example,
     exactly_one_of,
@@ -143,6 +144,43 @@ class ProfileOut(Out):
 
     file: str = Field(description="Its file in the folder `profiles` of the data folder.")
     profile: ProfileModel
+
+
+class CalibrationRequest(In):
+    """The captures to calibrate a camera by: one of them or both."""
+
+    model_config = examples(
+        {"dark": ID_EXAMPLE},
+        rules=at_least_one_of("dark", "flat"),
+    )
+
+    dark: str | None = Field(
+        None, min_length=1, max_length=64, description="Capture with the lens covered: dark rates and hot pixels."
+    )
+    flat: str | None = Field(
+        None, min_length=1, max_length=64, description="Capture of an even light: gains and dead pixels."
+    )
+
+    @model_validator(mode="after")
+    def _something(self) -> Self:
+        if self.dark is None and self.flat is None:
+            raise ValueError("name a capture in the dark, one of an even light, or both")
+        return self
+
+
+class CalibrationOut(Out):
+    """Figures of a calibration."""
+
+    gain_spread: float = Field(description="Standard deviation of the logarithm of good pixels' gains.")
+    dark_rate: float = Field(description="Spikes a frame without light, median over the pixels.")
+    useless: int = Field(description="Pixels that are left out: dead, stuck or hot.")
+    pixels: int = Field(description="Of the sensor.")
+
+
+class CalibratedOut(ProfileOut):
+    """The completed profile of a device, and what was measured."""
+
+    measured: CalibrationOut
 
 
 class StatedCameraModel(In, CameraOptions, CameraFiles):

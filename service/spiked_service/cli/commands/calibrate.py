@@ -2,12 +2,12 @@
 
 import json
 import os
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import cv2
-import numpy as np
 import typer
 from rich.progress import Progress
 
@@ -15,6 +15,7 @@ from spiked.board import Board
 from spiked.calibration import Calibration
 from spiked.camera import Pinhole
 from spiked.distortion import LensModel
+from spiked.errors import ConfigurationError
 from spiked.lens_calibration import board_views, calibrate_lens
 from spiked.profile import CameraProfile
 from spiked.recording import Recording, RecordingGeometry
@@ -22,19 +23,29 @@ from spiked.sensor import Sensor
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import messages, output, report_warning
+from spiked_service.cli.guided_calibration import take_recordings
 
 _LENS = "Lens"
 
 
 def calibrate(
+    out: Annotated[Path, typer.Option("--out", "-o", help="The .npz file to write; with --board, a .json file.")],
     flat: Annotated[
-        Path,
+        Path | None,
         typer.Argument(
             help="A recording of even light, such as a white wall out of focus; with --board, of the board."
         ),
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The .npz file to write; with --board, a .json file.")],
+    ] = None,
     dark: Annotated[Path | None, typer.Option(help="A recording with the lens cap on.")] = None,
+    device: Annotated[
+        str | None,
+        typer.Option(
+            help="A camera, such as usb0, to record both from: you are told when to cover the lens.", metavar="SOURCE"
+        ),
+    ] = None,
+    seconds: Annotated[
+        float, typer.Option(help="Length of each of these recordings.", min=0.001, max=60, show_default=True)
+    ] = 1.0,
     board: Annotated[
         str | None,
         typer.Option(
@@ -66,7 +77,8 @@ def calibrate(
     """Measure each pixel's gain and dark rate, and find dead and hot pixels; or, with --board, measure the lens.
 
     `spiked reconstruct --calibration FILE` corrects rates by the result. One second of each recording is enough. Use
-    light at which pixels fire every 3 to 10 frames.
+    light at which pixels fire every 3 to 10 frames. With only one of the two recordings, OUT is completed: what the
+    other one said before stays.
 
     With --board the recording shows a ChArUco board, held in the hand for two seconds or more: filling most of the
     image, tilted to all sides, near and far. OUT gets focal length, centre and distortion with standard deviations, for
@@ -74,9 +86,11 @@ def calibrate(
 
     Examples:
 
+    - `spiked calibrate --device usb0 -o camera.npz --write-profile camera.json`
+
     - `spiked calibrate flat.dat --dark dark.dat -o camera.npz`
 
-    - `spiked calibrate flat.dat --dark dark.dat -o camera.npz --write-profile camera.json`
+    - `spiked calibrate --dark dark.dat -o camera.npz`
 
     - `spiked calibrate board.dat --board 9x6 -o lens.json --write-profile camera.json`
 
@@ -86,29 +100,41 @@ def calibrate(
     if write_profile is not None:
         outputs.try_file("--write-profile", write_profile)
     geometry = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic)
+    if device is not None:
+        if flat is not None or dark is not None or board is not None:
+            raise ConfigurationError("--device records by itself: leave out recordings and --board")
+        if geometry != RecordingGeometry() or profile is not None:
+            raise ConfigurationError(f"state the camera's options with the device: --device {device}?flipped=true&...")
+        with tempfile.TemporaryDirectory(dir=out.absolute().parent, prefix=".spiked-") as folder:
+            _calibrate_pixels(*take_recordings(device, seconds, Path(folder)), out, write_profile)
+        return
     if board is not None:
+        if flat is None:
+            raise ConfigurationError("--board needs a recording of the board")
         shown = g.open_described(flat, geometry, profile).recording
         _calibrate_lens(shown, Board.parse(board, markers), model, out, write_profile)
         return
     recordings = [
         None if path is None else g.open_described(path, geometry, profile).recording for path in (flat, dark)
     ]
-    assert recordings[0] is not None
-    for recording in recordings:
+    _calibrate_pixels(recordings[0], recordings[1], out, write_profile)
+
+
+def _calibrate_pixels(flat: Recording | None, dark: Recording | None, out: Path, profile: Path | None) -> None:
+    """Write gains and dark rates; one that is not measured keeps its value of before."""
+    known = next((one for one in (flat, dark) if one is not None), None)
+    if known is None:
+        raise ConfigurationError("give a recording of even light, --dark with one in the dark, or --device")
+    for recording in (flat, dark):
         for warning in () if recording is None else recording.warnings:
             report_warning(warning)
-    calibration = Calibration.measure(recordings[0], recordings[1])
+    complete = flat is not None and dark is not None
+    before = None if complete or not out.exists() or not out.stat().st_size else Calibration.read(out)
+    calibration = Calibration.measure(flat, dark, before)
     calibration.write(out)
-    if write_profile is not None:
-        _write_profile(write_profile, out, recordings[0].sensor)
-    good = ~calibration.dead
-    spread = 100 * float(np.std(np.log(calibration.gain[good])))
-    darkness = float(np.median(calibration.dark))
-    output.print(
-        f"{out}: gains differ by {spread:.1f} % (standard deviation), dark rate {darkness:.4f} spikes a frame, "
-        f"{int(calibration.dead.sum())} of {calibration.dead.size} pixels dead or hot",
-        markup=False,
-    )
+    if profile is not None:
+        _write_profile(profile, out, known.sensor)
+    output.print(f"{out}: {calibration.summary()}", markup=False)
 
 
 def _write_profile(path: Path, calibration: Path | None, sensor: Sensor) -> None:

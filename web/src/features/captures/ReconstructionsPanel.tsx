@@ -12,10 +12,10 @@ import { isEnded, storeReconstruction } from "../../shared/state/store";
 import { useFetch } from "../../shared/state/useFetch";
 import { ActionButton } from "../../shared/ui/access";
 import { Fetched } from "../../shared/ui/Fetched";
+import { OptionsForm } from "../../shared/ui/OptionsForm";
 import { Icon } from "../../shared/ui/icons";
 import { Badge, Empty, JobBadge, JobReason, jobTone, Panel, Warnings } from "../../shared/ui/parts";
 import { Table } from "../../shared/ui/Table";
-import { OptionsForm } from "./OptionsForm";
 
 const COLUMNS = [
   { name: "Show" },
@@ -196,7 +196,9 @@ export function RerunPanel({
   return (
     <Panel title="Options of the new reconstruction">
       <Fetched from={schema} what="the options">
-        {(fields) => <OptionsForm schema={fields} initial={initial} onSubmit={onSubmit} onCancel={onCancel} />}
+        {(fields) => (
+          <OptionsForm schema={fields} initial={initial} action="Reconstruct" onSubmit={onSubmit} onCancel={onCancel} />
+        )}
       </Fetched>
     </Panel>
   );

@@ -1,4 +1,4 @@
-/** The Set-up page: machine check, configuration, tokens, links. */
+/** The Set-up page: machine check, cameras, configuration, tokens, links. */
 
 import type { JSX } from "react";
 
@@ -15,6 +15,7 @@ import { Fetched } from "../../shared/ui/Fetched";
 import { Icon } from "../../shared/ui/icons";
 import { Badge, Empty, Loading, Markup, Panel, type Tone } from "../../shared/ui/parts";
 import { Table } from "../../shared/ui/Table";
+import { ProfilePanel } from "./ProfilePanel";
 
 const TONES: Record<Finding["status"], Tone> = { ok: "good", warning: "warning", problem: "problem" };
 const LINKS = [
@@ -35,6 +36,7 @@ export function SetupPage(): JSX.Element {
       <h1 className="hidden">Set-up</h1>
       <div>
         <Doctor />
+        <ProfilePanel />
         {administrator && <Configuration />}
       </div>
       <div>

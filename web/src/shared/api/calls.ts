@@ -1,7 +1,8 @@
 /** Calls of the REST API made by the page. */
 
-import { answered, API, client, query, request } from "./http";
+import { answered, API, ApiError, client, query, request } from "./http";
 import type {
+  Calibrated,
   Capture,
   CaptureChange,
   CapturePage,
@@ -11,6 +12,7 @@ import type {
   OptionSchema,
   OptionValues,
   PreviewKind,
+  Profile,
   Reconstruction,
   Setting,
   SourceKind,
@@ -27,6 +29,7 @@ const newKey = (): string =>
   Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");
 const idempotent = (): { "idempotency-key": string } => ({ "idempotency-key": newKey() });
 const ofCapture = (capture_id: string) => ({ params: { path: { capture_id } } });
+const ofDevice = (device_id: string) => ({ params: { path: { device_id } } });
 const ofReconstruction = (reconstruction_id: string) => ({ params: { path: { reconstruction_id } } });
 
 export const devices = async (): Promise<Device[]> => (await answered(client.GET("/api/v1/devices"))).items;
@@ -40,6 +43,29 @@ export const tokens = async (): Promise<Token[]> => (await answered(client.GET("
 export const optionSchema = async (): Promise<OptionSchema> => await answered(client.GET("/api/v1/options"));
 export const sourceKinds = async (): Promise<SourceKind[]> =>
   (await answered(client.GET("/api/v1/options/sources"))).items;
+export const profileSchema = async (): Promise<OptionSchema> => await answered(client.GET("/api/v1/options/profile"));
+
+/** The profile of a device; null if it has none. */
+export const profile = async (device: string): Promise<{ profile: Profile | null }> => {
+  try {
+    return await answered(client.GET("/api/v1/devices/{device_id}/profile", ofDevice(device)));
+  } catch (error) {
+    if (error instanceof ApiError && error.status === 404) return { profile: null };
+    throw error;
+  }
+};
+export const setProfile = async (device: string, body: Profile): Promise<unknown> =>
+  await answered(client.PUT("/api/v1/devices/{device_id}/profile", { ...ofDevice(device), body }));
+export const removeProfile = (device: string): Promise<unknown> =>
+  answered(client.DELETE("/api/v1/devices/{device_id}/profile", ofDevice(device)));
+/** Measure a camera by captures in the dark and of an even light. */
+export const calibrate = (device_id: string, body: { dark: string | null; flat: string | null }): Promise<Calibrated> =>
+  answered(
+    client.POST("/api/v1/devices/{device_id}/profile:calibrate", {
+      body,
+      params: { path: { device_id }, header: idempotent() },
+    }),
+  );
 
 export const captures = (wanted: { limit?: number; cursor?: string; q?: string }): Promise<CapturePage> =>
   answered(client.GET("/api/v1/captures", { params: { query: wanted } }));
@@ -122,6 +148,9 @@ export const address = {
     kind: PreviewKind,
     extra: { gain?: number | undefined; frame?: number | undefined; white?: number | undefined } = {},
   ): string => `${API}/captures/${id}/preview${query({ kind, ...extra })}`,
+  /** A picture of what is known of each pixel; `file` makes it another one after a new calibration. */
+  calibration: (device: string, kind: string, file: string): string =>
+    `${API}/devices/${encodeURIComponent(device)}/profile/calibration${query({ kind, file })}`,
   recording: (id: string): string => `${API}/captures/${id}/recording`,
   sidecar: (id: string): string => `${API}/captures/${id}/recording/sidecar`,
   scene: (id: string, format: "ply" | "spz"): string => `${API}/reconstructions/${id}/scene${query({ format })}`,

@@ -108,6 +108,52 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/api/v1/devices/{device_id}/profile:calibrate": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        get?: never;
+        put?: never;
+        /**
+         * Calibrate Device
+         * @description Measure gains, dark rates and defects from recordings, and store them with the profile of the device.
+         *
+         *     Captures of the device are corrected by them from then on. What the recordings do not say stays as it was.
+         *
+         *     Scope of a token: `operate`.
+         */
+        post: operations["calibrate_device_api_v1_devices__device_id__profile_calibrate_post"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/devices/{device_id}/profile/calibration": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Device Calibration
+         * @description A picture of what is known of each pixel, as PNG.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["get_device_calibration_api_v1_devices__device_id__profile_calibration_get"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
     "/api/v1/devices/{device_id}": {
         parameters: {
             query?: never;
@@ -956,6 +1002,28 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/api/v1/options/profile": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Profile Options
+         * @description The fields of a camera profile as JSON Schema.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["get_profile_options_api_v1_options_profile_get"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
     "/api/v1/uploads": {
         parameters: {
             query?: never;
@@ -1219,6 +1287,70 @@ export interface components {
          * @enum {string}
          */
         BitOrder: "lsb" | "msb";
+        /**
+         * CalibratedOut
+         * @description The completed profile of a device, and what was measured.
+         */
+        CalibratedOut: {
+            /**
+             * File
+             * @description Its file in the folder `profiles` of the data folder.
+             */
+            file: string;
+            profile: components["schemas"]["ProfileModel"];
+            measured: components["schemas"]["CalibrationOut"];
+        };
+        /**
+         * CalibrationOut
+         * @description Figures of a calibration.
+         */
+        CalibrationOut: {
+            /**
+             * Gain Spread
+             * @description Standard deviation of the logarithm of good pixels' gains.
+             */
+            gain_spread: number;
+            /**
+             * Dark Rate
+             * @description Spikes a frame without light, median over the pixels.
+             */
+            dark_rate: number;
+            /**
+             * Useless
+             * @description Pixels that are left out: dead, stuck or hot.
+             */
+            useless: number;
+            /**
+             * Pixels
+             * @description Of the sensor.
+             */
+            pixels: number;
+        };
+        /**
+         * CalibrationPicture
+         * @description What a picture of a calibration shows.
+         * @enum {string}
+         */
+        CalibrationPicture: "gain" | "dark" | "useless";
+        /**
+         * CalibrationRequest
+         * @description The captures to calibrate a camera by: one of them or both.
+         * @example {
+         *       "dark": "01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10"
+         *     }
+         */
+        CalibrationRequest: {
+            /**
+             * Dark
+             * @description Capture with the lens covered: dark rates and hot pixels.
+             */
+            dark?: string | null;
+            /**
+             * Flat
+             * @description Capture of an even light: gains and dead pixels.
+             */
+            flat?: string | null;
+        } & unknown;
         /**
          * CameraModel
          * @description Where a camera is, camera to world, OpenCV axes: c2w, or position and quaternion_wxyz, or frame.
@@ -3998,6 +4130,221 @@ export interface operations {
         responses: {
             /** @description Successful Response */
             204: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    calibrate_device_api_v1_devices__device_id__profile_calibrate_post: {
+        parameters: {
+            query?: never;
+            header?: {
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                "idempotency-key"?: string;
+            };
+            path: {
+                /** @description As `GET devices` names it, percent-encoded. */
+                device_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["CalibrationRequest"];
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["CalibratedOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It conflicts with the current state. */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_device_calibration_api_v1_devices__device_id__profile_calibration_get: {
+        parameters: {
+            query?: {
+                kind?: components["schemas"]["CalibrationPicture"];
+            };
+            header?: never;
+            path: {
+                /** @description As `GET devices` names it, percent-encoded. */
+                device_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description The picture. */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "image/png": string;
+                };
+            };
+            /** @description The content has not changed. */
+            304: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -8460,6 +8807,91 @@ export interface operations {
                 };
                 content: {
                     "application/json": components["schemas"]["SourceKindsOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_profile_options_api_v1_options_profile_get: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description JSON Schema 2020-12. */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": {
+                        [key: string]: unknown;
+                    };
                 };
             };
             /** @description The request is malformed. */

@@ -127,7 +127,7 @@ export function OptionInput({
       step={field.kind === "integer" ? 1 : "any"}
       min={field.minimum}
       max={field.maximum}
-      required={!field.optional}
+      required={!field.optional && field.initial !== ""}
       disabled={disabled}
       placeholder={field.optional ? "default" : ""}
       value={text}

@@ -1,20 +1,25 @@
-/** A form for reconstruction options, generated from their JSON Schema. */
+/** A form for options, generated from their JSON Schema. */
 
 import { type JSX, type SubmitEvent, useState } from "react";
 
-import type { OptionSchema, OptionValues } from "../../shared/api/types";
-import { fieldsOf, OptionInput, textOf, valuesOf } from "../../shared/ui/options";
+import type { OptionSchema, OptionValues } from "../api/types";
+import { ActionButton } from "./access";
+import { fieldsOf, OptionInput, textOf, valuesOf } from "./options";
+import { Markup } from "./parts";
 
 export function OptionsForm({
   schema,
   initial,
+  action,
   onSubmit,
   onCancel,
 }: {
   schema: OptionSchema;
   initial: OptionValues;
+  /** Label of the button that submits. */
+  action: string;
   onSubmit: (values: OptionValues) => Promise<void>;
-  onCancel: () => void;
+  onCancel?: () => void;
 }): JSX.Element {
   const fields = fieldsOf(schema);
   const [texts, setTexts] = useState<Record<string, string>>(() =>
@@ -33,16 +38,20 @@ export function OptionsForm({
         <label key={field.key}>
           <span>{field.label}</span>
           <OptionInput field={field} text={texts[field.key] ?? ""} onChange={(text) => change(field.key, text)} />
-          <small className="dim">{field.hint}</small>
+          <small className="dim">
+            <Markup>{field.hint}</Markup>
+          </small>
         </label>
       ))}
       <div className="buttons">
-        <button type="submit" className="primary" disabled={busy}>
-          Reconstruct
-        </button>
-        <button type="button" onClick={onCancel}>
-          Cancel
-        </button>
+        <ActionButton type="submit" className="primary" disabled={busy}>
+          {action}
+        </ActionButton>
+        {onCancel !== undefined && (
+          <button type="button" onClick={onCancel}>
+            Cancel
+          </button>
+        )}
       </div>
     </form>
   );

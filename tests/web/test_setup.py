@@ -1,0 +1,86 @@
+"""Cameras on the Set-up page: their profile is edited, and their pixels are calibrated."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from browsing import until
+
+from spiked.sensor import Sensor
+from tests.still_recordings import pixels, place, still
+
+SENSOR = Sensor(96, 64, 20_000.0)
+
+
+def cameras(page: Any) -> Any:
+    """The panel."""
+    return page.locator(".panel:has(h2:text-is('Cameras'))")
+
+
+def test_the_profile_of_a_camera_is_edited(daemon: Callable[..., Any], visit: Callable[..., Any]) -> None:
+    one = daemon("--device", "sim:", "--no-capture")
+    page = visit(f"{one.address}?page=setup")
+    panel = cameras(page)
+    panel.get_by_text("Nothing is stated of this camera.").wait_for()
+    panel.locator("summary", has_text="Profile").click()
+    panel.get_by_label("mosaic").select_option("GRBG")
+    panel.get_by_label("intrinsics").fill("200,200,100,nonsense")
+    panel.get_by_role("button", name="Save").click()
+    page.get_by_text('"nonsense" is not a number').wait_for()
+    panel.get_by_label("intrinsics").fill("200,200,100,60,-0.2")
+    panel.get_by_label("serial").fill("A7")
+    panel.get_by_role("button", name="Save").click()
+    panel.get_by_text("Captures of this camera take what is stated here.").wait_for()
+    stored = one.http.get("devices/sim%3A/profile").json()["profile"]
+    assert (stored["mosaic"], stored["serial"]) == ("GRBG", "A7")
+    assert stored["intrinsics"]["distortion"]["k1"] == -0.2
+    until(lambda: panel.get_by_label("intrinsics").input_value() == "200,200,100,60,-0.2,0,0,0,0", "it is shown again")
+    panel.get_by_role("button", name="Remove the profile").click()
+    panel.get_by_text("Nothing is stated of this camera.").wait_for()
+    assert one.http.get("devices/sim%3A/profile").status_code == 404
+
+
+def test_a_person_calibrates_a_camera(
+    daemon: Callable[..., Any], visit: Callable[..., Any], tmp_path: Path, pictures_folder: Path
+) -> None:
+    for name, light in (("dark", 0.0), ("wall", 0.2)):
+        still(tmp_path / f"{name}.dat", SENSOR, light)
+    shown = tmp_path / "camera.dat"
+    place(shown, tmp_path / "wall.dat")
+    one = daemon("--device", f"replay:{shown}", "--no-capture")
+    page = visit(f"{one.address}?page=setup")
+    panel = cameras(page)
+    dark, light = (panel.get_by_role("button", name=name) for name in ("Record the dark", "Record the light"))
+    measure = panel.get_by_role("button", name="Measure")
+    assert measure.is_disabled()
+    place(shown, tmp_path / "dark.dat")
+    dark.click()
+    panel.get_by_text("recorded", exact=True).wait_for()
+    place(shown, tmp_path / "wall.dat")
+    light.click()
+    until(lambda: panel.get_by_text("recorded", exact=True).count() == 2, "both are recorded")
+    measure.click()
+    useless = int(((pixels(SENSOR).gain == 0) | (pixels(SENSOR).dark > 0.1)).sum())
+    panel.get_by_text(f"{useless} of {SENSOR.width * SENSOR.height} pixels are dead or hot").wait_for()
+    pictures = panel.locator("figure img")
+    until(
+        lambda: pictures.evaluate_all(
+            f"all => all.length == 3 && all.every(one => one.naturalWidth == {SENSOR.width})"
+        ),
+        "the pictures are loaded",
+    )
+    page.screenshot(path=pictures_folder / "calibration.png", full_page=True)
+    # Somebody who forgets the cover is told, and nothing is changed.
+    before = one.http.get(
+        f"devices/{one.http.get('devices').json()['items'][0]['id'].replace('/', '%2F')}/profile"
+    ).json()
+    dark.click()
+    panel.get_by_text("recorded", exact=True).wait_for()
+    measure.click()
+    panel.get_by_text("is not dark").wait_for()
+    assert (
+        before
+        == one.http.get(
+            f"devices/{one.http.get('devices').json()['items'][0]['id'].replace('/', '%2F')}/profile"
+        ).json()
+    )

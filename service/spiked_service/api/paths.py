@@ -24,7 +24,7 @@ class _Id(Convertor[str]):
 class _DeviceId(Convertor[str]):
     """The id of a device, which may contain slashes and colons, up to the action."""
 
-    regex = "(?:(?!:(?:dis)?arm$).)+"
+    regex = "(?:(?!:(?:dis)?arm$|/profile:calibrate$).)+"
 
     def convert(self, value: str) -> str:
         return value

@@ -27,14 +27,13 @@ from numpy.typing import NDArray
 from spiked.blocks import Window
 from spiked.evaluate import score_trajectory
 from spiked.pose import Array
-from spiked.recon import MapOptions, Options, Reconstructor
+from spiked.recon import LossName, MapOptions, Options, Reconstructor
 from spiked.recon.frontend import windowing as views
 from spiked.recon.frontend.demosaic import fill_mosaic
 from spiked.recon.frontend.spike_intervals import SpikeIntervals
 from spiked.recon.frontend.windowing import View
 from spiked.recon.mapping import mapper as mapping
 from spiked.recon.mapping import pose_alignment as refine
-from spiked.recon.mapping.loss import RateLoss
 from spiked.recon.mapping.mapper import Mapper
 from spiked.recon.mapping.pyramid import Level, Target
 from spiked.recon.mapping.render_requests import RenderPlanner, RenderRequest
@@ -45,10 +44,9 @@ from spiked.recon.odometry import initialisation as bootstrap
 from spiked.recon.odometry import spline_fitting as smooth
 from spiked.recon.odometry.odometry import Odometry
 from spiked.recording import open_recording
-from spiked.render.loss import dssim
 from spiked.render.splats import RenderedImage
 from spiked.scene import Scene
-from spiked.sensor import Image, Mosaic
+from spiked.sensor import Image
 from spiked.spline import Spline
 from spiked.trajectory import Trajectory
 
@@ -68,7 +66,6 @@ class Row:
     """Whether it is about the path: poses are not given."""
     aligned: bool = False
     """And that after the map was made and the path aligned with it."""
-    window_frames: int | None = None
     steps_share: float = 1.0
 
 
@@ -94,38 +91,6 @@ def counted(window: Window, after_gap: bool, *more: Any, **named: Any) -> View:
     view = Counted(window.begin, window.end, edges, float(window.count.mean()), None, after_gap, sharp)
     view.__dict__["counts"] = window.count.astype(np.float32)
     return view
-
-
-def still_poses(parts: int) -> Callable[[RenderPlanner, View, Spline, int], RenderRequest]:
-    """The mean of exact renders at the middles of the sub-frames: no blur within one, the same for all pixels."""
-
-    def request(self: RenderPlanner, view: View, spline: Spline, pixel: int = 1) -> RenderRequest:
-        edges = np.linspace(view.begin, view.end, parts + 1)
-        times = np.clip(0.5 * (edges[1:] + edges[:-1]), spline.begin, spline.end)
-        rotations, centres = spline.poses(times)
-        return RenderRequest(rotations, centres)
-
-    return request
-
-
-def pooled_binomial(
-    self: RateLoss, expected: Image, target: Target, white: float, mosaic: Mosaic | None = None
-) -> tuple[float, Image]:
-    """The paper's losses: pooled binomial likelihood over 4x4 pixels and 32 frames, and (1 - l) L2 + l (1 - SSIM)."""
-    share = self.ssim
-    error = expected - target.values
-    slope = (1 - share) * 2 * error / np.float32(white**2 * error.size)
-    slope += share * self.ssim_scale * dssim(expected, target=target.values, white=white)[1]
-    height, width = (n // 4 * 4 for n in expected.shape)
-
-    def pool(image: Image) -> Image:
-        return image[:height, :width].reshape(height // 4, 4, width // 4, 4).mean((1, 3))
-
-    rate, seen = np.clip(pool(expected), 1e-3, 1 - 1e-3), pool(target.values)
-    # d/dp of -(k log p + (n - k) log(1 - p)) / n for k = n * seen, normalised as the squared error is.
-    by_rate = ((rate - seen) / (rate * (1 - rate)) / error.size).astype(np.float32)
-    slope[:height, :width] += 0.1 * np.repeat(np.repeat(by_rate, 4, 0), 4, 1)
-    return float(np.mean(error * error)) / white**2, slope
 
 
 class Demosaiced(Level):
@@ -208,7 +173,7 @@ def rows() -> list[Row]:
         table.append(
             Row(
                 f"{parts} sub-frames, not blur matched",
-                patches=lambda parts=parts: patched((RenderPlanner, "exposed", still_poses(parts))),  # type: ignore[misc]
+                mapping={"sub_frames": parts, "blur_matched": False},
             )
         )
     table += [
@@ -216,11 +181,7 @@ def rows() -> list[Row]:
         Row("black background while fitting", mapping={"background": 0.0}),
         Row("first splats of doubtful depth as well", mapping=DOUBTFUL),
         Row("without structural similarity", mapping={"ssim": 0.0}),
-        Row(
-            "the paper's pooled binomial and accumulation losses, 32-frame counts",
-            patches=lambda: patched((views, "make_view", counted), (RateLoss, "__call__", pooled_binomial)),
-            window_frames=32,
-        ),
+        *[Row(f"loss: {name}", mapping={"loss": name}) for name in LossName if name is not LossName.CHARGE],
         Row("charge between the spikes of 24 frames (as it is)", COLOUR, steps_share=0.4),
         Row("full size from the start", COLOUR, mapping=FULL_SIZE, steps_share=0.4),
         Row("fine detail not raised", COLOUR, mapping={"detail": 0.0}, steps_share=0.4),
@@ -266,7 +227,6 @@ def run(row: Row, streams: Path, steps: int) -> dict[str, Any]:
     options = Options(
         steps=0 if row.path and not row.aligned else round(steps * row.steps_share),
         poses=None if row.path else truth,
-        window_frames=row.window_frames,
         mapping=replace(MapOptions(), **row.mapping),
     )
     begin = time.process_time()

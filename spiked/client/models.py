@@ -316,6 +316,18 @@ class LocalisedViewOut(BaseModel):
     sigma_px: Annotated[float, Field(description="The same in the image.")]
 
 
+class LossName(StrEnum):
+    """
+    The losses that a map can be fitted with (docs/paper.md).
+    """
+
+    charge = "charge"
+    accumulation = "accumulation"
+    interval = "interval"
+    binomial = "binomial"
+    accumulation_binomial = "accumulation+binomial"
+
+
 class MapRefOut(BaseModel):
     """
     A version of a reconstruction that is used as a map.
@@ -1244,6 +1256,12 @@ class ReconstructionOptions(BaseModel):
         Field(description="MiB of images held in memory; the others are built anew from the recording."),
     ] = 512
     refine_poses: Annotated[bool, Field(description="Whether the map corrects the trajectory.")] = True
+    loss: Annotated[
+        LossName,
+        Field(
+            description="What the map is fitted to: the charge between spikes, or another loss, to compare methods (docs/paper.md)."
+        ),
+    ] = LossName.charge
     intrinsics: Annotated[
         IntrinsicsOption | None,
         Field(description="Optics, where neither the capture nor its recording says them, or to overrule them."),

@@ -11,7 +11,7 @@ from spiked.recon.merging.known_map import KnownMap
 from spiked.recon.merging.merger import Merged, merge
 from spiked.recon.merging.registration import NotOnePlaceError, Registration
 from spiked.recon.odometry.tracking_state import State
-from spiked.recon.options import MapOptions, Options
+from spiked.recon.options import LossName, MapOptions, Options
 from spiked.recon.reconstructor import Reconstructor
 from spiked.recon.report import Sample, Status, Tracked
 
@@ -20,6 +20,7 @@ __all__ = [
     "Localisation",
     "LocalisedView",
     "Localiser",
+    "LossName",
     "MapIndex",
     "MapOptions",
     "Merged",

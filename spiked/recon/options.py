@@ -4,10 +4,11 @@ from dataclasses import dataclass, field
 
 from spiked.calibration import Calibration
 from spiked.errors import ConfigurationError
+from spiked.recon.mapping.loss import LossName
 from spiked.recon.mapping.options import MapOptions
 from spiked.trajectory import Trajectory
 
-__all__ = ["MapOptions", "Options"]
+__all__ = ["LossName", "MapOptions", "Options"]
 
 
 @dataclass(frozen=True)

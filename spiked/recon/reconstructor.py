@@ -16,6 +16,7 @@ from spiked.recon.frontend.mosaic_check import layout_warnings
 from spiked.recon.frontend.recorded_views import RecordedFrames, RecordedViews
 from spiked.recon.frontend.windowing import View, Windows, luminance
 from spiked.recon.given_poses import GivenPoses
+from spiked.recon.mapping.loss import LossName
 from spiked.recon.mapping.pose_alignment import TrajectoryPrior
 from spiked.recon.mapping.scene_psnr import COMPARED_VIEWS, scene_psnr_db
 from spiked.recon.mapping.trainer import MapTrainer
@@ -69,7 +70,13 @@ class Reconstructor:
             )
         intrinsics = sensor.intrinsics or Intrinsics.from_fov(sensor.width, sensor.height, FIRST_DEG)
         focal = Focal(intrinsics, np.inf) if sensor.intrinsics is None else None
-        recorded = None if recording is None else RecordedViews(recording, sensor, options.calibration)
+        target = options.mapping.loss.target
+        if target is not None and sensor.response is Response.BERNOULLI:
+            raise ConfigurationError(
+                f"the loss {options.mapping.loss} is of cameras that integrate light, and this one counts photons: "
+                f"use the loss {LossName.CHARGE}"
+            )
+        recorded = None if recording is None else RecordedViews(recording, sensor, options.calibration, target)
         memory_bytes = options.memory_mb * 2**20
         self.views = ViewStore(options.max_views, (1 - KEYFRAME_SHARE) * memory_bytes, recorded)
         """One record a view."""
@@ -78,7 +85,7 @@ class Reconstructor:
         """The tracker: its views, points and states."""
         self.warnings: list[str] = []
         """Warnings about the recording, one sentence each."""
-        self._windows = Windows(sensor, options.window_frames, options.calibration)
+        self._windows = Windows(sensor, options.window_frames, options.calibration, target)
         known = replace(sensor, intrinsics=intrinsics)
         self._trainer = MapTrainer(
             known, self.views, options.mapping, options.seed, options.threads, options.calibration

@@ -3,10 +3,12 @@
 The defaults are the library's; names, limits and descriptions are here.
 """
 
+from dataclasses import replace
+
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictInt
 
 from spiked.camera import Pinhole
-from spiked.recon import Options
+from spiked.recon import LossName, Options
 
 _LIBRARY = Options()
 
@@ -48,6 +50,11 @@ class ReconstructionOptions(BaseModel):
         default=_LIBRARY.refine_poses, description="Whether the map corrects the trajectory."
     )
 
+    loss: LossName = Field(
+        default=_LIBRARY.mapping.loss,
+        description="What the map is fitted to: the charge between spikes, or another loss, to compare methods.",
+    )
+
     intrinsics: IntrinsicsOption | None = Field(
         default=None, description="Optics, where neither the capture nor its recording says them, or to overrule them."
     )
@@ -62,4 +69,5 @@ class ReconstructionOptions(BaseModel):
             max_views=self.max_views,
             memory_mb=self.memory_mb,
             refine_poses=self.refine_poses,
+            mapping=replace(_LIBRARY.mapping, loss=self.loss),
         )

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from spiked.blocks import aligned_window
 from spiked.calibration import Calibration
 from spiked.recon.frontend.motion_compensation import COARSE_FRAMES, MotionCompensator
+from spiked.recon.frontend.spike_targets import TargetKind, record_target
 from spiked.recon.frontend.windowing import View, make_view
 from spiked.sensor import Image, Sensor
 
@@ -49,6 +50,8 @@ class RecordedViews:
     source: RecordedFrames
     sensor: Sensor
     calibration: Calibration | None = None
+    target: TargetKind | None = None
+    """What each view records for the map."""
 
     def holds(self, of: ViewFrames) -> bool:
         """Whether all frames of a view can be read."""
@@ -58,11 +61,16 @@ class RecordedViews:
 
     def build(self, of: ViewFrames, sharp: bool = False) -> View | None:
         """See `build_view`."""
-        return build_view(of, self.source, self.sensor, self.calibration, sharp)
+        return build_view(of, self.source, self.sensor, self.calibration, sharp, self.target)
 
 
 def build_view(
-    of: ViewFrames, source: RecordedFrames, sensor: Sensor, calibration: Calibration | None = None, sharp: bool = False
+    of: ViewFrames,
+    source: RecordedFrames,
+    sensor: Sensor,
+    calibration: Calibration | None = None,
+    sharp: bool = False,
+    target: TargetKind | None = None,
 ) -> View | None:
     """The view of these frames, equal to the first one; None if they cannot be read.
 
@@ -75,7 +83,8 @@ def build_view(
     window = aligned_window(frames, sensor, of.first, of.begin, of.end)
     image = _sharp(of, frames, sensor) if sharp and warped is not None else None
     first = 0 if of.warped is None else of.warped[0]
-    return make_view(window, of.after_gap, calibration, image, first, warped, sensor.response)
+    shown = None if target is None else record_target(target, frames, sensor, of.first, of.begin, of.end)
+    return make_view(window, of.after_gap, calibration, image, first, warped, sensor.response, shown)
 
 
 def _sharp(of: ViewFrames, frames: NDArray[np.uint8], sensor: Sensor) -> Image | None:

@@ -1,7 +1,7 @@
 """From frames as they arrive to views: spike-aligned rate images of short windows, with the noise of each pixel."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -13,6 +13,7 @@ from spiked.calibration import Calibration
 from spiked.recon.frontend.motion_compensation import BINOMIAL, MotionCompensator, drift, speed
 from spiked.recon.frontend.photon_counts import PhotonCounts
 from spiked.recon.frontend.spike_intervals import SpikeIntervals
+from spiked.recon.frontend.spike_targets import SpikeTarget, TargetKind, record_target
 from spiked.sensor import Image, Mosaic, Response, Sensor
 
 SITE_SHARES = np.array([0.25, 0.5, 0.25], np.float32)
@@ -78,6 +79,18 @@ class View:
     """Absolute index of the first of `frames`."""
     frames: NDArray[np.uint8] | None = None
     """Stored frames [n, frame_bytes] around the middle, if `sharp` is set; the map is fitted to all of them."""
+    target: SpikeTarget | None = None
+    """What the map is fitted to, if not to the charge between `intervals`."""
+    shows_target: bool = False
+    """Rates, deviations and exposures are those of `target`."""
+
+    def for_map(self) -> "View":
+        """The view as the map is fitted to it: that of its target, if it has one."""
+        return self if self.target is None else replace(self, shows_target=True)
+
+    @property
+    def _measured(self) -> SpikeIntervals | PhotonCounts | SpikeTarget:
+        return self.target if self.shows_target and self.target is not None else self.intervals
 
     @property
     def time(self) -> float:
@@ -87,7 +100,7 @@ class View:
     @cached_property
     def light(self) -> tuple[Image, Image]:
         """Rate and deviation, computed at the first access and cached."""
-        measured = self.intervals.rate(), self.intervals.deviation()
+        measured = self._measured.rate(), self._measured.deviation()
         return measured if self.calibration is None else self.calibration.apply(*measured)
 
     @property
@@ -104,7 +117,8 @@ class View:
     def nbytes(self) -> int:
         """Bytes held by the view: spikes, the compensated image, and its share of the frames."""
         frames = 0 if self.frames is None else (self.end - self.begin) * self.frames.shape[1]
-        return self.intervals.nbytes + frames + (0 if self.sharp is None else self.sharp.nbytes)
+        others = (self.sharp, self.target)
+        return self.intervals.nbytes + frames + sum(one.nbytes for one in others if one is not None)
 
     def preview_rate(self, out: Image) -> Image:
         """`rate` without caching; written to `out` if there is no calibration."""
@@ -116,7 +130,7 @@ class View:
         Returns the times [parts + 1] in frames of the poses, evenly spaced over the exposure of most pixels, the
         pixels' exposures [2, H, W] in units of sub-frames, and a mask [H, W], False for much longer exposures.
         """
-        start, stop = self.intervals.times()
+        start, stop = self._measured.times()
         first = float(np.percentile(start[::4, ::4], EXPOSURE_PERCENTILE))
         last = float(np.percentile(stop[::4, ::4], 100 - EXPOSURE_PERCENTILE))
         scale = np.float32(parts / max(last - first, 1e-3))
@@ -136,12 +150,13 @@ def make_view(
     first: int = 0,
     frames: NDArray[np.uint8] | None = None,
     response: Response = Response.INTEGRATE_AND_FIRE,
+    target: SpikeTarget | None = None,
 ) -> View:
     """The view of a window, in light instead of spikes where the camera is calibrated."""
     counted = response is Response.BERNOULLI
     intervals = PhotonCounts.of(window) if counted else SpikeIntervals.of(window)
     count = float(cv2.mean(window.count)[0])
-    return View(window.begin, window.end, intervals, count, calibration, after_gap, sharp, first, frames)
+    return View(window.begin, window.end, intervals, count, calibration, after_gap, sharp, first, frames, target)
 
 
 class Windows:
@@ -150,8 +165,15 @@ class Windows:
     Without a `length` it follows the motion, see `follow`. Fast motion is compensated in each view's `sharp` image.
     """
 
-    def __init__(self, sensor: Sensor, length: int | None, calibration: Calibration | None = None) -> None:
-        """Raises CalibrationError when the calibration is of another sensor."""
+    def __init__(
+        self,
+        sensor: Sensor,
+        length: int | None,
+        calibration: Calibration | None = None,
+        target: TargetKind | None = None,
+    ) -> None:
+        """Each view records a `target`, if one is given. Raises CalibrationError when the calibration is of another
+        sensor."""
         counted = sensor.response is Response.BERNOULLI
         self._wanted = float(PHOTON_WINDOWS[1])
         """Frames without which photons are too noisy."""
@@ -163,7 +185,7 @@ class Windows:
         """Views lie up to `SPACING_PX` apart, and frames between them are left out."""
         self._spacing = 0
         """Frames from the middle of one view to that of the next, at least."""
-        self._calibration = calibration
+        self._calibration, self._target = calibration, target
         if calibration is not None:
             calibration.check(sensor)
         self._store = np.zeros((0, sensor.frame_bytes), np.uint8)
@@ -222,7 +244,8 @@ class Windows:
         length = min(self.length, len(frames))
         begin = first_frame + (len(frames) - length) // 2
         window = aligned_window(frames, self.sensor, first_frame, begin, begin + length)
-        view = make_view(window, self._gap, self._calibration, response=self.sensor.response)
+        target = self._record(frames, first_frame, window)
+        view = make_view(window, self._gap, self._calibration, response=self.sensor.response, target=target)
         self._frames, self._first, self._next, self._gap = self._store[:0], stop, stop, False
         self._probed, self._compensator = True, None
         return view
@@ -301,13 +324,20 @@ class Windows:
             if sharp is None and self.sharpen and final:
                 continue  # the motion after the last frame is unknown, and a blurred view is worse than none
             first, frames = self._around((begin + end) // 2, stop) if sharp is not None else (0, None)
-            view = make_view(window, self._gap, self._calibration, sharp, first, frames, self.sensor.response)
+            target = self._record(part, low, window)
+            view = make_view(window, self._gap, self._calibration, sharp, first, frames, self.sensor.response, target)
             if not self._sees_motion:
                 self._wanted = _frames_wanted(view.spikes_a_pixel / (end - begin))
             yield view
             self._gap = False
         keep = max(self._first, min(self._next - SEARCH_FRAMES, stop))
         self._frames, self._first = self._frames[keep - self._first :], keep
+
+    def _record(self, frames: NDArray[np.uint8], first_frame: int, window: Window) -> SpikeTarget | None:
+        """The target of a window, from the frames around it."""
+        if self._target is None:
+            return None
+        return record_target(self._target, frames, self.sensor, first_frame, window.begin, window.end)
 
     def _around(self, middle: int, stop: int) -> tuple[int, NDArray[np.uint8]]:
         """The frames around a time; views share their memory."""

@@ -66,6 +66,7 @@ class Mapper:
         self.adam = Adam(self.scene.arrays(), *BETAS, threads=threads)
         self.nuisances = Nuisances(sensor.height, sensor.width)
         self.rate_loss = RateLoss(options.ssim, options.floor)
+        self.view_loss = options.view_loss()
         kernel = ChargeLoss(sensor, threads)
         self.charge_loss = WarpedChargeLoss(kernel, camera, calibration, options.floor, options.detail)
         self.extent = 1.0
@@ -172,7 +173,8 @@ class Mapper:
             expected = expected * factor
             if self.steps % NUISANCE_STEPS == NUISANCE_STEPS - 1:
                 self.nuisances.update()
-        self._losses[key], slope = self.rate_loss(expected, target, self.white, level.mosaic)
+        made = self.view_loss.compare(expected, target, self.white, level.mosaic)
+        self._losses[key], slope = made.error, made.slope
         if factor is not None:
             slope *= factor
         return slope

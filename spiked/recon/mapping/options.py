@@ -3,7 +3,15 @@
 from dataclasses import dataclass, field, replace
 
 from spiked.recon.mapping.densification import DensifyStrategy
-from spiked.recon.mapping.loss import RateLoss, WarpedChargeLoss
+from spiked.recon.mapping.loss import (
+    BinomialLoss,
+    LossName,
+    PhotometricLoss,
+    RateLoss,
+    SummedLoss,
+    ViewLoss,
+    WarpedChargeLoss,
+)
 from spiked.recon.mapping.pruning import Pruning
 from spiked.recon.mapping.schedule import Schedule
 from spiked.recon.mapping.seeding import Seeding
@@ -35,10 +43,19 @@ class MapOptions:
     """Of the opacity logits, per step (decision 6)."""
     rate_colours: float = 1.5e-2
     """Of the colours, per step, in units of white (decision 6)."""
+    loss: LossName = LossName.CHARGE
+    """What the map is fitted to."""
     ssim: float = RateLoss.ssim
     """Share of structural similarity in the loss of rates, see `RateLoss`."""
+    ssim_scale: float = RateLoss.ssim_scale
+    """Factor on 1 - SSIM, see `RateLoss`."""
+    binomial_weight: float = SummedLoss.binomial_weight
+    """Factor on the likelihood where it is added to another loss, see `SummedLoss`."""
     sub_frames: int | None = None
     """Sub-frames of straight motion in the render of a view; None follows the motion, 0 renders a still camera."""
+    blur_matched: bool = True
+    """Each sub-frame is rendered with the blur of its motion and with the time of each pixel; otherwise a view is the
+    mean of sharp renders at the middles of its sub-frames, the same for all pixels: Eq 23 of the paper."""
     nuisances: bool = True
     """Estimate each pixel's gain and the brightness of each view (flicker, lamps)."""
     background: float = 0.5
@@ -55,6 +72,19 @@ class MapOptions:
     """Which splats are removed."""
     schedule: Schedule = field(default_factory=Schedule)
     """What happens when in a refinement."""
+
+    def view_loss(self) -> ViewLoss:
+        """The loss of a view's image; `LossName.CHARGE` has another one for fast motion."""
+        light = PhotometricLoss(self.ssim, self.ssim_scale)
+        match self.loss:
+            case LossName.CHARGE:
+                return RateLoss(self.ssim, self.floor, self.ssim_scale)
+            case LossName.ACCUMULATION | LossName.INTERVAL:
+                return light
+            case LossName.BINOMIAL:
+                return BinomialLoss()
+            case LossName.ACCUMULATION_BINOMIAL:
+                return SummedLoss(light, BinomialLoss(), self.binomial_weight)
 
     def for_photons(self) -> "MapOptions":
         """Of a single-photon camera: structural similarity with so noisy images would fit their noise, and fewer splats

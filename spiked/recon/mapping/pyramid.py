@@ -25,6 +25,8 @@ class Target:
     """Their standard deviation, of the same shape; infinite for masked pixels."""
     windows: Image | None
     """[2, H, W] as in `RenderRequest`."""
+    pixel: int = 1
+    """Size of its pixels in sensor pixels."""
 
 
 class Level:
@@ -74,7 +76,7 @@ class Level:
         if seen is not None:
             enough = self._mean(seen.astype(np.float32)) > 0.5
             deviation[~enough] = np.inf
-        return Target(values, deviation, small)
+        return Target(values, deviation, small, self.factor)
 
     def _small(self, view: View) -> tuple[Image, Image]:
         """Rates and their deviations of large pixels."""

@@ -47,6 +47,8 @@ class RenderPlanner:
     """Sub-frames of every view; None follows the motion, 0 renders a still camera."""
     depth: float = 1.0
     """Median depth of the points, in the path's unit, at which image motion is predicted."""
+    blur_matched: bool = True
+    """See `MapOptions.blur_matched`."""
 
     def request(self, view: View, path: Path, pixel: int = 1) -> RenderRequest:
         """The render of a view: warped frames for fast motion, sub-frames otherwise.
@@ -67,12 +69,16 @@ class RenderPlanner:
             moved_px = self.motion_px(rotations[0], centres[0], rotations[-1], centres[-1])
             parts = int(np.clip(np.ceil(moved_px / (SUB_FRAME_PX * pixel)), 1, MAX_SUB_FRAMES))
         times, windows, seen = view.exposure(parts)
+        if not self.blur_matched:
+            rotations, centres = path.poses(np.clip(0.5 * (times[1:] + times[:-1]), path.begin, path.end))
+            return RenderRequest(rotations, centres)
         rotations, centres = path.poses(np.clip(times, path.begin, path.end))
         return RenderRequest(rotations, centres, windows, seen)
 
     def warped(self, view: View, path: Path) -> RenderRequest | None:
-        """For a view of fast motion: one pose, and the frames around it inside the path; None for others."""
-        if view.frames is None:
+        """For a view of fast motion: one pose, and the frames around it inside the path; None for others, and for
+        views of another target."""
+        if view.frames is None or view.shows_target:
             return None
         times = view.first + 0.5 + np.arange(len(view.frames))
         covered = (times >= path.begin) & (times <= path.end)

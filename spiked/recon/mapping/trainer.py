@@ -50,7 +50,8 @@ class MapTrainer:
         """Increases when the map changes."""
         self._seed, self._threads, self._calibration = seed, threads, calibration
         self._rng = np.random.default_rng(seed)
-        self.planner = RenderPlanner(Camera(sensor.intrinsics, sensor.width, sensor.height), options.sub_frames)
+        camera = Camera(sensor.intrinsics, sensor.width, sensor.height)
+        self.planner = RenderPlanner(camera, options.sub_frames, blur_matched=options.blur_matched)
         self.restart()
 
     @property
@@ -162,7 +163,7 @@ class MapTrainer:
         if not self._queue:
             self._queue = [int(i) for i in self._rng.permutation(self.views.mappable(path))]
         view_id = self._queue.pop()
-        view, level = self.views.image(view_id), self.mapper.level(coarse)
+        view, level = self.views.image(view_id).for_map(), self.mapper.level(coarse)
         request = self.planner.request(view, path, level.factor)
         self.mapper.step(view_id, view, request, decay, level)
         if self.options.densification.due(self.mapper.steps, share):

@@ -25,7 +25,7 @@ from rich.progress import (
 from rich.text import Text
 
 from spiked.errors import ConfigurationError, SceneError, SpikedError
-from spiked.recon import Merged, NotOnePlaceError, Reconstructor, State, Status, extend
+from spiked.recon import LossName, Merged, NotOnePlaceError, Reconstructor, State, Status, extend
 from spiked.recon.frontend.mosaic_check import detect
 from spiked.recon.frontend.windowing import Windows
 from spiked.recording import Recording, RecordingGeometry
@@ -81,6 +81,7 @@ def reconstruct(
     max_views: Annotated[int, _option("max_views")] = _DEFAULTS.max_views,
     memory_mb: Annotated[int, _option("memory_mb")] = _DEFAULTS.memory_mb,
     refine_poses: Annotated[bool, _option("refine_poses")] = _DEFAULTS.refine_poses,
+    loss: Annotated[LossName, _option("loss")] = _DEFAULTS.loss,
     watch: Annotated[bool, typer.Option("--watch", help="Serve a progress page.")] = False,
     watch_port: Annotated[int, typer.Option(help="Port of the progress page; 0: any free port.", min=0)] = 8660,
     fov: g.Fov = None,
@@ -151,6 +152,7 @@ def reconstruct(
         max_views=max_views,
         memory_mb=memory_mb,
         refine_poses=refine_poses,
+        loss=loss,
     )
     known = None if poses is None else Trajectory.read_tum(poses)
     measured = g.read_calibration(calibration, described)

@@ -2264,6 +2264,12 @@ export interface components {
             sigma_px: number;
         };
         /**
+         * LossName
+         * @description The losses that a map can be fitted with (docs/paper.md).
+         * @enum {string}
+         */
+        LossName: "charge" | "accumulation" | "interval" | "binomial" | "accumulation+binomial";
+        /**
          * MapRefOut
          * @description A version of a reconstruction that is used as a map.
          */
@@ -2654,6 +2660,11 @@ export interface components {
              * @default true
              */
             refine_poses?: boolean;
+            /**
+             * @description What the map is fitted to: the charge between spikes, or another loss, to compare methods (docs/paper.md).
+             * @default charge
+             */
+            loss?: components["schemas"]["LossName"];
             /** @description Optics, where neither the capture nor its recording says them, or to overrule them. */
             intrinsics?: components["schemas"]["IntrinsicsOption"] | null;
         };

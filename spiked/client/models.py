@@ -1257,11 +1257,9 @@ class ReconstructionOptions(BaseModel):
     ] = 512
     refine_poses: Annotated[bool, Field(description="Whether the map corrects the trajectory.")] = True
     loss: Annotated[
-        LossName,
-        Field(
-            description="What the map is fitted to: the charge between spikes, or another loss, to compare methods (docs/paper.md)."
-        ),
-    ] = LossName.charge
+        LossName | None,
+        Field(description="What the map is fitted to, to compare methods; the charge between spikes if not given."),
+    ] = None
     intrinsics: Annotated[
         IntrinsicsOption | None,
         Field(description="Optics, where neither the capture nor its recording says them, or to overrule them."),

@@ -1,6 +1,6 @@
 """Options of a reconstruction."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from spiked.calibration import Calibration
 from spiked.errors import ConfigurationError
@@ -35,6 +35,8 @@ class Options:
     """The camera's gains, dark rates and defects, from `spiked calibrate`."""
     refine_poses: bool = True
     """Whether the map corrects the trajectory."""
+    loss: LossName | None = None
+    """What the map is fitted to; None: `mapping.loss`."""
     mapping: MapOptions = field(default_factory=MapOptions)
 
     def __post_init__(self) -> None:
@@ -46,3 +48,8 @@ class Options:
             raise ConfigurationError(f"{self.max_views} views are too few to map from; 20 is the least")
         if self.memory_mb < 16:
             raise ConfigurationError(f"{self.memory_mb} MiB for images are too few; 16 is the least")
+
+    @property
+    def fitted(self) -> MapOptions:
+        """The options of the map, with `loss` where it is given."""
+        return self.mapping if self.loss is None else replace(self.mapping, loss=self.loss)

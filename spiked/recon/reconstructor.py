@@ -70,10 +70,10 @@ class Reconstructor:
             )
         intrinsics = sensor.intrinsics or Intrinsics.from_fov(sensor.width, sensor.height, FIRST_DEG)
         focal = Focal(intrinsics, np.inf) if sensor.intrinsics is None else None
-        target = options.mapping.loss.target
+        target = options.fitted.loss.target
         if target is not None and sensor.response is Response.BERNOULLI:
             raise ConfigurationError(
-                f"the loss {options.mapping.loss} is of cameras that integrate light, and this one counts photons: "
+                f"the loss {options.fitted.loss} is of cameras that integrate light, and this one counts photons: "
                 f"use the loss {LossName.CHARGE}"
             )
         recorded = None if recording is None else RecordedViews(recording, sensor, options.calibration, target)
@@ -88,7 +88,7 @@ class Reconstructor:
         self._windows = Windows(sensor, options.window_frames, options.calibration, target)
         known = replace(sensor, intrinsics=intrinsics)
         self._trainer = MapTrainer(
-            known, self.views, options.mapping, options.seed, options.threads, options.calibration
+            known, self.views, options.fitted, options.seed, options.threads, options.calibration
         )
         self._given = None if options.poses is None else GivenPoses(options.poses, sensor.frame_rate_hz)
         self._refiner: Refiner | None = None

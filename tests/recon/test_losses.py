@@ -120,7 +120,7 @@ def fitted() -> Callable[[LossName], tuple[float, float]]:
     truth = Trajectory((np.arange(400) + 0.5) / source.sensor.frame_rate_hz, rotations, centres)
 
     def fit(name: LossName) -> tuple[float, float]:
-        options = Options(steps=100, poses=truth, mapping=MapOptions(loss=name))
+        options = Options(steps=100, poses=truth, loss=name)
         made = Reconstructor(replace(source.sensor, intrinsics=source.intrinsics), options)
         made.feed(0, frames)
         losses: list[float] = []
@@ -134,4 +134,4 @@ def fitted() -> Callable[[LossName], tuple[float, float]]:
 def test_losses_of_spike_cameras_are_refused_for_photons() -> None:
     sensor = Sensor(48, 32, 20_000.0, intrinsics=SENSOR.intrinsics, response=Response.BERNOULLI)
     with pytest.raises(ConfigurationError, match="counts photons: use the loss charge"):
-        Reconstructor(sensor, Options(mapping=MapOptions(loss=LossName.BINOMIAL)))
+        Reconstructor(sensor, Options(loss=LossName.BINOMIAL))

@@ -3,8 +3,6 @@
 The defaults are the library's; names, limits and descriptions are here.
 """
 
-from dataclasses import replace
-
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictInt
 
 from spiked.camera import Pinhole
@@ -50,9 +48,9 @@ class ReconstructionOptions(BaseModel):
         default=_LIBRARY.refine_poses, description="Whether the map corrects the trajectory."
     )
 
-    loss: LossName = Field(
-        default=_LIBRARY.mapping.loss,
-        description="What the map is fitted to: the charge between spikes, or another loss, to compare methods.",
+    loss: LossName | None = Field(
+        default=_LIBRARY.loss,
+        description="What the map is fitted to, to compare methods; the charge between spikes if not given.",
     )
 
     intrinsics: IntrinsicsOption | None = Field(
@@ -69,5 +67,5 @@ class ReconstructionOptions(BaseModel):
             max_views=self.max_views,
             memory_mb=self.memory_mb,
             refine_poses=self.refine_poses,
-            mapping=replace(_LIBRARY.mapping, loss=self.loss),
+            loss=self.loss,
         )

@@ -81,7 +81,7 @@ def reconstruct(
     max_views: Annotated[int, _option("max_views")] = _DEFAULTS.max_views,
     memory_mb: Annotated[int, _option("memory_mb")] = _DEFAULTS.memory_mb,
     refine_poses: Annotated[bool, _option("refine_poses")] = _DEFAULTS.refine_poses,
-    loss: Annotated[LossName, _option("loss")] = _DEFAULTS.loss,
+    loss: Annotated[LossName | None, _option("loss")] = _DEFAULTS.loss,
     watch: Annotated[bool, typer.Option("--watch", help="Serve a progress page.")] = False,
     watch_port: Annotated[int, typer.Option(help="Port of the progress page; 0: any free port.", min=0)] = 8660,
     fov: g.Fov = None,

@@ -2660,11 +2660,8 @@ export interface components {
              * @default true
              */
             refine_poses?: boolean;
-            /**
-             * @description What the map is fitted to: the charge between spikes, or another loss, to compare methods (docs/paper.md).
-             * @default charge
-             */
-            loss?: components["schemas"]["LossName"];
+            /** @description What the map is fitted to, to compare methods; the charge between spikes if not given. */
+            loss?: components["schemas"]["LossName"] | null;
             /** @description Optics, where neither the capture nor its recording says them, or to overrule them. */
             intrinsics?: components["schemas"]["IntrinsicsOption"] | null;
         };

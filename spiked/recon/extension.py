@@ -88,7 +88,7 @@ def _trainer(joint: Joint, reconstructor: Reconstructor) -> tuple[MapTrainer, Wa
     trainer = MapTrainer(
         reconstructor.sensor,
         reconstructor.views,
-        options.mapping,
+        options.fitted,
         options.seed,
         options.threads,
         options.calibration,

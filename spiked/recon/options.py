@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 
 from spiked.calibration import Calibration
 from spiked.errors import ConfigurationError
+from spiked.recon.frontend.spike_targets import TargetKind
 from spiked.recon.mapping.loss import LossName
 from spiked.recon.mapping.options import MapOptions
 from spiked.trajectory import Trajectory
@@ -53,3 +54,9 @@ class Options:
     def fitted(self) -> MapOptions:
         """The options of the map, with `loss` where it is given."""
         return self.mapping if self.loss is None else replace(self.mapping, loss=self.loss)
+
+    @property
+    def targets(self) -> tuple[TargetKind, ...]:
+        """What views record for the loss."""
+        kind = self.fitted.loss.target
+        return () if kind is None else (kind,)

@@ -70,13 +70,13 @@ class Reconstructor:
             )
         intrinsics = sensor.intrinsics or Intrinsics.from_fov(sensor.width, sensor.height, FIRST_DEG)
         focal = Focal(intrinsics, np.inf) if sensor.intrinsics is None else None
-        target = options.fitted.loss.target
-        if target is not None and sensor.response is Response.BERNOULLI:
+        targets = options.targets
+        if targets and sensor.response is Response.BERNOULLI:
             raise ConfigurationError(
                 f"the loss {options.fitted.loss} is of cameras that integrate light, and this one counts photons: "
                 f"use the loss {LossName.CHARGE}"
             )
-        recorded = None if recording is None else RecordedViews(recording, sensor, options.calibration, target)
+        recorded = None if recording is None else RecordedViews(recording, sensor, options.calibration, targets)
         memory_bytes = options.memory_mb * 2**20
         self.views = ViewStore(options.max_views, (1 - KEYFRAME_SHARE) * memory_bytes, recorded)
         """One record a view."""
@@ -85,7 +85,7 @@ class Reconstructor:
         """The tracker: its views, points and states."""
         self.warnings: list[str] = []
         """Warnings about the recording, one sentence each."""
-        self._windows = Windows(sensor, options.window_frames, options.calibration, target)
+        self._windows = Windows(sensor, options.window_frames, options.calibration, targets)
         known = replace(sensor, intrinsics=intrinsics)
         self._trainer = MapTrainer(
             known, self.views, options.fitted, options.seed, options.threads, options.calibration

@@ -9,7 +9,7 @@ import pytest
 from spiked.blocks import aligned_window
 from spiked.errors import ConfigurationError
 from spiked.recon import LossName, MapOptions, Options, Reconstructor
-from spiked.recon.frontend.spike_targets import AdjacentSpikes, SpikeCounts, TargetKind, record_target
+from spiked.recon.frontend.spike_targets import AdjacentSpikes, SpikeCounts, TargetKind, record_target, record_targets
 from spiked.recon.frontend.windowing import make_view
 from spiked.recon.mapping.loss import BinomialLoss, ViewLoss
 from spiked.recon.mapping.pyramid import Target
@@ -58,11 +58,11 @@ def test_a_view_shows_its_target_only_to_the_map() -> None:
     images[30] = 1  # one spike too many in each pixel: the count has it
     frames = packed(images)
     window = aligned_window(frames, SENSOR, 0, 24, 40)
-    view = make_view(window, after_gap=False, target=record_target(TargetKind.COUNTS, frames, SENSOR, 0, 24, 40))
+    view = make_view(window, after_gap=False, targets=record_targets((*TargetKind,), frames, SENSOR, 0, 24, 40))
     assert view.nbytes > make_view(window, after_gap=False).nbytes
-    np.testing.assert_array_equal(view.for_map().rate, images[16:48].sum(0) / np.float32(32))
-    assert not np.array_equal(view.rate, view.for_map().rate)
-    times, windows, seen = view.for_map().exposure(4)
+    np.testing.assert_array_equal(view.showing(TargetKind.COUNTS).rate, images[16:48].sum(0) / np.float32(32))
+    assert view.showing(TargetKind.ADJACENT).rate[0, 0] == pytest.approx(1 / 5)
+    times, windows, seen = view.showing(TargetKind.COUNTS).exposure(4)
     assert seen.all() and times[0] == 16 and times[-1] == 48 and (windows[1] - windows[0] == 4).all()
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from spiked.blocks import aligned_window
 from spiked.calibration import Calibration
 from spiked.recon.frontend.motion_compensation import COARSE_FRAMES, MotionCompensator
-from spiked.recon.frontend.spike_targets import TargetKind, record_target
+from spiked.recon.frontend.spike_targets import TargetKind, record_targets
 from spiked.recon.frontend.windowing import View, make_view
 from spiked.sensor import Image, Sensor
 
@@ -50,7 +50,7 @@ class RecordedViews:
     source: RecordedFrames
     sensor: Sensor
     calibration: Calibration | None = None
-    target: TargetKind | None = None
+    targets: tuple[TargetKind, ...] = ()
     """What each view records for the map."""
 
     def holds(self, of: ViewFrames) -> bool:
@@ -61,7 +61,7 @@ class RecordedViews:
 
     def build(self, of: ViewFrames, sharp: bool = False) -> View | None:
         """See `build_view`."""
-        return build_view(of, self.source, self.sensor, self.calibration, sharp, self.target)
+        return build_view(of, self.source, self.sensor, self.calibration, sharp, self.targets)
 
 
 def build_view(
@@ -70,7 +70,7 @@ def build_view(
     sensor: Sensor,
     calibration: Calibration | None = None,
     sharp: bool = False,
-    target: TargetKind | None = None,
+    targets: tuple[TargetKind, ...] = (),
 ) -> View | None:
     """The view of these frames, equal to the first one; None if they cannot be read.
 
@@ -83,8 +83,8 @@ def build_view(
     window = aligned_window(frames, sensor, of.first, of.begin, of.end)
     image = _sharp(of, frames, sensor) if sharp and warped is not None else None
     first = 0 if of.warped is None else of.warped[0]
-    shown = None if target is None else record_target(target, frames, sensor, of.first, of.begin, of.end)
-    return make_view(window, of.after_gap, calibration, image, first, warped, sensor.response, shown)
+    recorded = record_targets(targets, frames, sensor, of.first, of.begin, of.end)
+    return make_view(window, of.after_gap, calibration, image, first, warped, sensor.response, recorded)
 
 
 def _sharp(of: ViewFrames, frames: NDArray[np.uint8], sensor: Sensor) -> Image | None:

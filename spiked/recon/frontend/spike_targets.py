@@ -40,6 +40,8 @@ class SpikeCounts:
     """Frames from the middle of the view to the begin of the window."""
     end: float
 
+    kind = TargetKind.COUNTS
+
     @property
     def nbytes(self) -> int:
         """Bytes of the array."""
@@ -71,6 +73,8 @@ class AdjacentSpikes:
     """Number of frames searched."""
     offset: float
     """Frames from the middle of the view to the instant."""
+
+    kind = TargetKind.ADJACENT
 
     @property
     def nbytes(self) -> int:
@@ -131,6 +135,18 @@ def record_target(
         _first_spike(unpack(np.ascontiguousarray(part), sensor)) for part in (frames[:at][::-1], frames[at:])
     )
     return AdjacentSpikes(before, after, len(frames), instant - middle)
+
+
+def record_targets(
+    kinds: tuple[TargetKind, ...],
+    frames: NDArray[np.uint8],
+    sensor: Sensor,
+    first_frame: int,
+    begin: int,
+    end: int,
+) -> tuple[SpikeTarget, ...]:
+    """See `record_target`; frames are uint8 [n, frame_bytes]."""
+    return tuple(record_target(kind, frames, sensor, first_frame, begin, end) for kind in kinds)
 
 
 def _first_spike(images: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -13,7 +13,7 @@ from spiked.calibration import Calibration
 from spiked.recon.frontend.motion_compensation import BINOMIAL, MotionCompensator, drift, speed
 from spiked.recon.frontend.photon_counts import PhotonCounts
 from spiked.recon.frontend.spike_intervals import SpikeIntervals
-from spiked.recon.frontend.spike_targets import SpikeTarget, TargetKind, record_target
+from spiked.recon.frontend.spike_targets import SpikeTarget, TargetKind, record_targets
 from spiked.sensor import Image, Mosaic, Response, Sensor
 
 SITE_SHARES = np.array([0.25, 0.5, 0.25], np.float32)
@@ -79,18 +79,18 @@ class View:
     """Absolute index of the first of `frames`."""
     frames: NDArray[np.uint8] | None = None
     """Stored frames [n, frame_bytes] around the middle, if `sharp` is set; the map is fitted to all of them."""
-    target: SpikeTarget | None = None
-    """What the map is fitted to, if not to the charge between `intervals`."""
-    shows_target: bool = False
-    """Rates, deviations and exposures are those of `target`."""
+    targets: tuple[SpikeTarget, ...] = ()
+    """What else the map may be fitted to, one of a kind."""
+    shown: SpikeTarget | None = None
+    """Rates, deviations and exposures are those of this target; None: of the charge between `intervals`."""
 
-    def for_map(self) -> "View":
-        """The view as the map is fitted to it: that of its target, if it has one."""
-        return self if self.target is None else replace(self, shows_target=True)
+    def showing(self, kind: TargetKind | None) -> "View":
+        """The view with rates, deviations and exposures of its target of that kind; None: of its intervals."""
+        return replace(self, shown=next((one for one in self.targets if one.kind is kind), None))
 
     @property
     def _measured(self) -> SpikeIntervals | PhotonCounts | SpikeTarget:
-        return self.target if self.shows_target and self.target is not None else self.intervals
+        return self.intervals if self.shown is None else self.shown
 
     @property
     def time(self) -> float:
@@ -117,8 +117,8 @@ class View:
     def nbytes(self) -> int:
         """Bytes held by the view: spikes, the compensated image, and its share of the frames."""
         frames = 0 if self.frames is None else (self.end - self.begin) * self.frames.shape[1]
-        others = (self.sharp, self.target)
-        return self.intervals.nbytes + frames + sum(one.nbytes for one in others if one is not None)
+        sharp = 0 if self.sharp is None else self.sharp.nbytes
+        return self.intervals.nbytes + frames + sharp + sum(target.nbytes for target in self.targets)
 
     def preview_rate(self, out: Image) -> Image:
         """`rate` without caching; written to `out` if there is no calibration."""
@@ -150,13 +150,13 @@ def make_view(
     first: int = 0,
     frames: NDArray[np.uint8] | None = None,
     response: Response = Response.INTEGRATE_AND_FIRE,
-    target: SpikeTarget | None = None,
+    targets: tuple[SpikeTarget, ...] = (),
 ) -> View:
     """The view of a window, in light instead of spikes where the camera is calibrated."""
     counted = response is Response.BERNOULLI
     intervals = PhotonCounts.of(window) if counted else SpikeIntervals.of(window)
     count = float(cv2.mean(window.count)[0])
-    return View(window.begin, window.end, intervals, count, calibration, after_gap, sharp, first, frames, target)
+    return View(window.begin, window.end, intervals, count, calibration, after_gap, sharp, first, frames, targets)
 
 
 class Windows:
@@ -170,9 +170,9 @@ class Windows:
         sensor: Sensor,
         length: int | None,
         calibration: Calibration | None = None,
-        target: TargetKind | None = None,
+        targets: tuple[TargetKind, ...] = (),
     ) -> None:
-        """Each view records a `target`, if one is given. Raises CalibrationError when the calibration is of another
+        """Each view records these `targets`. Raises CalibrationError when the calibration is of another
         sensor."""
         counted = sensor.response is Response.BERNOULLI
         self._wanted = float(PHOTON_WINDOWS[1])
@@ -185,7 +185,7 @@ class Windows:
         """Views lie up to `SPACING_PX` apart, and frames between them are left out."""
         self._spacing = 0
         """Frames from the middle of one view to that of the next, at least."""
-        self._calibration, self._target = calibration, target
+        self._calibration, self._targets = calibration, targets
         if calibration is not None:
             calibration.check(sensor)
         self._store = np.zeros((0, sensor.frame_bytes), np.uint8)
@@ -244,8 +244,8 @@ class Windows:
         length = min(self.length, len(frames))
         begin = first_frame + (len(frames) - length) // 2
         window = aligned_window(frames, self.sensor, first_frame, begin, begin + length)
-        target = self._record(frames, first_frame, window)
-        view = make_view(window, self._gap, self._calibration, response=self.sensor.response, target=target)
+        targets = self._record(frames, first_frame, window)
+        view = make_view(window, self._gap, self._calibration, response=self.sensor.response, targets=targets)
         self._frames, self._first, self._next, self._gap = self._store[:0], stop, stop, False
         self._probed, self._compensator = True, None
         return view
@@ -324,8 +324,8 @@ class Windows:
             if sharp is None and self.sharpen and final:
                 continue  # the motion after the last frame is unknown, and a blurred view is worse than none
             first, frames = self._around((begin + end) // 2, stop) if sharp is not None else (0, None)
-            target = self._record(part, low, window)
-            view = make_view(window, self._gap, self._calibration, sharp, first, frames, self.sensor.response, target)
+            targets = self._record(part, low, window)
+            view = make_view(window, self._gap, self._calibration, sharp, first, frames, self.sensor.response, targets)
             if not self._sees_motion:
                 self._wanted = _frames_wanted(view.spikes_a_pixel / (end - begin))
             yield view
@@ -333,11 +333,9 @@ class Windows:
         keep = max(self._first, min(self._next - SEARCH_FRAMES, stop))
         self._frames, self._first = self._frames[keep - self._first :], keep
 
-    def _record(self, frames: NDArray[np.uint8], first_frame: int, window: Window) -> SpikeTarget | None:
-        """The target of a window, from the frames around it."""
-        if self._target is None:
-            return None
-        return record_target(self._target, frames, self.sensor, first_frame, window.begin, window.end)
+    def _record(self, frames: NDArray[np.uint8], first_frame: int, window: Window) -> tuple[SpikeTarget, ...]:
+        """The targets of a window, from the frames around it."""
+        return record_targets(self._targets, frames, self.sensor, first_frame, window.begin, window.end)
 
     def _around(self, middle: int, stop: int) -> tuple[int, NDArray[np.uint8]]:
         """The frames around a time; views share their memory."""

@@ -78,7 +78,7 @@ class RenderPlanner:
     def warped(self, view: View, path: Path) -> RenderRequest | None:
         """For a view of fast motion: one pose, and the frames around it inside the path; None for others, and for
         views of another target."""
-        if view.frames is None or view.shows_target:
+        if view.frames is None or view.shown is not None:
             return None
         times = view.first + 0.5 + np.arange(len(view.frames))
         covered = (times >= path.begin) & (times <= path.end)

@@ -1,13 +1,15 @@
 """Training of the map: which view each step takes, how it is rendered, and which views are swept for depth."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from spiked.calibration import Calibration
 from spiked.pose import Array
-from spiked.recon.frontend.windowing import luminance
+from spiked.recon.frontend.windowing import View, luminance
+from spiked.recon.mapping.loss import LossName
 from spiked.recon.mapping.mapper import Mapper
 from spiked.recon.mapping.options import MapOptions
 from spiked.recon.mapping.plane_sweep import SWEPT_PIXELS, PosedImage, Sweep, neighbours, sweep
@@ -50,6 +52,9 @@ class MapTrainer:
         """Increases when the map changes."""
         self._seed, self._threads, self._calibration = seed, threads, calibration
         self._rng = np.random.default_rng(seed)
+        self.loss = options.loss
+        """What the map is fitted to."""
+        self._only: frozenset[int] | None = None
         camera = Camera(sensor.intrinsics, sensor.width, sensor.height)
         self.planner = RenderPlanner(camera, options.sub_frames, blur_matched=options.blur_matched)
         self.restart()
@@ -155,15 +160,34 @@ class MapTrainer:
         swept = sweep(filled, others, lens.straight, planes, straight, pixels, self._threads)
         return Sweep(lens.bend(swept.inverse_depth), lens.bend(np.where(known, swept.confidence, np.float32(0))))
 
+    def shown(self, view_id: int) -> View:
+        """The image of a view as the map is fitted to it."""
+        return self.views.image(view_id).showing(self.loss.target)
+
+    def fit_with(self, loss: LossName) -> None:
+        """Fit the map with another loss from now on; the views have recorded what it needs."""
+        self.loss = loss
+        self.mapper.view_loss = replace(self.options, loss=loss).view_loss()
+
+    def use_only(self, ids: Sequence[int] | None) -> None:
+        """Take steps on these views only; None: on all."""
+        self._only = None if ids is None else frozenset(ids)
+        self.reshuffle()
+
+    def usable(self, path: Path) -> list[int]:
+        """Ids of the views that steps are taken on."""
+        ids = self.views.mappable(path)
+        return ids if self._only is None else [i for i in ids if i in self._only]
+
     def step(self, path: Path, decay: float, coarse: float, share: float) -> None:
         """One gradient step on the next view of a random order.
 
         `decay` scales the learning rates; `coarse` is the pyramid level, 0 to 1; `share` of the refinement is done.
         """
         if not self._queue:
-            self._queue = [int(i) for i in self._rng.permutation(self.views.mappable(path))]
+            self._queue = [int(i) for i in self._rng.permutation(self.usable(path))]
         view_id = self._queue.pop()
-        view, level = self.views.image(view_id).for_map(), self.mapper.level(coarse)
+        view, level = self.shown(view_id), self.mapper.level(coarse)
         request = self.planner.request(view, path, level.factor)
         self.mapper.step(view_id, view, request, decay, level)
         if self.options.densification.due(self.mapper.steps, share):

@@ -76,9 +76,10 @@ def simulate(
 
     The folder, which must be new or empty, then holds NAME.dat, its sidecar NAME.json, groundtruth.tum (a pose for the
     middle of each frame), and `views` held-out noise-free pictures in views/ with their poses in views.json, evenly
-    spread over time; every other one lies beside the path, drawn by `seed`. These pictures have no
-    distortion. If the camera interpolates between exact pictures, `simulation.interpolation` of the sidecar is the
-    error of that, measured as in `InterpolationError`.
+    spread over time; every other one lies beside the path, drawn by `seed`. These pictures have no distortion; of a
+    lens with distortion, views_lens/ has pictures of the same poses as the lens shows them. If the camera interpolates
+    between exact pictures, `simulation.interpolation` of the sidecar is the error of that, measured as in
+    `InterpolationError`.
     Memory does not grow with `frames`. `progress` is called with the number of frames written. Raises RecordingError
     if the folder cannot be written or holds something, and ConfigurationError for a sensor whose frames are not compact
     and LSB first.
@@ -129,6 +130,9 @@ def _write_views(camera: SimulatedCamera, folder: Path, frames: int, *, views: i
     path = camera.truth(np.arange(0, frames, _COVERAGE_STRIDE))
     middle_rotations, middle_centres = camera.truth([frames // 2])
     median_depth = float(np.median(_finite(camera.depth(middle_rotations[0], middle_centres[0], undistorted=True))))
+    through_lens = camera.intrinsics.distortion is not None
+    if through_lens:
+        (folder / "views_lens").mkdir()
     entries = []
     for number, frame in enumerate(chosen):
         on_path = number % 2 == 0
@@ -137,15 +141,14 @@ def _write_views(camera: SimulatedCamera, folder: Path, frames: int, *, views: i
         if not on_path:
             pose[:3, 3] += 0.015 * median_depth * rng.standard_normal(3)
             pose[:3, :3] = pose[:3, :3] @ exp_so3(0.015 * rng.standard_normal(3))
-        intensity = camera.view(pose[:3, :3], pose[:3, 3], undistorted=True) / camera.gain
-        picture = np.round(np.clip(intensity, 0, 1) * 255).astype(np.uint8)
-        file = f"views/{number:02d}.png"
-        (folder / file).write_bytes(
-            cv2.imencode(".png", picture[..., ::-1] if picture.ndim == 3 else picture)[1].tobytes()
-        )
+        files = {"file": f"views/{number:02d}.png"}
+        _write_view(camera, pose, folder / files["file"], undistorted=True)
+        if through_lens:
+            files["lens_file"] = f"views_lens/{number:02d}.png"
+            _write_view(camera, pose, folder / files["lens_file"], undistorted=False)
         entries.append(
             {
-                "file": file,
+                **files,
                 "on_trajectory": on_path,
                 "timestamp": (int(frame) + 0.5) / camera.sensor.frame_rate_hz,
                 "c2w": pose.tolist(),
@@ -160,6 +163,12 @@ def _write_views(camera: SimulatedCamera, folder: Path, frames: int, *, views: i
         "views": entries,
     }
     (folder / "views.json").write_text(json.dumps(table, indent=1), encoding="utf-8")
+
+
+def _write_view(camera: SimulatedCamera, pose: Array, path: Path, *, undistorted: bool) -> None:
+    intensity = camera.view(pose[:3, :3], pose[:3, 3], undistorted) / camera.gain
+    picture = np.round(np.clip(intensity, 0, 1) * 255).astype(np.uint8)
+    path.write_bytes(cv2.imencode(".png", picture[..., ::-1] if picture.ndim == 3 else picture)[1].tobytes())
 
 
 def _finite(depth: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -13,8 +13,10 @@ from spiked.distortion import Distortion, LensModel
 from spiked.errors import RecordingError
 from spiked.recording import open_recording
 from spiked.recording.sidecar import read_sidecar
+from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import SimulatedCamera
+from spiked.trajectory import Trajectory, tum_lines
 
 WIDTH, HEIGHT = 96, 64
 BARREL = Intrinsics(90.0, 90.0, 48.0, 32.0, Distortion(LensModel.OPENCV, (-0.3, 0.1, 0.003, -0.002)))
@@ -59,6 +61,36 @@ def test_held_out_views_have_no_distortion(tmp_path: Path) -> None:
     assert open_recording(bent / "simulated.dat").sensor.intrinsics == Intrinsics(90, 90, 48, 32, distortion)
     shown = CliRunner().invoke(app, ["info", str(bent / "simulated.dat")]).output
     assert "opencv, k1 -0.3, k2 0.1" in shown
+    assert not (plain / "views_lens").exists()
+
+
+def test_views_through_the_lens_are_scored_in_its_own_pixels(tmp_path: Path) -> None:
+    rng, count, result = np.random.default_rng(5), 300, tmp_path / "result"
+    means = rng.uniform([-1.2, -0.9, 1.5], [1.2, 0.9, 3.0], (count, 3)).astype(np.float32)
+    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
+    sizes = np.full((count, 3), np.log(0.08), np.float32)
+    colours = rng.uniform(0.1, 0.6, (count, 1)).astype(np.float32)
+    scene = Scene(means, quats, sizes, np.full(count, 1.5, np.float32), colours)
+    result.mkdir()
+    scene.write_ply(result / "scene.ply")
+    times = np.linspace(0, 63 / 20_000, 64)
+    path = Trajectory(
+        times, np.tile(np.eye(3), (64, 1, 1)), np.stack([0.1 * np.cos(1e3 * times), 40 * times, 0 * times], 1)
+    )
+    (result / "path.tum").write_text("".join(tum_lines([path])))
+    room = tmp_path / "room"
+    options = ["--width", "96", "--height", "64", "--frames", "64", "--views", "2", "--fov", "100"]
+    files = ["--scene", str(result / "scene.ply"), "--poses", str(result / "path.tum"), "--distortion", "fisheye:0.02"]
+    done = CliRunner().invoke(app, ["simulate", "-o", str(room), *options, *files])
+    assert done.exit_code == 0, done.output
+    (result / "trajectory.tum").write_bytes((room / "groundtruth.tum").read_bytes())
+    recording, figures = str(room / "simulated.dat"), result / "score.json"
+    done = CliRunner().invoke(app, ["evaluate", str(result), "--recording", recording, "--json", str(figures)])
+    assert done.exit_code == 0, done.output
+    scores = json.loads(figures.read_text())
+    assert scores["lens_worst_psnr_db"] > 45 and scores["worst_psnr_db"] > 45, scores
+    views = [cv2.imread(str(room / folder / "00.png")).astype(int) for folder in ("views", "views_lens")]
+    assert np.abs(views[0] - views[1]).mean() > 3
 
 
 def test_the_field_of_view_is_what_the_lens_shows(tmp_path: Path) -> None:

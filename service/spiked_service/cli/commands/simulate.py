@@ -64,7 +64,8 @@ def simulate(
 ) -> None:
     """Simulate a camera with shot, thermal, dark and fixed-pattern noise, with ground truth.
 
-    With --distortion the recording is distorted; the held-out views are not.
+    With --distortion the recording is distorted; the held-out views are not. The folder views_lens then has the same
+    views through the lens, for `spiked evaluate`.
 
     Examples:
 

@@ -1,6 +1,7 @@
 """The folder of camera profiles: what captures take from it, and calibrations made of captures."""
 
 import threading
+from collections.abc import Iterable
 from pathlib import Path
 
 from spiked_driver import open_camera
@@ -9,11 +10,16 @@ from spiked_driver.spec import stored_profile
 
 from spiked.calibration import Calibration
 from spiked.camera import CameraFiles
-from spiked.profile import CameraProfile, profile_path
-from spiked.recording import Recording
+from spiked.errors import ProfileError
+from spiked.profile import SHARED_SERIALS, CameraProfile, profile_path
+from spiked.recording import Recording, read_sidecar, sidecar_path
 from spiked_service.base.ids import new_id
-from spiked_service.captures.sources import with_options
+from spiked_service.captures.sources import same_device, with_options
 from spiked_service.store.catalogue import UnknownIdError
+from spiked_service.store.rows import CaptureRow, Origin
+
+MEASURED = "calibration-"
+"""Names of the calibrations that are made here begin so."""
 
 
 class CameraProfiles:
@@ -58,6 +64,21 @@ class CameraProfiles:
         named = None if stored is None else CameraProfile.read(stored).calibration
         return None if named is None else self.folder / named
 
+    def remove_unused_calibrations(self, sources: Iterable[str]) -> None:
+        """Remove the calibrations made here that no profile and no source names. Nothing may read them meanwhile.
+
+        While a profile cannot be read, all stay.
+        """
+        stated = list(sources)
+        with self._measuring:
+            try:
+                named = {CameraProfile.read(path).calibration for path in self.folder.glob("*.json")}
+            except ProfileError:
+                return
+            for path in self.folder.glob(f"{MEASURED}*.npz"):
+                if Path(path.name) not in named and not any(path.name in source for source in stated):
+                    path.unlink(missing_ok=True)
+
     def calibrate(self, device: Device, flat: Recording | None, dark: Recording | None) -> tuple[Path, Calibration]:
         """Measure gains and dark rates, and store them with the device's profile. Returns its file.
 
@@ -69,7 +90,7 @@ class CameraProfiles:
             measured = Calibration.measure(flat, dark, None if flat is not None and dark is not None else before)
             profile = CameraProfile() if stored is None else CameraProfile.read(stored)
             # A new name: armed devices and captures that start meanwhile still read the one before.
-            path = self.folder / f"calibration-{new_id()}.npz"
+            path = self.folder / f"{MEASURED}{new_id()}.npz"
             try:
                 measured.write(path)
                 file = self.replace(device, profile.model_copy(update={"calibration": Path(path.name)}))
@@ -77,3 +98,18 @@ class CameraProfiles:
                 path.unlink(missing_ok=True)
                 raise
             return file, measured
+
+
+def of_another_camera(row: CaptureRow, recording: Recording, device: Device) -> str | None:
+    """What shows that a capture is not of the device's camera; None if nothing does.
+
+    Serial numbers decide where both are known, else the source of a live capture. An upload without a serial number may
+    be of any camera.
+    """
+    profile = read_sidecar(sidecar_path(recording.path)).profile or {}
+    serial = profile.get("serial")
+    if not {serial, device.serial} & {None, *SHARED_SERIALS}:
+        return None if serial == device.serial else f"camera {serial}"
+    if row.origin is Origin.LIVE and not same_device(row.source, device):
+        return f"the device {row.source}"
+    return None

@@ -3,6 +3,7 @@
 from urllib.parse import parse_qsl, urlencode
 
 from pydantic import BaseModel
+from spiked_driver.source_kind import Device, SourceSpec
 from spiked_driver.source_kinds import find_kind
 
 from spiked.camera import CameraFiles, CameraOptions
@@ -21,6 +22,15 @@ def device_of(source: str) -> str:
         return address
     options = [option for option in query.split("&") if option and not option.startswith("pace=")]
     return f"{address}?{'&'.join(options)}" if options else address
+
+
+def same_device(source: str, device: Device) -> bool:
+    """Whether a source is the device: by its address, or because both names are of one port now."""
+    if device_of(unpaced(source)) == device_of(unpaced(device.source)):
+        return True
+    kind = find_kind(source)
+    port = None if kind is None or kind.name != device.kind else kind.describe(SourceSpec.parse(source)).port
+    return port is not None and port == device.port
 
 
 def stated_options(source: str) -> bool:

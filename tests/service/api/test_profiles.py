@@ -1,16 +1,23 @@
 """Camera profiles over HTTP: checked, kept over a restart, and used by captures."""
 
+import json
 import time
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from spiked_driver.source_kind import Device
+from spiked_service.captures.camera_profiles import of_another_camera
+from spiked_service.store.rows import CaptureRow, CaptureState, Origin, Plan
 
 from spiked.calibration import Calibration
 from spiked.client import ApiError, ProfileModel, Spiked, StatedCameraModel
 from spiked.profile import CameraProfile
+from spiked.recording import open_recording, sidecar_path
 from spiked.sensor import Sensor
 from tests.still_recordings import still
 
@@ -118,6 +125,7 @@ def test_a_device_is_calibrated_by_captures(service: Any, folder: Path, tmp_path
         both = client.calibrate(DEVICE, flat=flat)  # the dark rates of before stay
         assert both.measured.dark_rate == first.measured.dark_rate
         assert both.measured.useless > first.measured.useless and both.measured.gain_spread > 0.01
+        assert [file.name for file in folder.glob("*.npz")] == [str(both.profile.calibration)]
         whole = Calibration.read(folder / str(both.profile.calibration))
         flags = {
             "useless": (whole.dead, 255, 255),
@@ -136,8 +144,34 @@ def test_a_device_is_calibrated_by_captures(service: Any, folder: Path, tmp_path
         assert sidecar["calibration"] == "calibration.npz"
     finally:
         service.http.delete(PATH)
-        for file in folder.iterdir():
-            file.unlink()
+    assert list(folder.iterdir()) == []
+
+
+def test_a_capture_of_another_camera_does_not_calibrate_a_device(service: Any, folder: Path) -> None:
+    client = service.client
+    started = client.start_capture("sim:?width=96&height=64&seed=3", frames=400, reconstruct=False)
+    other = client.wait_for_capture(started.id, 60).id
+    refused = service.http.post(f"{PATH}:calibrate", json={"dark": other})
+    assert refused.status_code == 409 and "is of the device sim:?" in refused.text, refused.text
+    assert list(folder.iterdir()) == []
+
+
+def test_serial_numbers_tell_cameras_apart(tmp_path: Path) -> None:
+    path = still(tmp_path / "serial.dat", SENSOR, 0)
+    sidecar = sidecar_path(path)
+    sidecar.write_text(json.dumps({**json.loads(sidecar.read_text()), "profile": {"serial": "A8"}}))
+    recording = open_recording(path)
+    live = CaptureRow("a", Origin.LIVE, Plan("usb0"), CaptureState.COMPLETE, datetime.now(UTC))
+    for serial, source, told in (
+        ("A8", "usb:2-4", None),
+        ("A9", "usb0", "camera A8"),
+        (None, "usb0", None),
+        ("000000000001", "pcie:/dev/JR6101", "the device usb0"),
+    ):
+        device = Device(source, source.partition(":")[0], "", serial=serial)
+        assert of_another_camera(live, recording, device) == told
+    upload = replace(live, origin=Origin.UPLOAD)
+    assert of_another_camera(upload, recording, Device("pcie:/dev/JR6101", "pcie", "")) is None
 
 
 def test_what_cannot_calibrate_a_device_leaves_it_as_it_was(service: Any, folder: Path, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from spiked_driver.source_kind import Device
 from spiked.calibration import Calibration
 from spiked.errors import SpikedError
 from spiked.profile import CameraProfile
+from spiked.recording import Recording
 from spiked.ring import DeviceState
 from spiked_service.api import files
 from spiked_service.api.idempotency import IdempotencyKey
@@ -33,7 +34,7 @@ from spiked_service.api.schemas.captures import (
     ProfileOut,
 )
 from spiked_service.api.sources import Sources
-from spiked_service.captures.camera_profiles import CameraProfiles
+from spiked_service.captures.camera_profiles import CameraProfiles, of_another_camera
 from spiked_service.captures.captures import Captures
 from spiked_service.captures.sources import device_of, unpaced
 from spiked_service.events.bus import Bus, Topic
@@ -98,6 +99,11 @@ def _add_profile_routes(
 ) -> None:
     """Routes that read, write, measure and remove the profile of a device."""
 
+    def tidy() -> None:
+        # Captures and armed devices have read a profile, and may read its calibration later.
+        if not captures.live() and not captures.armed():
+            profiles.remove_unused_calibrations(device.source for device in sources.devices())
+
     @router.get("/{device_id:device}/profile", responses=problems(404))
     def get_device_profile(device_id: DeviceId) -> ProfileOut:
         """What captures of the device take from its profile."""
@@ -114,12 +120,15 @@ def _add_profile_routes(
             raise ConflictError(f"the profile is of camera {body.serial}, and {device_id} is camera {device.serial}")
         if body.calibration is not None:
             sources.check_file(str(profiles.folder / body.calibration), profiles.folder)
-        return ProfileOut(file=profiles.replace(device, body).name, profile=body)
+        written = profiles.replace(device, body)
+        tidy()
+        return ProfileOut(file=written.name, profile=body)
 
     @router.delete("/{device_id:device}/profile", status_code=HTTPStatus.NO_CONTENT, responses=problems(404))
     def remove_device_profile(device_id: DeviceId) -> None:
         """Remove the profile of the device."""
         profiles.remove(_find(sources, device_id))
+        tidy()
 
     @router.post("/{device_id:device}/profile:calibrate", responses=problems(404, 409))
     def calibrate_device(
@@ -131,9 +140,10 @@ def _add_profile_routes(
         """
         device = _find(sources, device_id)
         flat, dark = (
-            None if one is None else closed_recording(captures, folder, one) for one in (body.flat, body.dark)
+            None if one is None else _recording_by(device, one, captures, folder) for one in (body.flat, body.dark)
         )
         file, measured = profiles.calibrate(device, flat, dark)
+        tidy()
         shown = CalibrationOut(**asdict(measured.summary()))
         return CalibratedOut(**_profile_out(file).model_dump(), measured=shown)
 
@@ -153,6 +163,17 @@ def _add_profile_routes(
 
 def _profile_out(path: Path) -> ProfileOut:
     return ProfileOut(file=path.name, profile=ProfileModel(**CameraProfile.read(path).model_dump()))
+
+
+def _recording_by(device: Device, capture_id: str, captures: Captures, folder: DataFolder) -> Recording:
+    """The recording of a capture. Raises ConflictError while it is written, and if another camera made it."""
+    recording = closed_recording(captures, folder, capture_id)
+    other = of_another_camera(captures.get(capture_id).row, recording, device)
+    if other is not None:
+        raise ConflictError(
+            f"capture {capture_id} is of {other}, not of {device.source}: calibrate with a capture of this camera"
+        )
+    return recording
 
 
 def _find(sources: Sources, device_id: str) -> Device:

@@ -1,11 +1,11 @@
-"""Scores a trajectory and its renders against the truth: ATE, RPE, coverage, PSNR, SSIM.
+"""Scores a trajectory and its renders against the truth: ATE, RPE, coverage, PSNR, SSIM, LPIPS.
 
 Trajectories are camera-to-world rotations [n, 3, 3] and centres [n, 3] of the same frames. An estimate's length unit
 and world frame are its own, so the truth is aligned by a similarity first.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -33,6 +33,8 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+Distance = Callable[[NDArray[np.float32], NDArray[np.float32]], float]
+"""Of two pictures of one size with values in [0, 1]: `spiked.lpips.Lpips` is one."""
 Render = Callable[[Array, Array], NDArray[np.float32]]
 """A picture [H, W] or [H, W, 3] from a camera-to-world rotation [3, 3] and centre [3]."""
 
@@ -81,6 +83,11 @@ class PoseErrors:
     """Mean angle between true and estimated rotation over 32 frames, in degrees."""
     rpe_t_percent: float
     """Mean difference between true and estimated translation over 32 frames, in % of the truth's RMS radius."""
+    rpe_r_unit_deg: float
+    """Mean angle between true and estimated rotation from each of the 24 poses of `ate_unit` to the next, in degrees
+    (the convention of the CF-3DGS and InstantSplat tables)."""
+    rpe_t_unit: float
+    """The same of the translation, in hundredths of the unit of `ate_unit`, as those tables print it."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +107,10 @@ class ViewScore:
     psnr_db: list[float]
     ssim: list[float]
     gain: float
+    lpips: list[float] | None = None
+    """Perceptual distance of each view, 0 for equal ones; None where it was not asked for."""
+    shown: list[NDArray[np.float32]] = field(default_factory=list, repr=False, compare=False)
+    """The renders that were compared, after the gain, in [0, 1]."""
 
     @property
     def mean_psnr_db(self) -> float:
@@ -110,6 +121,11 @@ class ViewScore:
     def mean_ssim(self) -> float:
         """Mean over the views of their SSIM."""
         return float(np.mean(self.ssim))
+
+    @property
+    def mean_lpips(self) -> float | None:
+        """Mean over the views of their LPIPS, None without."""
+        return None if self.lpips is None else float(np.mean(self.lpips))
 
 
 def umeyama(*, source: Array, target: Array) -> Similarity:
@@ -160,12 +176,14 @@ def pose_errors(*, truth: Poses, estimate: Poses) -> PoseErrors:
     apart = min(RPE_FRAMES, n - 1)
     turn, way = _relative(truth_rotations, truth_centres, apart)
     turn_est, way_est = _relative(rotations, fit.scale * centres, apart)
-    angles = np.linalg.norm(log_so3(turn.swapaxes(-1, -2) @ turn_est), axis=1)
+    unit = _unit_errors(truth, estimate)
     return PoseErrors(
         ate_percent=100 * ate / radius,
-        ate_unit=_ate_unit(truth_centres, centres),
-        rpe_r_deg=float(np.degrees(angles).mean()),
+        ate_unit=unit[0],
+        rpe_r_deg=_mean_angle_deg(turn, turn_est),
         rpe_t_percent=float(100 * np.linalg.norm(way_est - way, axis=1).mean() / radius),
+        rpe_r_unit_deg=unit[1],
+        rpe_t_unit=unit[2],
     )
 
 
@@ -265,10 +283,12 @@ def score_views(
     truths: Sequence[NDArray[np.float32]],
     length: float,
     refine: bool = True,
+    perceptual: Distance | None = None,
 ) -> ViewScore:
     """Score renders at held-out poses, given in the scene's frame, against images in [0, 1].
 
-    With `refine`, each pose is first refined on its image, so that errors of the similarity do not count.
+    With `refine`, each pose is first refined on its image, so that errors of the similarity do not count. `perceptual`
+    gives `ViewScore.lpips`.
     """
     at = list(poses)
     gain = best_gain([render(*pose) for pose in at], truths=truths)
@@ -281,7 +301,13 @@ def score_views(
     gain = best_gain(images, truths=truths)
     shown = [np.clip(gain * image, 0, 1) for image in images]
     pairs = list(zip(shown, truths, strict=True))
-    return ViewScore([psnr(i, t) for i, t in pairs], [ssim(i, t) for i, t in pairs], gain)
+    return ViewScore(
+        psnr_db=[psnr(i, t) for i, t in pairs],
+        ssim=[ssim(i, t) for i, t in pairs],
+        gain=gain,
+        lpips=None if perceptual is None else [perceptual(i, t) for i, t in pairs],
+        shown=shown,
+    )
 
 
 def _rms(differences: Array) -> float:
@@ -294,15 +320,26 @@ def _relative(rotations: Array, centres: Array, apart: int) -> tuple[Array, Arra
     return back @ rotations[apart:], np.einsum("nij,nj->ni", back, centres[apart:] - centres[:-apart])
 
 
-def _ate_unit(truth_centres: Array, centres: Array) -> float:
-    rows = np.linspace(0, len(centres) - 1, _UNIT_POSES).round().astype(int)
+def _mean_angle_deg(turns: Array, others: Array) -> float:
+    """Mean angle between rotations [n, 3, 3] and others, in degrees."""
+    return float(np.degrees(np.linalg.norm(log_so3(turns.swapaxes(-1, -2) @ others), axis=1)).mean())
+
+
+def _unit_errors(truth: Poses, estimate: Poses) -> tuple[float, float, float]:
+    """`ate_unit`, `rpe_r_unit_deg` and `rpe_t_unit` of `PoseErrors`."""
+    rows = np.linspace(0, len(truth[1]) - 1, _UNIT_POSES).round().astype(int)
+    (truth_rotations, truth_centres), (rotations, centres) = ((r[rows], c[rows]) for r, c in (truth, estimate))
 
     def unit(x: Array) -> Array:
         centred = x - x.mean(0)
         return np.asarray(centred / max(float(np.linalg.norm(centred)), 1e-12))
 
-    a, b = unit(centres[rows]), unit(truth_centres[rows])
-    return _rms(umeyama(source=a, target=b).points(a) - b)
+    a, b = unit(centres), unit(truth_centres)
+    fit = umeyama(source=a, target=b)
+    turn, way = _relative(truth_rotations, b, 1)
+    turn_est, way_est = _relative(rotations, fit.scale * a, 1)
+    way_error = float(100 * np.linalg.norm(way_est - way, axis=1).mean())
+    return _rms(fit.points(a) - b), _mean_angle_deg(turn, turn_est), way_error
 
 
 def _moved(pose: tuple[Array, Array], step: Array) -> tuple[Array, Array]:

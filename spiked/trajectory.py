@@ -161,13 +161,13 @@ def colmap_camera(sensor: Sensor) -> str:
     if sensor.intrinsics is None:
         raise SceneError("a COLMAP model needs intrinsics; give --intrinsics or --fov")
     k = sensor.intrinsics
-    model, coefficients = _colmap_lens(k.distortion)
+    model, coefficients = colmap_lens(k.distortion)
     numbers = [sensor.width, sensor.height, k.fx, k.fy, k.cx, k.cy, *coefficients.values()]
     names = " ".join(["# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY", *(name.upper() for name in coefficients)])
     return f"{names}\n1 {model} {' '.join(map(repr, numbers))}\n"
 
 
-def _colmap_lens(lens: Distortion | None) -> tuple[str, dict[str, float]]:
+def colmap_lens(lens: Distortion | None) -> tuple[str, dict[str, float]]:
     """COLMAP's name of a camera model, and its coefficients after the focal lengths and the centre."""
     if lens is None:
         return "PINHOLE", {}

@@ -190,6 +190,32 @@ def test_ate_and_rpe_are_those_of_evo() -> None:
         assert figure == pytest.approx(rpe.get_statistic(metrics.StatisticsType.mean), rel=1e-9)
 
 
+def test_the_figures_of_unit_norm_are_those_of_evo() -> None:
+    """24 poses of paths of unit norm, from each to the next, as the tables of CF-3DGS and InstantSplat have them."""
+    rotations, centres = path()
+    moved, places = noisy(*CARRY.poses(rotations, centres))
+    ours = pose_errors(truth=(rotations, centres), estimate=(moved, places))
+    rows = np.linspace(0, 199, 24).round().astype(int)
+    truth, estimate = (
+        PosePath3D(
+            positions_xyz=(c[rows] - c[rows].mean(0)) / np.linalg.norm(c[rows] - c[rows].mean(0)),
+            orientations_quat_wxyz=quaternion(r[rows]),
+        )
+        for r, c in ((rotations, centres), (moved, places))
+    )
+    estimate.align(truth, correct_scale=True)
+    ate = metrics.APE(metrics.PoseRelation.translation_part)
+    ate.process_data((truth, estimate))
+    assert ours.ate_unit == pytest.approx(ate.get_statistic(metrics.StatisticsType.rmse), rel=1e-9)
+    for relation, figure in (
+        (metrics.PoseRelation.rotation_angle_deg, ours.rpe_r_unit_deg),
+        (metrics.PoseRelation.translation_part, ours.rpe_t_unit / 100),
+    ):
+        rpe = metrics.RPE(relation, delta=1, delta_unit=metrics.Unit.frames)
+        rpe.process_data((truth, estimate))
+        assert figure == pytest.approx(rpe.get_statistic(metrics.StatisticsType.mean), rel=1e-9)
+
+
 @pytest.mark.parametrize("shape", [(40, 60), (40, 60, 3)], ids=["grey", "colour"])
 def test_ssim_is_that_of_scikit_image(shape: tuple[int, ...]) -> None:
     """scikit-image leaves out a margin of 5 px in its mean, so the image's own margin is a mirror image there."""

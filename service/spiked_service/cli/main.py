@@ -9,8 +9,10 @@ import typer
 from spiked.errors import SpikedError
 from spiked_service.base.version import installed_version
 from spiked_service.cli.commands.backup import backup, restore
+from spiked_service.cli.commands.baseline import baseline
 from spiked_service.cli.commands.bench import bench
 from spiked_service.cli.commands.calibrate import calibrate
+from spiked_service.cli.commands.compare import compare
 from spiked_service.cli.commands.config import config
 from spiked_service.cli.commands.convert import convert
 from spiked_service.cli.commands.devices import devices
@@ -58,7 +60,7 @@ def _options(
 for _group, _commands in {
     "Live": (serve, devices, backup, restore),
     "Files": (info, verify, convert, offset, simulate, calibrate, noise_report),
-    "Scenes": (reconstruct, localise, merge, render, evaluate),
+    "Scenes": (reconstruct, localise, merge, render, evaluate, baseline, compare),
     "This program": (bench, openapi, version),
 }.items():
     for _command in _commands:

@@ -1,6 +1,7 @@
 """`spiked evaluate`: errors of a reconstruction against ground truth."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,7 @@ from pydantic import BaseModel
 
 from spiked.errors import SceneError
 from spiked.evaluate import ViewScore, score_trajectory, score_views, similarity_of_trajectories
+from spiked.lpips import LPIPS_LEAST_SIDE_PX, Lpips, lpips_available
 from spiked.recording import Recording, open_recording
 from spiked.render import Camera
 from spiked.render.cpu import Rasteriser
@@ -24,37 +26,57 @@ _LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)  # the weights by which
 
 
 def evaluate(
-    result: Annotated[Path, typer.Argument(help="Output folder of `spiked reconstruct`.")],
+    result: Annotated[Path, typer.Argument(help="Output folder of `spiked reconstruct` or `spiked baseline`.")],
     recording: Annotated[Path, typer.Option(help="The recording, with groundtruth.tum and views.json beside it.")],
     json_out: Annotated[Path | None, typer.Option("--json", help="Also write the figures to this file.")] = None,
+    pictures: Annotated[
+        Path | None, typer.Option(help="Also write the held-out views, true and rendered, to this folder.")
+    ] = None,
+    lpips: Annotated[
+        bool | None,
+        typer.Option(
+            "--lpips/--no-lpips",
+            help="LPIPS of the views; by default if it is installed and they are 63 pixels wide and high.",
+        ),
+    ] = None,
 ) -> None:
-    """Print coverage, ATE and RPE of a trajectory, and PSNR and SSIM of held-out views: the mean, and the worst PSNR.
+    """Print the errors of a trajectory, and of held-out views: the mean, and the worst PSNR.
+
+    coverage: share of the true frames with a pose. ate_percent: ATE in percent of the RMS radius of the true path,
+    after alignment by a similarity. rpe_r_deg and rpe_t_percent: over 32 frames, translation in percent of the radius.
+    ate_unit, rpe_r_unit_deg and rpe_t_unit: the same of 24 poses on paths of unit norm, from each to the next and
+    translation in hundredths, as the tables of CF-3DGS and InstantSplat have them. psnr_db, ssim and lpips: values in
+    [0, 1], each pose refined with the scene held; LPIPS (extra `spiked[lpips]`) by AlexNet, smaller is better. A result
+    without scene.ply has only the first of these.
 
     Held-out views have no distortion. Of a simulated lens with distortion, `lens_` figures compare the same poses in
     the lens's own pixels: what the undistorted figures lose against them is resolution that the lens did not have.
-
-    ATE is in percent of the RMS radius of the true path, after alignment by a similarity. RPE is over 32 frames.
 
     Example: `spiked simulate -o room && spiked reconstruct room/simulated.dat -o out &&
     spiked evaluate out --recording room/simulated.dat`
     """
     if json_out is not None:
         outputs.try_file("--json", json_out)
+    if pictures is not None:
+        outputs.try_folder("--pictures", pictures)
     source = open_recording(recording)
-    rate_hz = source.sensor.frame_rate_hz
+    fits = min(source.sensor.width, source.sensor.height) >= LPIPS_LEAST_SIDE_PX
+    perceptual = Lpips.load() if (lpips_available() and fits if lpips is None else lpips) else None
     truth = Trajectory.read_tum(recording.parent / "groundtruth.tum")
     estimate = Trajectory.read_tum(result / "trajectory.tum")
-    score = score_trajectory(truth=truth, estimate=estimate, frame_rate_hz=rate_hz)
+    score = score_trajectory(truth=truth, estimate=estimate, frame_rate_hz=source.sensor.frame_rate_hz)
     figures: dict[str, float] = {"coverage": score.coverage}
     if score.errors is not None:
         figures |= vars(score.errors)
-        scene = Scene.read_ply(result / "scene.ply")
-        for prefix, through_lens in (("", False), ("lens_", True)):
-            views = _score_views(source, truth, estimate, scene, through_lens=through_lens)
-            if views is not None:
-                figures[f"{prefix}psnr_db"] = views.mean_psnr_db
-                figures[f"{prefix}worst_psnr_db"] = min(views.psnr_db)
-                figures[f"{prefix}ssim"] = views.mean_ssim
+        if (result / "scene.ply").exists():
+            scene = Scene.read_ply(result / "scene.ply")
+            for prefix, through_lens in (("", False), ("lens_", True)):
+                views = _score_views(source, (truth, estimate), scene, perceptual, through_lens=through_lens)
+                if views is None:
+                    continue
+                figures |= {prefix + name: value for name, value in _figures(views.score).items()}
+                if pictures is not None and not through_lens:
+                    _write_pictures(pictures, views)
     for name, value in figures.items():
         output.print(f"{name:18s} {value:.4f}")
     if json_out is not None:
@@ -62,10 +84,30 @@ def evaluate(
             json_out.write_text(json.dumps(figures, indent=1), encoding="utf-8")
 
 
+@dataclass(frozen=True)
+class _Scored:
+    names: list[str]
+    truths: list[NDArray[np.float32]]
+    score: ViewScore
+
+
+def _figures(views: ViewScore) -> dict[str, float]:
+    figures = {"psnr_db": views.mean_psnr_db, "worst_psnr_db": min(views.psnr_db), "ssim": views.mean_ssim}
+    return figures if views.mean_lpips is None else {**figures, "lpips": views.mean_lpips}
+
+
 def _score_views(
-    recording: Recording, truth: Trajectory, estimate: Trajectory, scene: Scene, *, through_lens: bool
-) -> ViewScore | None:
-    """The held-out views, with their true poses in the frame of the estimate; None if there are none."""
+    recording: Recording,
+    paths: tuple[Trajectory, Trajectory],
+    scene: Scene,
+    perceptual: Lpips | None,
+    *,
+    through_lens: bool,
+) -> _Scored | None:
+    """The held-out views, with their true poses in the frame of the estimate; None if there are none.
+
+    `paths` are the true one and the estimate.
+    """
     sensor, folder = recording.sensor, recording.path.parent
     if sensor.intrinsics is None:
         raise SceneError(f"{recording.path} has no intrinsics in its sidecar, so its views cannot be rendered")
@@ -73,10 +115,10 @@ def _score_views(
     files = [view.lens_file if through_lens else view.file for view in held_out.views]
     if not files or None in files:
         return None
-    similarity = similarity_of_trajectories(truth=truth, estimate=estimate, frame_rate_hz=sensor.frame_rate_hz)
+    similarity = similarity_of_trajectories(truth=paths[0], estimate=paths[1], frame_rate_hz=sensor.frame_rate_hz)
     matrices = [np.array(view.c2w) for view in held_out.views]
     poses = [similarity.poses(matrix[:3, :3], matrix[:3, 3]) for matrix in matrices]
-    pictures = [_read_picture(folder / file, colour=sensor.mosaic is not None) for file in files if file is not None]
+    truths = [_read_picture(folder / file, colour=sensor.mosaic is not None) for file in files if file is not None]
     optics = sensor.intrinsics if through_lens else sensor.intrinsics.pinhole
     rasteriser = Rasteriser(Camera(optics, sensor.width, sensor.height))
 
@@ -84,7 +126,19 @@ def _score_views(
         values = rasteriser.forward(scene, rotation[None], centre[None]).values
         return values @ _LUMINANCE if values.ndim == 3 and sensor.mosaic is None else values
 
-    return score_views(render, poses=poses, truths=pictures, length=similarity.scale * held_out.median_depth)
+    length = similarity.scale * held_out.median_depth
+    score = score_views(render, poses=poses, truths=truths, length=length, perceptual=perceptual)
+    return _Scored([Path(view.file).stem for view in held_out.views], truths, score)
+
+
+def _write_pictures(folder: Path, views: _Scored) -> None:
+    """NAME-truth.png and NAME-render.png of each view."""
+    with outputs.writing("--pictures", folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    for name, truth, render in zip(views.names, views.truths, views.score.shown, strict=True):
+        for kind, picture in (("truth", truth), ("render", render)):
+            levels = np.rint(255 * picture).astype(np.uint8)
+            cv2.imwrite(str(folder / f"{name}-{kind}.png"), levels if levels.ndim == 2 else levels[..., ::-1])
 
 
 class _View(BaseModel):

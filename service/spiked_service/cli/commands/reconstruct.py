@@ -37,6 +37,7 @@ from spiked_service.cli.console import messages, output, report_error, report_wa
 from spiked_service.cli.reconstruction_run import RESULTS, ReconstructionRun, parameters_of
 from spiked_service.results.map_folder import MapFolder, file_name, joint_paths, write_map
 from spiked_service.results.recording_feed import reconstruct_recording
+from spiked_service.settings.map_options import changed
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 
 if TYPE_CHECKING:
@@ -58,6 +59,17 @@ def _option(name: str) -> Any:
     described = ReconstructionOptions.model_fields[name]
     limits = {kind: getattr(part, kind) for part in described.metadata for kind in ("ge", "le") if hasattr(part, kind)}
     return typer.Option(help=described.description, min=limits.get("ge"), max=limits.get("le"))
+
+
+MapOptionTexts = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--map-option",
+        metavar="NAME=VALUE",
+        help="A field of spiked.recon.MapOptions, for experiments: sub_frames=0, seeding.sure=0.5; repeatable. A wrong "
+        "name lists all.",
+    ),
+]
 
 
 # Longer than 60 lines, because each option is a parameter.
@@ -82,6 +94,7 @@ def reconstruct(
     memory_mb: Annotated[int, _option("memory_mb")] = _DEFAULTS.memory_mb,
     refine_poses: Annotated[bool, _option("refine_poses")] = _DEFAULTS.refine_poses,
     loss: Annotated[LossName | None, _option("loss")] = _DEFAULTS.loss,
+    map_option: MapOptionTexts = None,
     watch: Annotated[bool, typer.Option("--watch", help="Serve a progress page.")] = False,
     watch_port: Annotated[int, typer.Option(help="Port of the progress page; 0: any free port.", min=0)] = 8660,
     fov: g.Fov = None,
@@ -156,8 +169,10 @@ def reconstruct(
     )
     known = None if poses is None else Trajectory.read_tum(poses)
     measured = g.read_calibration(calibration, described)
+    options = chosen.options()
+    mapping = changed(options.mapping, map_option or [])
     reconstructor = Reconstructor(
-        sensor, replace(chosen.options(), poses=known, calibration=measured), recording=recording
+        sensor, replace(options, poses=known, calibration=measured, mapping=mapping), recording=recording
     )
     reconstructor.warnings += questions
     run = ReconstructionRun.begun(recording, reconstructor, out, parameters_of(context, described.geometry))

@@ -1,0 +1,193 @@
+"""`spiked baseline`: what pipelines for ordinary cameras make of a recording."""
+
+import json
+import time
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from spiked.baselines import ImageKind, PictureOptions, SpikePicture, interpolated, run_colmap, spike_pictures
+from spiked.baselines.pictures import bin_pixels, picture_intrinsics
+from spiked.errors import SpikedError
+from spiked.recon import MapOptions, Options, Reconstructor
+from spiked.recording import Recording, RecordingGeometry
+from spiked.trajectory import Trajectory
+from spiked_service.cli import outputs
+from spiked_service.cli import recording_flags as g
+from spiked_service.cli.commands.reconstruct import MapOptionTexts, ProgressDisplay
+from spiked_service.cli.console import messages, output, report_error, report_warning
+from spiked_service.results.recording_feed import reconstruct_recording
+from spiked_service.settings.map_options import changed
+
+RESULTS = "trajectory.tum", "report.json"
+"""Files in OUT; with a map also scene.ply."""
+TRUTH = "groundtruth.tum"
+
+
+class PoseSource(StrEnum):
+    """Where the poses come from."""
+
+    COLMAP = "colmap"
+    GIVEN = "given"
+
+
+class MapSource(StrEnum):
+    """What is made on the poses."""
+
+    OURS = "ours"
+    NONE = "none"
+
+
+@dataclass(frozen=True)
+class _Posed:
+    trajectory: Trajectory
+    report: dict[str, Any]
+
+
+# Longer than 60 lines, because each option is a parameter.
+def baseline(
+    file: Annotated[Path, typer.Argument(help="A recording without gaps.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; created if missing.")],
+    images: Annotated[
+        ImageKind,
+        typer.Option(
+            help="Pictures made of spikes. tfp: mean of a window; tfi: reciprocal of the interval between the two "
+            "spikes about its middle; charge: charge between the spikes nearest to its edges."
+        ),
+    ] = ImageKind.TFP,
+    poses: Annotated[
+        PoseSource, typer.Option(help="colmap: structure from motion on the pictures; given: those of --given.")
+    ] = PoseSource.COLMAP,
+    map: Annotated[
+        MapSource, typer.Option(help="ours: Gaussians fitted to the pictures at these poses; none: poses only.")
+    ] = MapSource.OURS,
+    given: Annotated[
+        Path | None, typer.Option(help="TUM file of camera-to-world poses; by default groundtruth.tum beside FILE.")
+    ] = None,
+    window_frames: Annotated[
+        int | None,
+        typer.Option(help="Frames of a picture; by default the longest of 32, 16, 8, 4 that FILE has 35 of.", min=1),
+    ] = None,
+    pictures: Annotated[
+        int | None, typer.Option(help="Number of pictures for COLMAP, evenly spaced; by default 60.", min=2)
+    ] = None,
+    steps: Annotated[int, typer.Option(help="Gradient steps of the map.", min=0)] = Options().steps,
+    seed: Annotated[int, typer.Option(help="Of COLMAP and of the map.", min=0)] = 0,
+    threads: Annotated[int | None, typer.Option(help="All cores if not given.", min=1)] = None,
+    map_option: MapOptionTexts = None,
+    fov: g.Fov = None,
+    intrinsics: g.IntrinsicsText = None,
+    distortion: g.DistortionText = None,
+    width: g.Width = None,
+    height: g.Height = None,
+    rate: g.Rate = None,
+    layout: g.FrameLayout = None,
+    bit_order: g.Bits = None,
+    flipped: g.Flipped = None,
+    mosaic: g.Colours = None,
+    response: g.SensorResponse = None,
+    profile: g.Profile = None,
+) -> None:
+    """Reconstruct a recording as one would without this program: COLMAP on pictures made of spikes.
+
+    OUT has trajectory.tum, scene.ply and report.json as `spiked reconstruct` writes them, so that `spiked evaluate` and
+    `spiked compare` score it. COLMAP (extra `spiked[colmap]`) takes the recording's own focal length and lens and holds
+    them; pixels of a colour mosaic are averaged by 2x2. Poses of the frames between the pictures are interpolated. The
+    map takes the camera as still during a picture. OUT/colmap is COLMAP's own project: the pictures, and the model in
+    sparse/0.
+
+    Examples:
+
+    - `spiked baseline rec.dat -o out`
+
+    - `spiked baseline rec.dat -o out --images charge --map none`
+
+    - `spiked baseline rec.dat -o out --images tfi --poses given --given known.tum`
+    """
+    outputs.try_folder("--out", out, RESULTS)
+    stated = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic, response=response)
+    recording = g.open_described(file, stated, profile).recording
+    for warning in recording.warnings:
+        report_warning(warning)
+    sensor = g.with_optics(recording.sensor, fov, intrinsics, distortion)
+    recording = replace(recording, sensor=sensor)
+    options = PictureOptions(images, window_frames, pictures)
+    if poses is PoseSource.GIVEN:
+        posed = _Posed(Trajectory.read_tum(given or file.parent / TRUTH), {})
+    else:
+        posed = _by_colmap(recording, options, out, (threads, seed))
+    report: dict[str, Any] = {"images": images, "poses": poses, "map": map, **posed.report}
+    if map is MapSource.NONE:
+        (out / "scene.ply").unlink(missing_ok=True)
+        _write(out, posed.trajectory, {"frames": recording.frames, "baseline": report})
+        output.print(f"{out}: {len(posed.trajectory)} poses for {recording.frames} frames, no map", markup=False)
+        return
+    chosen = Options(
+        window_frames=window_frames,
+        steps=steps,
+        seed=seed,
+        threads=threads,
+        poses=posed.trajectory,
+        mapping=changed(MapOptions(sub_frames=0), map_option or []),
+    )
+    _map(recording, Reconstructor(sensor, chosen, recording=recording), out, report)
+
+
+def _by_colmap(
+    recording: Recording, options: PictureOptions, out: Path, threads_and_seed: tuple[int | None, int]
+) -> _Posed:
+    """Poses of all frames, and what the report says of them."""
+    intrinsics = picture_intrinsics(recording.sensor)
+    threads, seed = threads_and_seed
+    begin = time.perf_counter()
+    made: list[SpikePicture] = list(spike_pictures(recording, options))
+    messages.print(f"COLMAP on {len(made)} pictures ({options.kind})", markup=False)
+    with outputs.writing("--out", out):
+        found = run_colmap(made, intrinsics, out / "colmap", threads=threads, seed=seed)
+    rate_hz = recording.sensor.frame_rate_hz
+    path = interpolated(found.times, (found.rotations, found.centres), frames=recording.frames, frame_rate_hz=rate_hz)
+    if found.models > 1:
+        report_warning(f"COLMAP made {found.models} models that it could not join; the largest one is taken")
+    first, last = options.windows(recording.frames)[0]
+    return _Posed(
+        path,
+        {
+            "colmap": found.version,
+            "pictures": len(made),
+            "registered": len(found.times),
+            "models": found.models,
+            "points": found.points,
+            "reprojection_px": found.reprojection_px,
+            "window_frames": last - first,
+            "bin_pixels": bin_pixels(recording.sensor),
+            "seconds": time.perf_counter() - begin,
+        },
+    )
+
+
+def _map(recording: Recording, reconstructor: Reconstructor, out: Path, report: dict[str, Any]) -> None:
+    """Fit and write the map. Raises typer.Exit where there is none."""
+    with ProgressDisplay(recording.frames) as display:
+        reconstruct_recording(recording, reconstructor, progress=display.show, cancelled=lambda: False)
+    for warning in reconstructor.warnings:
+        report_warning(warning)
+    path = reconstructor.trajectory()
+    with outputs.writing("--out", out):
+        out.mkdir(parents=True, exist_ok=True)
+        reconstructor.scene().write_ply(out / "scene.ply", reconstructor.white)
+    _write(out, path, {**reconstructor.report(), "baseline": report})
+    if reconstructor.failure is not None:
+        report_error(SpikedError(f"no map was made: {reconstructor.failure}"))
+        raise typer.Exit(1)
+    splats = reconstructor.status().splats
+    output.print(f"{out}: {len(path)} poses for {recording.frames} frames, {splats} splats", markup=False)
+
+
+def _write(out: Path, trajectory: Trajectory, report: dict[str, Any]) -> None:
+    with outputs.writing("--out", out):
+        out.mkdir(parents=True, exist_ok=True)
+        trajectory.write_tum(out / "trajectory.tum")
+        (out / "report.json").write_text(json.dumps(report, indent=1), encoding="utf-8")

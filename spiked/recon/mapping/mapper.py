@@ -164,16 +164,19 @@ class Mapper:
     def _compare_rates(self, key: int, view: View, request: RenderRequest, level: Level, background: float) -> Image:
         """Gradient of the loss by the image, from a view's rates over its pixels' windows."""
         target = level.target(view, request.windows, request.seen)
-        image = level.render(self.scene, replace(request, windows=target.windows), background)
+        first = self.options.demosaic_first and level.mosaic is not None
+        image = level.render(self.scene, replace(request, windows=target.windows), background, demosaiced=first)
         expected = image.values
         factor: Image | None = None
-        if level.factor == 1 and self._knows_nuisances():
+        if first:
+            target = level.demosaiced_target(target)
+        elif level.factor == 1 and self._knows_nuisances():
             factor = self.nuisances.factor(key)
             self.nuisances.observe(key, image.values, view.rate, target.deviation, self.steps >= GAINS_FROM)
             expected = expected * factor
             if self.steps % NUISANCE_STEPS == NUISANCE_STEPS - 1:
                 self.nuisances.update()
-        made = self.view_loss.compare(expected, target, self.white, level.mosaic)
+        made = self.view_loss.compare(expected, target, self.white, None if first else level.mosaic)
         self._losses[key], slope = made.error, made.slope
         if factor is not None:
             slope *= factor

@@ -58,6 +58,10 @@ class MapOptions:
     mean of sharp renders at the middles of its sub-frames, the same for all pixels: Eq 23 of the paper."""
     nuisances: bool = True
     """Estimate each pixel's gain and the brightness of each view (flicker, lamps)."""
+    demosaic_first: bool = False
+    """Fit a mosaic's map to colours interpolated at every pixel, as most pipelines do, and without nuisances; otherwise
+    to the sensor's sites. Only where the map is fitted to windows: `Options.window_frames` chooses them in fast motion,
+    too."""
     background: float = 0.5
     """Largest brightness of the random background while fitting, in units of white; 0 is always black (decision 5)."""
     floor: float = RateLoss.floor

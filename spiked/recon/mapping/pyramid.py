@@ -1,10 +1,11 @@
 """Image pyramid of views: large images are fitted at smaller sizes first."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spiked.recon.frontend.demosaic import fill_mosaic
 from spiked.recon.frontend.windowing import View, luminance
 from spiked.recon.mapping.render_requests import RenderRequest
 from spiked.render import Camera, RenderedImage, rasteriser_for
@@ -54,14 +55,22 @@ class Level:
         """The mosaic of this level's images; None where pixels have all colours or none."""
         return None if self.channels is None else self._mosaic
 
-    def render(self, scene: Scene, request: RenderRequest, background: float = 0.0) -> RenderedImage:
-        """Render a scene at this size; the request's windows are of this size. `background` is a radiance."""
-        poses = request.rotations, request.centres
+    def render(
+        self, scene: Scene, request: RenderRequest, background: float = 0.0, *, demosaiced: bool = False
+    ) -> RenderedImage:
+        """Render a scene at this size; the request's windows are of this size. `background` is a radiance.
+
+        `demosaiced`: all colours at every pixel, as in `demosaiced_target`.
+        """
+        poses, channels = (request.rotations, request.centres), None if demosaiced else self.channels
         if request.windows is None:
-            return self.rasteriser.forward(scene, *poses, channels=self.channels, background=background)
-        return self.rasteriser.forward_moving(
-            scene, *poses, request.windows, channels=self.channels, background=background
-        )
+            return self.rasteriser.forward(scene, *poses, channels=channels, background=background)
+        return self.rasteriser.forward_moving(scene, *poses, request.windows, channels=channels, background=background)
+
+    def demosaiced_target(self, target: Target) -> Target:
+        """A mosaic's target [H, W] of this size with colours interpolated, [H, W, 3]."""
+        deviation = np.repeat(target.deviation[..., None], 3, -1)
+        return replace(target, values=fill_mosaic(target.values, self.channels), deviation=deviation)
 
     def target(self, view: View, windows: Image | None, seen: NDArray[np.bool_] | None) -> Target:
         """A view at this size; incomplete large pixels at the right and lower edges are left out.

@@ -12,7 +12,7 @@ import typer
 from spiked.baselines import ImageKind, PictureOptions, SpikePicture, interpolated, run_colmap, spike_pictures
 from spiked.baselines.pictures import bin_pixels, picture_intrinsics
 from spiked.errors import SpikedError
-from spiked.recon import MapOptions, Options, Reconstructor
+from spiked.recon import LossName, MapOptions, Options, Reconstructor
 from spiked.recording import Recording, RecordingGeometry
 from spiked.trajectory import Trajectory
 from spiked_service.cli import outputs
@@ -25,6 +25,12 @@ from spiked_service.settings.map_options import changed
 RESULTS = "trajectory.tum", "report.json"
 """Files in OUT; with a map also scene.ply."""
 TRUTH = "groundtruth.tum"
+_LOSSES = {
+    ImageKind.TFP: LossName.ACCUMULATION,
+    ImageKind.TFI: LossName.INTERVAL,
+    ImageKind.CHARGE: LossName.CHARGE,
+}
+"""What the map is fitted to. The accumulation image counts 32 frames whatever the window of the pictures."""
 
 
 class PoseSource(StrEnum):
@@ -96,8 +102,8 @@ def baseline(
     OUT has trajectory.tum, scene.ply and report.json as `spiked reconstruct` writes them, so that `spiked evaluate` and
     `spiked compare` score it. COLMAP (extra `spiked[colmap]`) takes the recording's own focal length and lens and holds
     them; pixels of a colour mosaic are averaged by 2x2. Poses of the frames between the pictures are interpolated. The
-    map takes the camera as still during a picture. OUT/colmap is COLMAP's own project: the pictures, and the model in
-    sparse/0.
+    map is fitted to pictures of the same kind (tfp: of 32 frames) and takes the camera as still during one. OUT/colmap
+    is COLMAP's own project: the pictures, and the model in sparse/0.
 
     Examples:
 
@@ -126,14 +132,20 @@ def baseline(
         output.print(f"{out}: {len(posed.trajectory)} poses for {recording.frames} frames, no map", markup=False)
         return
     chosen = Options(
-        window_frames=window_frames,
+        window_frames=_window(options, recording),
         steps=steps,
         seed=seed,
         threads=threads,
         poses=posed.trajectory,
-        mapping=changed(MapOptions(sub_frames=0), map_option or []),
+        mapping=changed(MapOptions(sub_frames=0, loss=_LOSSES[images]), map_option or []),
     )
     _map(recording, Reconstructor(sensor, chosen, recording=recording), out, report)
+
+
+def _window(options: PictureOptions, recording: Recording) -> int:
+    """Frames of a picture. As the length of the map's views it also keeps the map from compensating fast motion."""
+    begin, end = options.windows(recording.frames)[0]
+    return max(2, end - begin)
 
 
 def _by_colmap(
@@ -151,7 +163,6 @@ def _by_colmap(
     path = interpolated(found.times, (found.rotations, found.centres), frames=recording.frames, frame_rate_hz=rate_hz)
     if found.models > 1:
         report_warning(f"COLMAP made {found.models} models that it could not join; the largest one is taken")
-    first, last = options.windows(recording.frames)[0]
     return _Posed(
         path,
         {
@@ -161,7 +172,7 @@ def _by_colmap(
             "models": found.models,
             "points": found.points,
             "reprojection_px": found.reprojection_px,
-            "window_frames": last - first,
+            "window_frames": _window(options, recording),
             "bin_pixels": bin_pixels(recording.sensor),
             "seconds": time.perf_counter() - begin,
         },

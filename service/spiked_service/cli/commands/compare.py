@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
-from rich.table import Table
 
 from spiked.errors import ConfigurationError, SpikedError
 from spiked.recording import open_recording
@@ -22,7 +20,7 @@ from spiked_service.cli.commands.reconstruct import INTERRUPTED
 from spiked_service.cli.comparison.cells import Cell, Outcome, run_cell, stored
 from spiked_service.cli.comparison.page import page
 from spiked_service.cli.comparison.pictures import Strip, strips
-from spiked_service.cli.comparison.rows import GROUPS, chosen
+from spiked_service.cli.comparison.rows import GROUPS, chosen, rows
 from spiked_service.cli.comparison.tables import csv_text, markdown
 from spiked_service.cli.console import messages, output, report_warning
 
@@ -179,8 +177,9 @@ def _interruptible() -> Iterator[None]:
 
 
 def _list() -> None:
-    table = Table("group", "row", "command", "", box=None, pad_edge=False)
+    width = max(len(name) for name in rows())
     for group, members in GROUPS.items():
-        for number, one in enumerate(members):
-            table.add_row("" if number else group, one.name, escape(" ".join(one.arguments)), escape(one.summary))
-    output.print(table, soft_wrap=False)
+        output.print(f"{group}:", markup=False)
+        for one in members:
+            output.print(f"  {one.name:{width}s}  {one.summary}", markup=False)
+            output.print(f"  {'':{width}s}  {' '.join(one.arguments)}", markup=False, style="dim")

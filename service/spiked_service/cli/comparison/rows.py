@@ -51,6 +51,12 @@ def _row(name: str, command: str, summary: str, share_of_steps: float = 1.0) -> 
     return Row(name, tuple(command.split()), summary, share_of_steps)
 
 
+def _given(name: str, options: str, summary: str) -> Row:
+    """A variant of the map on the true path, which the row `given-spiked` is the measure of."""
+    named = " ".join(f"--map-option {option}" for option in options.split())
+    return _row(name, f"reconstruct --poses {TRUTH} {named}", summary)
+
+
 def _plain(name: str) -> bool:
     return bool(name) and name[0].isalnum() and all(letter.isalnum() or letter in "._+-" for letter in name)
 
@@ -73,6 +79,42 @@ GROUPS: dict[str, tuple[Row, ...]] = {
             f"baseline --poses given --given {TRUTH} --images charge",
             "a map of charge, camera still during a picture, on the true path",
         ),
+    ),
+    "losses": tuple(
+        _row(f"loss-{loss}", f"reconstruct --poses {TRUTH} --loss {loss}", f"{what}, on the true path")
+        for loss, what in (
+            ("charge", "charge between spikes, the default"),
+            ("accumulation", "spikes counted in 32 frames"),
+            ("interval", "interval between two spikes"),
+            ("binomial", "likelihood of the spikes of 16 pixels and 32 frames"),
+            ("accumulation+binomial", "accumulation and likelihood, as the paper fits its scene"),
+        )
+    ),
+    "ablation": (
+        _given("still", "sub_frames=0", "camera taken as still during a view"),
+        *(_given(f"sub-frames-{n}", f"sub_frames={n}", f"{n} sub-frames, blur matched") for n in (1, 2, 4)),
+        *(
+            _given(f"sharp-sub-frames-{n}", f"sub_frames={n} blur_matched=false", f"{n} sub-frames, each without blur")
+            for n in (2, 4)
+        ),
+        _given("no-nuisances", "nuisances=false", "gains of pixels and brightness of views not estimated"),
+        _given("black-background", "background=0", "black background while fitting"),
+        _given("doubtful-depth", "seeding.sure=0", "first splats of doubtful depth as well"),
+        _given("no-ssim", "ssim=0", "without structural similarity"),
+        _given("full-size", "schedule.coarse_share=1e-9", "full size from the start"),
+        _given("no-detail", "detail=0", "fine detail of fast motion not raised"),
+        _row(
+            "demosaic-last",
+            f"reconstruct --poses {TRUTH} --window-frames 8",
+            "of a mosaic: windows of 8 frames, its sites",
+        ),
+        _row(
+            "demosaic-first",
+            f"reconstruct --poses {TRUTH} --window-frames 8 --map-option demosaic_first=true",
+            "the same with colours interpolated before the fit",
+        ),
+        _row("path-tracked", "reconstruct --steps 0", "the path before the map corrects it"),
+        _row("path-kept", "reconstruct --no-refine-poses", "a map that does not correct the path"),
     ),
 }
 """All rows, by groups that `--methods` names as one."""

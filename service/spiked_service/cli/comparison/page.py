@@ -21,9 +21,10 @@ body { margin: 0 auto; max-width: 1500px; padding: 1.5rem; font: 15px/1.5 system
 h1 { font-size: 1.5rem; margin: 0; } h2 { font-size: 1.2rem; margin: 2.5rem 0 .5rem; }
 h3 { font-size: .95rem; font-weight: 500; color: var(--soft); margin: 1.2rem 0 .4rem; }
 p, li { max-width: 62rem; } .soft { color: var(--soft); }
-.scroll { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .3rem .7rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
-th:first-child, td:first-child, td.why { text-align: left; } td.why { white-space: normal; min-width: 14rem; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .85rem; }
+th, td { padding: .3rem .55rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
+th:first-child, td.why { text-align: left; } td.why { color: var(--soft); }
 td.best { background: var(--best); font-weight: 600; }
 .strip { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 320px), 1fr)); gap: .8rem; }
 figure { margin: 0; } img { width: 100%; display: block; border-radius: 3px; }
@@ -59,11 +60,13 @@ def _table(rows: dict[str, list[Outcome]]) -> str:
             f"{escape(column.text(sound[row]))}</td>"
             for column in columns
         )
+        body.append(f'<tr><th scope="row">{escape(row)}</th>{marked}</tr>')
         why = escape("; ".join(failures(cells)))
-        body.append(f'<tr><th scope="row">{escape(row)}</th>{marked}<td class="why">{why}</td></tr>')
+        if why:
+            body.append(f'<tr><td class="why" colspan="{len(columns) + 1}">failed: {why}</td></tr>')
     return (
         f'<div class="scroll" tabindex="0" role="region" aria-label="Figures"><table><thead><tr>'
-        f'<th scope="col">method</th>{head}<th scope="col">failed</th></tr></thead>'
+        f'<th scope="col">method</th>{head}</tr></thead>'
         f"<tbody>{''.join(body)}</tbody></table></div>"
     )
 

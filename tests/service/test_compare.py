@@ -26,6 +26,7 @@ from spiked.simulate import SimulatedCamera
 from spiked.simulate.record import simulate
 
 QUICK = ("--row", "quick=reconstruct --poses {truth} --steps 10", "--row", "none=reconstruct --window-frames 300")
+LIGHT = ("--row", "light=baseline --poses given --map none")
 PATIENCE_S = 120.0
 
 
@@ -69,22 +70,22 @@ def test_a_table_is_made_once_and_a_failed_cell_is_a_row(room: Path, tmp_path: P
 
 def test_a_killed_comparison_goes_on(room: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    words = ["compare", str(room), "-o", str(out), "--methods", "", *QUICK[:2], "--seeds", "2"]
+    words = ["compare", str(room), "-o", str(out), "--methods", "", *LIGHT, "--seeds", "2"]
     process = subprocess.Popen([sys.executable, "-m", "spiked_service", *words], stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + PATIENCE_S
-    while not list(out.glob("cells/room/quick/seed-1.making-*")):
+    while not list(out.glob("cells/room/light/seed-1.making-*")):
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.02)
     process.send_signal(signal.SIGKILL)
     process.wait()
     first = made_at(out)
-    assert list(first) == ["cells/room/quick/seed-0"]
+    assert list(first) == ["cells/room/light/seed-0"]
     code, said = compare(*words[1:])
     assert code == 0 and "seed 0: kept" in said and "2 cells, 0 failed" in said
     second = made_at(out)
-    assert second["cells/room/quick/seed-0"] == first["cells/room/quick/seed-0"] and len(second) == 2
+    assert second["cells/room/light/seed-0"] == first["cells/room/light/seed-0"] and len(second) == 2
     assert not list(out.rglob("*.making-*"))
-    assert re.search(r"\| quick \|.*\(\d+\.\d+-\d+\.\d+\)", (out / "comparison.md").read_text())
+    assert re.search(r"\| light \|.*\(\d+\.\d+-\d+\.\d+\)", (out / "comparison.md").read_text())
 
 
 def test_a_cell_that_takes_too_long_and_a_recording_without_truth_are_told(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ _REASON = 400
 _FRAME = " \t│╭╮╰╯─"
 """Around the message about an option that cannot be parsed."""
 _POLL_S = 0.02
+"""Seconds between two looks at the process."""
 _LIBC = ctypes.CDLL(None)
 _PR_SET_PDEATHSIG = 1
 """Of prctl(2)."""

@@ -25,6 +25,7 @@ SEARCH_FRAMES = 64
 TIMES = (0.25, 0.75)
 """Of the observed pictures, as shares of the recording."""
 WHITE_PERCENTILE = 99.5
+"""Percentile of an observed picture that is shown as white."""
 WIDTH_PX = 480
 """Largest width of a picture in the page."""
 _QUALITY = 85

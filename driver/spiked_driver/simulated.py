@@ -10,13 +10,13 @@ from spiked.camera import Rate, Side
 from spiked.errors import SourceError
 from spiked.ring import DeviceState, DeviceStatus, End, EndReason, Gap
 from spiked.sensor import Intrinsics, Sensor
-from spiked.simulate import MotionKind, SimulatedCamera
+from spiked.simulate import Lighting, MotionKind, NoiseOptions, SensorNoise, SimulatedCamera
 from spiked.simulate.camera import DEFAULT_FOV_DEG
 from spiked_driver.source import Chunk, Pacer, former_source_names
 from spiked_driver.source_kind import Device, PacedOptions, SourceKind, SourceOptions, SourceSpec, Warn
 
 
-class SimulationOptions(PacedOptions, SourceOptions):
+class SimulationOptions(PacedOptions, SourceOptions, NoiseOptions):
     """Options of `sim:`."""
 
     seed: int = Field(0, ge=0, lt=1 << 32)
@@ -43,7 +43,7 @@ class SimulatedSource:
 
     `flow_px` is the mean image motion in pixels per frame. `frames` is the length of the capture; None: no end. `pace`
     is a factor of the sensor's rate; a slow machine delivers late and loses nothing. With 0, frames come as fast as
-    lossless consumers take them.
+    lossless consumers take them. `noise` and `lighting` are those of `SimulatedCamera`.
     """
 
     def __init__(
@@ -56,6 +56,8 @@ class SimulatedSource:
         frames: int | None = None,
         pace: float = 1.0,
         threads: int = 1,
+        noise: SensorNoise | None = None,
+        lighting: Lighting | None = None,
     ) -> None:
         intrinsics = sensor.intrinsics or Intrinsics.from_fov(sensor.width, sensor.height, DEFAULT_FOV_DEG)
         self._sensor = replace(sensor.compact(), intrinsics=intrinsics)
@@ -63,6 +65,8 @@ class SimulatedSource:
         self._motion = motion
         self._flow_px = flow_px
         self._threads = threads
+        self._noise = noise
+        self._lighting = lighting
         self._frames = frames
         self._pace = pace
         self._camera: SimulatedCamera | None = None
@@ -93,7 +97,13 @@ class SimulatedSource:
     def open(self) -> None:
         """Build the scene and start at frame 0."""
         self._camera = SimulatedCamera(
-            self._sensor, self._seed, self._motion, flow_px=self._flow_px, threads=self._threads
+            self._sensor,
+            self._seed,
+            self._motion,
+            noise=self._noise,
+            flow_px=self._flow_px,
+            lighting=self._lighting,
+            threads=self._threads,
         )
         self._pacer = Pacer(self._sensor.frame_rate_hz, self._pace)
         self._next = 0
@@ -124,14 +134,18 @@ class SimulatedSource:
 def _open(spec: SourceSpec, options: SimulationOptions, warn: Warn | None) -> SimulatedSource:
     if spec.target:
         raise SourceError(f"source {spec.text!r}: sim: takes options only, as in sim:?seed=1")
+    sensor = options.sensor(Sensor(options.width, options.height, options.rate))
+    options.checked(sensor.response)
     return SimulatedSource(
-        options.sensor(Sensor(options.width, options.height, options.rate)),
+        sensor,
         seed=options.seed,
         motion=options.motion,
         flow_px=options.flow_px,
         frames=None if options.seconds is None else round(options.seconds * options.rate),
         pace=options.pace,
         threads=options.threads,
+        noise=options.noise(),
+        lighting=options.lighting(),
     )
 
 

@@ -28,6 +28,7 @@ from spiked.client.models import (
     GroupOut,
     IntrinsicsModel,
     JobState,
+    NoiseModel,
     ProfileModel,
     ProfileOut,
     ReconstructionOptions,
@@ -114,6 +115,7 @@ class Spiked(MapMethods, ResultMethods):
         reconstruct: bool = True,
         options: ReconstructionOptions | None = None,
         camera: StatedCameraModel | None = None,
+        noise: NoiseModel | None = None,
         intrinsics: IntrinsicsModel | None = None,
     ) -> CaptureOut:
         """Start a capture of so many frames or seconds, or until it is stopped."""
@@ -128,6 +130,7 @@ class Spiked(MapMethods, ResultMethods):
             "reconstruct": reconstruct,
             "options": plain(options or ReconstructionOptions()),
             "camera": plain(camera),
+            "noise": None if noise is None else noise.model_dump(mode="json", exclude_unset=True),
             "intrinsics": plain(intrinsics),
         }
         return self._connection.post("captures", body, CaptureOut)

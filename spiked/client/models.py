@@ -365,6 +365,75 @@ class Mosaic(StrEnum):
     GBRG = "GBRG"
 
 
+class NoiseModel(BaseModel):
+    """
+    Noise, defects and light of the simulated camera `sim:`; it wins over the options of the source's text.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    electrons_a_spike: Annotated[
+        float,
+        Field(description="Photo-electrons of one spike; shot noise is Poisson in electrons (Eq 13, 14)."),
+    ] = 4000.0
+    temperature_k: Annotated[
+        float,
+        Field(
+            description="Absolute temperature in kelvin, of the thermal noise of a reset, sqrt(k T / C) (Eq 16); dark current is apart."
+        ),
+    ] = 300.0
+    swing_v: Annotated[
+        float,
+        Field(
+            description="Voltage of the threshold in volts, Vp - Vref (Eq 15); with the electrons it gives the capacitance C of Eq 16."
+        ),
+    ] = 1.0
+    reset_noise: Annotated[
+        float | None,
+        Field(
+            description="Standard deviation of the reset voltage as a share of the threshold, instead of what Eq 16 gives."
+        ),
+    ] = None
+    threshold_jitter: Annotated[
+        float,
+        Field(
+            description="Noise of the comparator: standard deviation of the threshold at each spike, as a share of it."
+        ),
+    ] = 0.00967
+    dark: Annotated[float, Field(description="Mean dark current in spikes a frame (Eq 17).")] = 0.002
+    dark_spread: Annotated[
+        float,
+        Field(description="Standard deviation of the dark current over the pixels, in spikes a frame (Eq 17)."),
+    ] = 0.0002
+    capacitance_mismatch: Annotated[
+        float,
+        Field(
+            description="Standard deviation of the pixels' capacitance, as a share: fixed pattern of the threshold (Eq 18)."
+        ),
+    ] = 0.016
+    reset_bias: Annotated[
+        float,
+        Field(
+            description="Half width of the uniform distribution of the pixels' reset voltage, as a share of the threshold (after Eq 18)."
+        ),
+    ] = 0.0208
+    hot_share: Annotated[float, Field(description="Share of the pixels that are hot.")] = 0.0
+    hot_rate: Annotated[
+        float,
+        Field(description="Extra dark current of a hot pixel, in spikes a frame."),
+    ] = 0.2
+    dead_share: Annotated[float, Field(description="Share of the pixels that never fire.")] = 0.0
+    flicker: Annotated[
+        float,
+        Field(description="Depth of the light's flicker: amplitude as a share of the mean."),
+    ] = 0.0
+    flicker_hz: Annotated[
+        float,
+        Field(description="Frequency of the flicker in Hz; lamps have twice that of the mains."),
+    ] = 100.0
+
+
 class OffsetOut(BaseModel):
     """
     When the frames of a capture came, by the clock of the machine.
@@ -1659,6 +1728,10 @@ class CaptureRequest(BaseModel):
     camera: Annotated[
         StatedCameraModel | None,
         Field(description="The same as options of the source's text."),
+    ] = None
+    noise: Annotated[
+        NoiseModel | None,
+        Field(description="Of `sim:`: the same as options of the source's text."),
     ] = None
     intrinsics: Annotated[
         IntrinsicsModel | None,

@@ -2,6 +2,7 @@
 
 from spiked.simulate.camera import SimulatedCamera
 from spiked.simulate.motion import Motion, MotionKind, Stage, look_at, make_motion
+from spiked.simulate.options import NoiseOptions
 from spiked.simulate.room import Room
 from spiked.simulate.sensor import GainStep, Lighting, PixelMaps, SensorNoise, SpikeSensor
 from spiked.simulate.view import View, ViewableScene
@@ -11,6 +12,7 @@ __all__ = [
     "Lighting",
     "Motion",
     "MotionKind",
+    "NoiseOptions",
     "PixelMaps",
     "Room",
     "SensorNoise",

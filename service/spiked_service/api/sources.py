@@ -25,8 +25,14 @@ class Sources:
         """The devices."""
         return known_devices(self._settings.now.devices)
 
-    def named(self, source: str | None, device: str | None, camera: BaseModel | None = None) -> str:
-        """The source of a request, with what it states of the camera among its options.
+    def named(
+        self,
+        source: str | None,
+        device: str | None,
+        camera: BaseModel | None = None,
+        noise: BaseModel | None = None,
+    ) -> str:
+        """The source of a request, with what it states of the camera and of its noise among its options.
 
         Raises UnknownIdError for a device, SourceError for a file not open to requests.
         """
@@ -41,6 +47,8 @@ class Sources:
             stated = with_options(SourceSpec.parse(source).address, camera)
             self._check_files(stated)
             source = with_options(source, camera)
+        if noise is not None:
+            source = with_options(source, noise)
         return unpaced(source)
 
     def check_file(self, path: str, *allowed: Path) -> None:

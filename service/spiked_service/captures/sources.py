@@ -41,7 +41,8 @@ def stated_options(source: str) -> bool:
 
 def with_options(source: str, stated: BaseModel) -> str:
     """The source with options in place of those of the same name; a field of view and intrinsics replace each other."""
-    values = {name: _text(value) for name, value in stated.model_dump(mode="json", exclude_none=True).items()}
+    given = stated.model_dump(mode="json", include=stated.model_fields_set, exclude_none=True)
+    values = {name: _text(value) for name, value in given.items()}
     replaced = set(values) | {_ALIASES.get(name, name) for name in values}
     if replaced & _OPTICS:
         replaced |= _OPTICS

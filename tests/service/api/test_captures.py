@@ -4,13 +4,14 @@ import hashlib
 import time
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs
 
 import cv2
 import httpx
 import numpy as np
 import pytest
 
-from spiked.client import ApiError, CaptureOut
+from spiked.client import ApiError, CaptureOut, NoiseModel
 from spiked.recording import open_recording
 
 FRAMES = 512
@@ -181,6 +182,27 @@ def test_a_post_that_failed_may_be_tried_again_with_its_key(service: Any) -> Non
     refused = service.http.post("captures", json={"source": "sim:?bogus=1"}, headers=key)
     assert refused.status_code == 422
     assert service.http.post("captures", json={"source": "sim:?bogus=1"}, headers=key).status_code == 422
+
+
+def test_noise_of_a_simulation_is_part_of_a_request(service: Any) -> None:
+    source = "sim:?width=96&height=64&dark=0.3&flicker=0.1"
+    started = service.client.start_capture(
+        source, frames=64, reconstruct=False, noise=NoiseModel(dark=0.9, hot_share=0.25)
+    )
+    assert parse_qs(started.source.partition("?")[2]) == {
+        "width": ["96"], "height": ["64"], "flicker": ["0.1"], "dark": ["0.9"], "hot_share": ["0.25"], "pace": ["0"],
+    }  # fmt: skip
+    frames = service.client.wait_for_capture(started.id).recording
+    assert frames is not None and frames.frames == 64
+    for body, told in (
+        ({"source": "sim:", "noise": {"dark": -1}}, "dark"),
+        ({"source": "sim:", "noise": {"dark": "0.1"}}, "dark"),
+        ({"source": "sim:", "noise": {"temperature": 300}}, "temperature"),
+        ({"source": "usb0", "noise": {"dark": 0.1}}, "no option dark"),
+        ({"source": "sim:?response=bernoulli", "noise": {"reset_bias": 0.1}}, "leave out reset_bias"),
+    ):
+        refused = service.http.post("captures", json=body)
+        assert refused.status_code == 422 and told in refused.text, refused.text
 
 
 def test_one_capture_a_device(service: Any) -> None:

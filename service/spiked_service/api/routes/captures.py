@@ -85,7 +85,7 @@ def _add_end_routes(router: APIRouter, captures: Captures) -> None:
 def plan_of(body: CaptureRequest, sources: Sources) -> Plan:
     """What a request asks for. Raises UnknownIdError for an unknown device."""
     return Plan(
-        source=sources.named(body.source, body.device, body.camera),
+        source=sources.named(body.source, body.device, body.camera, body.noise),
         frames=body.frames,
         seconds=body.seconds,
         pretrigger_s=body.pretrigger_s,

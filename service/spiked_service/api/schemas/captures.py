@@ -9,6 +9,7 @@ from spiked.camera import CameraFiles, CameraOptions
 from spiked.profile import CameraProfile
 from spiked.ring import DeviceState, Policy
 from spiked.sensor import Mosaic, Sensor
+from spiked.simulate import NoiseOptions
 from spiked_service.api.schemas.base import (
     ID_EXAMPLE,
     LARGEST_INTEGER,
@@ -191,6 +192,12 @@ class StatedCameraModel(In, CameraOptions, CameraFiles):
     intrinsics: IntrinsicsModel | None = None
 
 
+class NoiseModel(In, NoiseOptions):
+    """Noise, defects and light of the simulated camera `sim:`; it wins over the options of the source's text."""
+
+    model_config = example(dark=0.01, hot_share=0.001, flicker=0.2, flicker_hz=100.0) | ConfigDict(strict=True)
+
+
 class CaptureRequest(In):
     """A capture to start."""
 
@@ -198,6 +205,7 @@ class CaptureRequest(In):
         {"source": "sim:?seed=1", "frames": 1280, "name": "desk, by hand"},
         {"source": "sim:", "seconds": 0.1, "reconstruct": False},
         {"source": "sim:?seed=1", "frames": 640, "camera": {"mosaic": "BGGR", "fov": 60.0}},
+        {"source": "sim:", "frames": 640, "noise": {"dark": 0.01, "flicker": 0.2}},
         rules=[
             *exactly_one_of(source="string", device="string"),
             *at_most_one_of(frames="integer", seconds="number"),
@@ -235,6 +243,7 @@ class CaptureRequest(In):
     reconstruct: StrictBool = Field(True, description="Reconstruct while it runs.")
     options: ReconstructionOptions = Field(default_factory=ReconstructionOptions)
     camera: StatedCameraModel | None = Field(None, description="The same as options of the source's text.")
+    noise: NoiseModel | None = Field(None, description="Of `sim:`: the same as options of the source's text.")
     intrinsics: IntrinsicsModel | None = Field(None, description="If the source does not know its own.")
 
     @model_validator(mode="after")

@@ -1621,6 +1621,14 @@ export interface components {
          *       "frames": 640,
          *       "source": "sim:?seed=1"
          *     }
+         * @example {
+         *       "frames": 640,
+         *       "noise": {
+         *         "dark": 0.01,
+         *         "flicker": 0.2
+         *       },
+         *       "source": "sim:"
+         *     }
          */
         CaptureRequest: {
             /**
@@ -1674,6 +1682,8 @@ export interface components {
             options?: components["schemas"]["ReconstructionOptions"];
             /** @description The same as options of the source's text. */
             camera?: components["schemas"]["StatedCameraModel"] | null;
+            /** @description Of `sim:`: the same as options of the source's text. */
+            noise?: components["schemas"]["NoiseModel"] | null;
             /** @description If the source does not know its own. */
             intrinsics?: components["schemas"]["IntrinsicsModel"] | null;
         } & (unknown & unknown & unknown & unknown);
@@ -2317,6 +2327,101 @@ export interface components {
          * @enum {string}
          */
         Mosaic: "RGGB" | "BGGR" | "GRBG" | "GBRG";
+        /**
+         * NoiseModel
+         * @description Noise, defects and light of the simulated camera `sim:`; it wins over the options of the source's text.
+         * @example {
+         *       "dark": 0.01,
+         *       "flicker": 0.2,
+         *       "flicker_hz": 100,
+         *       "hot_share": 0.001
+         *     }
+         */
+        NoiseModel: {
+            /**
+             * Electrons A Spike
+             * @description Photo-electrons of one spike; shot noise is Poisson in electrons (Eq 13, 14).
+             * @default 4000
+             */
+            electrons_a_spike?: number;
+            /**
+             * Temperature K
+             * @description Absolute temperature in kelvin, of the thermal noise of a reset, sqrt(k T / C) (Eq 16); dark current is apart.
+             * @default 300
+             */
+            temperature_k?: number;
+            /**
+             * Swing V
+             * @description Voltage of the threshold in volts, Vp - Vref (Eq 15); with the electrons it gives the capacitance C of Eq 16.
+             * @default 1
+             */
+            swing_v?: number;
+            /**
+             * Reset Noise
+             * @description Standard deviation of the reset voltage as a share of the threshold, instead of what Eq 16 gives.
+             */
+            reset_noise?: number | null;
+            /**
+             * Threshold Jitter
+             * @description Noise of the comparator: standard deviation of the threshold at each spike, as a share of it.
+             * @default 0.00967
+             */
+            threshold_jitter?: number;
+            /**
+             * Dark
+             * @description Mean dark current in spikes a frame (Eq 17).
+             * @default 0.002
+             */
+            dark?: number;
+            /**
+             * Dark Spread
+             * @description Standard deviation of the dark current over the pixels, in spikes a frame (Eq 17).
+             * @default 0.0002
+             */
+            dark_spread?: number;
+            /**
+             * Capacitance Mismatch
+             * @description Standard deviation of the pixels' capacitance, as a share: fixed pattern of the threshold (Eq 18).
+             * @default 0.016
+             */
+            capacitance_mismatch?: number;
+            /**
+             * Reset Bias
+             * @description Half width of the uniform distribution of the pixels' reset voltage, as a share of the threshold (after Eq 18).
+             * @default 0.0208
+             */
+            reset_bias?: number;
+            /**
+             * Hot Share
+             * @description Share of the pixels that are hot.
+             * @default 0
+             */
+            hot_share?: number;
+            /**
+             * Hot Rate
+             * @description Extra dark current of a hot pixel, in spikes a frame.
+             * @default 0.2
+             */
+            hot_rate?: number;
+            /**
+             * Dead Share
+             * @description Share of the pixels that never fire.
+             * @default 0
+             */
+            dead_share?: number;
+            /**
+             * Flicker
+             * @description Depth of the light's flicker: amplitude as a share of the mean.
+             * @default 0
+             */
+            flicker?: number;
+            /**
+             * Flicker Hz
+             * @description Frequency of the flicker in Hz; lamps have twice that of the mains.
+             * @default 100
+             */
+            flicker_hz?: number;
+        };
         /**
          * OffsetOut
          * @description When the frames of a capture came, by the clock of the machine.

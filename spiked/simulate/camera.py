@@ -5,13 +5,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from spiked.errors import ConfigurationError
 from spiked.sensor import Image, Intrinsics, Sensor
+from spiked.simulate.exposure import Exposure
 from spiked.simulate.motion import Motion, MotionKind, make_motion
 from spiked.simulate.room import Room
 from spiked.simulate.sensor import Lighting, PixelMaps, SensorNoise, SpikeSensor
 from spiked.simulate.spans import (
     InterpolationError,
     PathRadiance,
-    Span,
     grouped_spans,
     interpolation_error,
     spaced_spans,
@@ -90,8 +90,8 @@ class SimulatedCamera:
         self.step_px = step_px
         self._radiance = self.path_radiance()
         depth = self._radiance.nearest_depth()
-        self._spans = grouped_spans(self._radiance, depth) if step_px is None else spaced_spans(self._radiance, step_px)
-        self._left: Span | None = None
+        spans = grouped_spans(self._radiance, depth) if step_px is None else spaced_spans(self._radiance, step_px)
+        self._exposure = Exposure(self.spikes, spans)
 
     def path_radiance(self) -> PathRadiance:
         """What the sensor sees along the path; a subclass may put something in front of it. Called once."""
@@ -99,16 +99,7 @@ class SimulatedCamera:
 
     def next_frames(self, count: int) -> NDArray[np.uint8]:
         """The next frames as stored, uint8 [count, frame_bytes]."""
-        out = np.empty((count, self.sensor.frame_bytes), np.uint8)
-        done = 0
-        while done < count:
-            span = self._left or next(self._spans)
-            take = min(count - done, len(span.weights))
-            self.spikes.expose(span.first, span.last, span.weights[:take], out[done : done + take])
-            rest = span.weights[take:]
-            self._left = Span(span.first, span.last, rest) if len(rest) else None
-            done += take
-        return out
+        return self._exposure.next_frames(count)
 
     def truth(self, frames: ArrayLike) -> tuple[Array, Array]:
         """Camera-to-world rotations [n, 3, 3] and centres [n, 3] at the middle of each frame [n]."""

@@ -2,8 +2,10 @@
 
 import json
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +18,7 @@ from spiked.scene import Scene
 from spiked.sensor import BitOrder, Layout, Sensor
 from spiked.simulate.camera import DEFAULT_GAIN, SimulatedCamera
 from spiked.simulate.motion import Recorded
-from spiked.simulate.sensor import SensorNoise
+from spiked.simulate.sensor import Lighting, SensorNoise, SpikeSensor
 from spiked.simulate.splats import SplatScene
 from spiked.trajectory import Trajectory, tum_lines
 
@@ -41,6 +43,7 @@ def camera_of_files(
     *,
     seed: int = 0,
     noise: SensorNoise | None = None,
+    lighting: Lighting | None = None,
     gain: float | None = None,
     step_px: float | None = None,
     threads: int = 1,
@@ -59,7 +62,9 @@ def camera_of_files(
     if gain is None:
         gain = scene.white or DEFAULT_GAIN
     splats = SplatScene(scene, threads)
-    return SimulatedCamera(sensor, seed, motion, splats, noise, gain=gain, step_px=step_px, threads=threads)
+    return SimulatedCamera(
+        sensor, seed, motion, splats, noise, gain=gain, lighting=lighting, step_px=step_px, threads=threads
+    )
 
 
 def simulate(
@@ -85,6 +90,28 @@ def simulate(
     and LSB first.
     """
     folder, sensor = Path(folder), camera.sensor
+    with writing_into(folder, sensor):
+        data = folder / f"{name}.dat"
+        simulation = simulation_of(camera.spikes, camera.gain)
+        error = camera.interpolation_error(frames)
+        if error is not None:
+            simulation["interpolation"] = asdict(error)
+        write_frames(
+            data, replace(sensor, intrinsics=camera.intrinsics), camera.next_frames, frames, simulation, progress
+        )
+        with (folder / "groundtruth.tum").open("w", encoding="utf-8") as file:
+            file.writelines(tum_lines(_truth(camera, frames)))
+        _write_views(camera, folder, frames, views=views, seed=seed)
+    return data
+
+
+@contextmanager
+def writing_into(folder: Path, sensor: Sensor) -> Iterator[None]:
+    """Make a folder for a simulated recording, which must be new or empty.
+
+    Raises RecordingError if it cannot be written, then and later, and ConfigurationError for a sensor whose frames are
+    not compact and LSB first.
+    """
     if sensor.layout is not Layout.COMPACT or sensor.bit_order is not BitOrder.LSB:
         raise ConfigurationError(
             "simulated recordings are compact, LSB first; write one and convert it to another layout"
@@ -93,26 +120,39 @@ def simulate(
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise RecordingError(f"{folder} is not empty; name a new folder for the simulated recording")
-        data = folder / f"{name}.dat"
-        described = replace(sensor, intrinsics=camera.intrinsics)
-        simulation = {"seed": camera.spikes.seed, "gain": camera.gain, "noise": asdict(camera.spikes.noise)}
-        error = camera.interpolation_error(frames)
-        if error is not None:
-            simulation["interpolation"] = asdict(error)
-        with RecordingWriter(
-            data, described, note="simulated; cfa is of the upright image", simulation=simulation
-        ) as out:
-            for begin in range(0, frames, _CHUNK):
-                count = min(_CHUNK, frames - begin)
-                out.append(camera.next_frames(count))
-                if progress is not None:
-                    progress(begin + count)
-        with (folder / "groundtruth.tum").open("w", encoding="utf-8") as file:
-            file.writelines(tum_lines(_truth(camera, frames)))
-        _write_views(camera, folder, frames, views=views, seed=seed)
+        yield
     except OSError as error:
         raise RecordingError(f"cannot write the simulated recording in {folder}: {error.strerror}") from error
-    return data
+
+
+def write_frames(
+    data: Path,
+    sensor: Sensor,
+    next_frames: Callable[[int], NDArray[np.uint8]],
+    frames: int,
+    simulation: dict[str, Any],
+    progress: Callable[[int], None] | None,
+) -> None:
+    """Write a recording with its sidecar; `next_frames` gives as many frames as it is asked for [n, frame_bytes]."""
+    note = "simulated; cfa is of the upright image"
+    with RecordingWriter(data, sensor, note=note, simulation=simulation) as out:
+        for begin in range(0, frames, _CHUNK):
+            count = min(_CHUNK, frames - begin)
+            out.append(next_frames(count))
+            if progress is not None:
+                progress(begin + count)
+
+
+def write_picture(file: Path, intensity: NDArray[np.float32]) -> None:
+    """Write a noise-free picture [H, W] or [H, W, 3], linear from 0 to 1, as a PNG of 8 bits."""
+    picture = np.round(np.clip(intensity, 0, 1) * 255).astype(np.uint8)
+    file.write_bytes(cv2.imencode(".png", picture[..., ::-1] if picture.ndim == 3 else picture)[1].tobytes())
+
+
+def simulation_of(spikes: SpikeSensor, gain: float) -> dict[str, Any]:
+    """What a sidecar says of the simulated sensor."""
+    told = {"seed": spikes.seed, "gain": gain, "noise": asdict(spikes.noise)}
+    return told if spikes.lighting == Lighting() else told | {"lighting": asdict(spikes.lighting)}
 
 
 def _truth(camera: SimulatedCamera, frames: int) -> Iterator[Trajectory]:
@@ -166,9 +206,7 @@ def _write_views(camera: SimulatedCamera, folder: Path, frames: int, *, views: i
 
 
 def _write_view(camera: SimulatedCamera, pose: Array, path: Path, *, undistorted: bool) -> None:
-    intensity = camera.view(pose[:3, :3], pose[:3, 3], undistorted) / camera.gain
-    picture = np.round(np.clip(intensity, 0, 1) * 255).astype(np.uint8)
-    path.write_bytes(cv2.imencode(".png", picture[..., ::-1] if picture.ndim == 3 else picture)[1].tobytes())
+    write_picture(path, camera.view(pose[:3, :3], pose[:3, 3], undistorted) / camera.gain)
 
 
 def _finite(depth: NDArray[np.float32]) -> NDArray[np.float32]:

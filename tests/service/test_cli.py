@@ -91,7 +91,7 @@ def test_a_simulation_can_interpolate_and_states_the_error(tmp_path: Path) -> No
 
 
 def test_a_simulation_says_how_long_it_takes_yet(capsys: pytest.CaptureFixture[str]) -> None:
-    with show_progress(4000, every_s=0) as show:
+    with show_progress("simulating", 4000, every_s=0) as show:
         show(1000)
     assert re.fullmatch(r"simulating: 1000/4000 frames, \d+ s left\n", capsys.readouterr().err)
 

@@ -1,10 +1,11 @@
-"""`spiked simulate`: a recording with ground truth, of the built-in room or of a given scene and path."""
+"""`spiked simulate`: a recording with ground truth, of the built-in room, a given scene and path, or pictures."""
 
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -14,30 +15,72 @@ from spiked.render.cpu import usable_cores
 from spiked.sensor import Mosaic, Response, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
 from spiked.simulate.camera import DEFAULT_GAIN, LONG_FRAMES, LONG_STEP_PX, default_step_px
+from spiked.simulate.pictures.record import Interpolation
 from spiked.simulate.record import camera_of_files
 from spiked.simulate.record import simulate as write_simulation
+from spiked_service.cli import noise_flags as n
 from spiked_service.cli import outputs
 from spiked_service.cli.console import messages, output
+from spiked_service.cli.picture_simulation import VideoOptions, simulate_video
 from spiked_service.cli.recording_flags import DistortionText, with_optics
 
 _FOV_DEG = 60.0
 """Horizontal field of view if none is given, degrees."""
+_FRAMES, _VIEWS = 1280, 16
+"""Frames and held-out views of a rendered recording if none are given."""
+_WIDTH, _HEIGHT = 400, 250
+"""Pixels of a rendered recording if none are given."""
+_PICTURES = "Spikes from pictures"
 _LINE_S = 10.0
 """Time between two lines of progress where standard error is not a terminal."""
 
 
+# Longer than 60 lines, because each option is a parameter.
 def simulate(
+    context: typer.Context,
     out: Annotated[Path, typer.Option("--out", "-o", help="New folder for recording and ground truth.")],
     name: Annotated[str, typer.Option(help="Name of the recording.")] = "simulated",
-    frames: Annotated[int, typer.Option(help="Number of frames.", min=1)] = 1280,
+    frames: Annotated[
+        int | None, typer.Option(help="Number of frames. Default: 1280; of pictures: as long as they last.", min=1)
+    ] = None,
     scene: Annotated[Path | None, typer.Option(help="A 3DGS PLY instead of the built-in room.")] = None,
-    poses: Annotated[Path | None, typer.Option(help="TUM file of the camera path; needs --scene.")] = None,
+    poses: Annotated[Path | None, typer.Option(help="TUM file of the camera path, of --scene or --video.")] = None,
+    video: Annotated[
+        Path | None,
+        typer.Option(help="A video, or a folder of images, instead of the built-in room.", rich_help_panel=_PICTURES),
+    ] = None,
+    picture_rate: Annotated[
+        float | None,
+        typer.Option(
+            help="Pictures a second, instead of the times that the video, a file times.txt or the names state; of slow "
+            "motion, those of the camera.",
+            min=1e-3,
+            max=1e6,
+            rich_help_panel=_PICTURES,
+        ),
+    ] = None,
+    gamma: Annotated[
+        str,
+        typer.Option(
+            help="How values of pictures follow from light: srgb, linear, or an exponent such as 2.2.",
+            rich_help_panel=_PICTURES,
+        ),
+    ] = "srgb",
+    interpolation: Annotated[
+        Interpolation,
+        typer.Option(
+            help="Light between pictures: linear fades from one to the next; motion moves it along the optical flow.",
+            rich_help_panel=_PICTURES,
+        ),
+    ] = Interpolation.LINEAR,
     motion: Annotated[MotionKind, typer.Option(help="Path through the built-in room.")] = MotionKind.HAND_SHAKE,
     flow: Annotated[
         float, typer.Option(help="Image motion in pixels per frame, in the built-in room.", min=0.0)
     ] = 0.12,
-    width: Annotated[int, typer.Option(help="Width in pixels; a multiple of 8.")] = 400,
-    height: Annotated[int, typer.Option(help="Height in pixels.")] = 250,
+    width: Annotated[
+        int | None, typer.Option(help="Width in pixels; a multiple of 8. Default: 400, or that of the pictures.")
+    ] = None,
+    height: Annotated[int | None, typer.Option(help="Height in pixels. Default: 250, or that of the pictures.")] = None,
     rate: Annotated[float, typer.Option(help="Frame rate in Hz.")] = 20_000.0,
     mosaic: Annotated[Mosaic | None, typer.Option(help="Colour mosaic of the upright image. Default: grey.")] = None,
     response: Annotated[
@@ -50,22 +93,42 @@ def simulate(
         float | None,
         typer.Option(help="Spikes per frame of white. Default: from the PLY, or 0.35."),
     ] = None,
-    views: Annotated[int, typer.Option(help="Number of held-out noise-free views.", min=0)] = 16,
+    views: Annotated[
+        int | None,
+        typer.Option(help="Number of held-out noise-free views. Default: 16; of pictures: 0.", min=0),
+    ] = None,
     picture_step: Annotated[
         float | None,
         typer.Option(
             help="Image motion in pixels between exact pictures; frames between are interpolated, and the sidecar says "
             f"with what error. Default: {LONG_STEP_PX} (off by 0.1 to 0.2 % of white RMS) above {LONG_FRAMES} frames; "
-            "up to that length, an exact picture at least every 8 frames.",
+            "up to that length, an exact picture at least every 8 frames. With --interpolation motion: between "
+            "pictures that are made.",
             min=0.01,
         ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Same seed and options: same bytes.")] = 0,
+    electrons_a_spike: n.ElectronsASpike = n.DEFAULT.electrons_a_spike,
+    temperature_k: n.TemperatureK = n.DEFAULT.temperature_k,
+    swing_v: n.SwingV = n.DEFAULT.swing_v,
+    reset_noise: n.ResetNoise = n.DEFAULT.reset_noise,
+    threshold_jitter: n.ThresholdJitter = n.DEFAULT.threshold_jitter,
+    dark: n.Dark = n.DEFAULT.dark,
+    dark_spread: n.DarkSpread = n.DEFAULT.dark_spread,
+    capacitance_mismatch: n.CapacitanceMismatch = n.DEFAULT.capacitance_mismatch,
+    reset_bias: n.ResetBias = n.DEFAULT.reset_bias,
+    hot_share: n.HotShare = n.DEFAULT.hot_share,
+    hot_rate: n.HotRate = n.DEFAULT.hot_rate,
+    dead_share: n.DeadShare = n.DEFAULT.dead_share,
+    flicker: n.Flicker = n.DEFAULT.flicker,
+    flicker_hz: n.FlickerHz = n.DEFAULT.flicker_hz,
 ) -> None:
     """Simulate a camera with shot, thermal, dark and fixed-pattern noise, with ground truth.
 
     With --distortion the recording is distorted; the held-out views are not. The folder views_lens then has the same
     views through the lens, for `spiked evaluate`.
+
+    With --video the light comes from pictures, scaled and cut to --width and --height, and says how far they are apart.
 
     Examples:
 
@@ -73,34 +136,77 @@ def simulate(
 
     - `spiked simulate -o again --scene out/scene.ply --poses out/trajectory.tum --fov 60`
 
+    - `spiked simulate -o lamp --flicker 0.3 --dark 0.01 --hot-share 0.001 --temperature-k 340`
+
+    - `spiked simulate -o street --video street.mp4 --picture-rate 960 --width 400 --height 250 --fov 60`
+
     - `spiked simulate -o wide --fov 120 --distortion fisheye:0.02`
 
     - `spiked simulate -o walk --scene flat.ply --poses walk.tum --fov 60 --frames 200000 --views 40`
     """
     outputs.try_folder("--out", out)
-    sensor = Sensor(width, height, rate, mosaic=mosaic, response=response)
+    threads = usable_cores()
+    options = n.noise_of(context.params).checked(response)
+    if video is not None:
+        _refuse_with_video(context)
+        given: dict[str, Any] = {one.name: context.params.get(one.name) for one in fields(VideoOptions)}
+        given |= {"noise": options, "threads": threads, "views": views or 0}
+        simulate_video(VideoOptions(**given), show_progress)
+        return
+    frames = _FRAMES if frames is None else frames
+    sensor = Sensor(width or _WIDTH, height or _HEIGHT, rate, mosaic=mosaic, response=response)
     if intrinsics is None and fov is None:
         fov = _FOV_DEG
     sensor = with_optics(sensor, fov, intrinsics, distortion)
     if (scene is None) != (poses is None):
         raise ConfigurationError("give --scene and --poses together")
     step_px = default_step_px(frames) if picture_step is None else picture_step
-    threads = usable_cores()
     if scene is not None and poses is not None:
-        camera = camera_of_files(sensor, scene, poses, seed=seed, gain=gain, step_px=step_px, threads=threads)
+        camera = camera_of_files(
+            sensor,
+            scene,
+            poses,
+            seed=seed,
+            noise=options.noise(),
+            lighting=options.lighting(),
+            gain=gain,
+            step_px=step_px,
+            threads=threads,
+        )
     else:
         gain = DEFAULT_GAIN if gain is None else gain
-        camera = SimulatedCamera(sensor, seed, motion, gain=gain, flow_px=flow, step_px=step_px, threads=threads)
-    with show_progress(frames) as show:
+        camera = SimulatedCamera(
+            sensor,
+            seed,
+            motion,
+            noise=options.noise(),
+            gain=gain,
+            flow_px=flow,
+            lighting=options.lighting(),
+            step_px=step_px,
+            threads=threads,
+        )
+    views = _VIEWS if views is None else views
+    with show_progress("simulating", frames) as show:
         path = write_simulation(camera, out, name, frames, views=views, seed=seed, progress=show)
     output.print(f"{path}: {frames} frames, {sensor.width}x{sensor.height}, ground truth in {out / 'groundtruth.tum'}")
 
 
+def _refuse_with_video(context: typer.Context) -> None:
+    """Raises ConfigurationError for options of a rendered scene."""
+    sources = {name: context.get_parameter_source(name) for name in ("scene", "motion", "flow")}
+    stated = [f"--{name}" for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
+    if stated:
+        raise ConfigurationError(f"--video is the scene itself: leave out {', '.join(stated)}")
+
+
 @contextmanager
-def show_progress(frames: int, every_s: float = _LINE_S) -> Iterator[Callable[[int], None]]:
+def show_progress(
+    work: str, total: int, units: str = "frames", every_s: float = _LINE_S
+) -> Iterator[Callable[[int], None]]:
     """A bar with the time left; off a terminal, a plain line every `every_s` seconds."""
     bar = Progress(
-        TextColumn("simulating"),
+        TextColumn(work),
         BarColumn(bar_width=28),
         TaskProgressColumn(),
         TimeElapsedColumn(),
@@ -110,7 +216,7 @@ def show_progress(frames: int, every_s: float = _LINE_S) -> Iterator[Callable[[i
         transient=True,
         disable=not messages.is_terminal,
     )
-    task = bar.add_task("simulating", total=frames)
+    task = bar.add_task(work, total=total)
     begin = last = time.monotonic()
 
     def show(done: int) -> None:
@@ -119,8 +225,8 @@ def show_progress(frames: int, every_s: float = _LINE_S) -> Iterator[Callable[[i
         now = time.monotonic()
         if not messages.is_terminal and now - last >= every_s:
             last = now
-            left = (now - begin) * (frames / done - 1)
-            messages.print(f"simulating: {done}/{frames} frames, {left:.0f} s left", markup=False)
+            left = (now - begin) * (total / done - 1)
+            messages.print(f"{work}: {done}/{total} {units}, {left:.0f} s left", markup=False)
 
     with bar:
         yield show

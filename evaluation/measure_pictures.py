@@ -75,7 +75,10 @@ def score(recording: Path, truth: Path, out: Path, steps: int) -> dict[str, floa
     spiked("reconstruct", recording, "-o", out, "--steps", steps)
     seconds = time.monotonic() - begin
     spiked("evaluate", out, "--recording", truth, "--json", out / "figures.json")
-    return json.loads((out / "figures.json").read_text()) | {"seconds": seconds}
+    figures = json.loads((out / "figures.json").read_text()) | {"seconds": seconds}
+    # Against the poses of the pictures, evenly joined: the path that the light between the pictures has.
+    spiked("evaluate", out, "--recording", recording, "--json", out / "own.json")
+    return figures | {"own_ate": json.loads((out / "own.json").read_text()).get("ate_percent", np.nan)}
 
 
 def main() -> None:
@@ -115,16 +118,16 @@ def main() -> None:
             told = json.loads((folder / "simulated.json").read_text())["simulation"]["pictures"]["spacing"]
             rows.append((f"{rate:g} pictures/s, {kind}", folder / "simulated.dat", told, time.monotonic() - begin))
     print(
-        "| light | px apart, median / 95 % | rate error, % of white | ATE % | RPE_r deg | PSNR dB | SSIM | s to make |"
+        "| light | px apart, median / 95 % | rate error, % of white | ATE % | against the pictures' path | RPE_r deg | PSNR dB | SSIM | s to make |"
     )
-    print("|---|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|---|")
     reference = rates(truth, frames)
     for name, recording, told, seconds in rows:
         apart = "-" if told is None else f"{told['median_px']:.2f} / {told['p95_px']:.2f}"
         error = 100 / 0.35 * float(np.sqrt(np.square(rates(recording, frames) - reference).mean()))
         f = score(recording, truth, given.out / f"out-{name.replace(' ', '-').replace('/', '')}", given.steps)
         print(
-            f"| {name} | {apart} | {error:.2f} | {f.get('ate_percent', np.nan):.3f} | {f.get('rpe_r_deg', np.nan):.4f} "
+            f"| {name} | {apart} | {error:.2f} | {f.get('ate_percent', np.nan):.3f} | {f['own_ate']:.3f} | {f.get('rpe_r_deg', np.nan):.4f} "
             f"| {f.get('psnr_db', np.nan):.2f} | {f.get('ssim', np.nan):.4f} | {seconds:.0f} |",
             flush=True,
         )

@@ -119,7 +119,7 @@ class PicturePath:
     def frames(self, count: int) -> NDArray[np.int64]:
         """Frames among the first `count` whose middle lies on the path [n]."""
         numbers = np.arange(count, dtype=np.int64)
-        return numbers[self.covers(numbers + 0.5)]
+        return numbers[self.covers(numbers.astype(np.float64) + 0.5)]
 
     def covers(self, times: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether moments in frames [n] lie on the path."""

@@ -6,7 +6,8 @@ Renders the path at each rate of pictures as a lossless video of 8 bits (sRGB) w
 with `spiked simulate --video`, with and without motion compensation, and one of the exact light. All are reconstructed
 without poses and scored by `spiked evaluate` against the truth and the held-out views of the exact light. Prints a
 table in Markdown; the rate error is that of windows of 64 frames in percent of white, sensor noise included, "own ATE"
-is against the poses of the pictures, evenly joined, and s the time to make the recording. Without a scene the built-in room is rendered.
+is against the poses of the pictures, evenly joined, and s the time to make the recording. Without a
+scene the built-in room is rendered.
 """
 
 import argparse

@@ -118,11 +118,16 @@ def writing_into(folder: Path, sensor: Sensor) -> Iterator[None]:
         )
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            raise RecordingError(f"{folder} is not empty; name a new folder for the simulated recording")
+        check_empty(folder)
         yield
     except OSError as error:
         raise RecordingError(f"cannot write the simulated recording in {folder}: {error.strerror}") from error
+
+
+def check_empty(folder: Path) -> None:
+    """Raises RecordingError for a folder that holds something."""
+    if folder.is_dir() and any(folder.iterdir()):
+        raise RecordingError(f"{folder} is not empty; name a new folder for the simulated recording")
 
 
 def write_frames(

@@ -15,7 +15,7 @@ from spiked_service.cli.main import app
 from typer.testing import CliRunner
 
 from spiked.recording import open_recording
-from spiked.sensor import Intrinsics, Mosaic
+from spiked.sensor import Intrinsics, Mosaic, Sensor
 from spiked.simulate.pictures.light import Framing, Node, Sites, Transfer, spans_between
 from spiked.simulate.pictures.motion import corners_moved, moved_nodes, shown
 from spiked.simulate.pictures.reading import open_pictures
@@ -157,6 +157,27 @@ def test_a_video_is_read_with_its_times_and_poses(tmp_path: Path, kind: str) -> 
     told = json.loads((tmp_path / "out" / "simulated.json").read_text())["simulation"]["pictures"]
     assert (told["count"], told["transfer"], told["interpolation"]) == (9, "sRGB", "linear")
     assert told["spacing"]["median_px"] == pytest.approx(0.3, abs=0.02)
+
+
+def test_poses_of_nerfstudio_have_names_and_optics(tmp_path: Path) -> None:
+    folder = write_pictures(tmp_path / "pictures", moving(4, 0.3), [f"{k / 100 + 5:.2f}.png" for k in range(4)])
+    path = Trajectory(np.arange(4) / 100 + 5, np.stack([np.eye(3)] * 4), np.eye(4)[:, :3])
+    optics = Intrinsics(90.0, 91.0, 80.0, 50.0)
+    text = path.nerfstudio(Sensor(160, 100, 100.0, intrinsics=optics))
+    assert "5.010000000.png" in text
+    (tmp_path / "transforms.json").write_text(re.sub(r"(\d\.\d\d)0{7}", r"\1", text))
+    done = simulate(tmp_path / "out", folder, "--poses", tmp_path / "transforms.json", "--width", 80)
+    assert done.exit_code == 0, done.output
+    truth = Trajectory.read_tum(tmp_path / "out" / "groundtruth.tum")
+    assert len(truth) == 600
+    expected = np.stack([np.interp(truth.times_s, np.arange(4) / 100, column) for column in path.centres.T], 1)
+    assert truth.centres == pytest.approx(expected, abs=1e-6)
+    assert truth.rotations[7] == pytest.approx(np.eye(3), abs=1e-9)
+    sensor = open_recording(tmp_path / "out" / "simulated.dat").sensor
+    assert (sensor.width, sensor.height, sensor.intrinsics) == (80, 50, Intrinsics(45.0, 45.5, 40.0, 25.0))
+    (tmp_path / "transforms.json").write_text('{"frames": [{"file_path": "a.png"}, {}]}')
+    wrong = simulate(tmp_path / "wrong", folder, "--poses", tmp_path / "transforms.json")
+    assert "frames.0.transform_matrix" in str(wrong.exception)
 
 
 def test_slow_motion_is_taken_at_the_rate_of_the_camera(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from spiked.errors import ConfigurationError
@@ -11,6 +11,7 @@ from spiked.simulate import NoiseOptions, SpikeSensor
 from spiked.simulate.camera import DEFAULT_GAIN, LONG_STEP_PX
 from spiked.simulate.pictures.light import Framing, Sites, Transfer
 from spiked.simulate.pictures.motion import Spacing
+from spiked.simulate.pictures.poses import read_poses
 from spiked.simulate.pictures.reading import Pictures, open_pictures
 from spiked.simulate.pictures.record import (
     GHOST_PX,
@@ -20,7 +21,7 @@ from spiked.simulate.pictures.record import (
     PictureSimulation,
     simulate_pictures,
 )
-from spiked.trajectory import Trajectory
+from spiked.simulate.record import check_empty
 from spiked_service.cli.console import messages, output, report_warning
 from spiked_service.cli.recording_flags import with_optics
 
@@ -60,15 +61,20 @@ def simulate_video(options: VideoOptions, progress: Progress) -> None:
     """Make the recording, and say what the pictures are. Raises SpikedError."""
     if options.gain is not None and not options.gain > 0:
         raise ConfigurationError(f"--gain {options.gain:g} must be a positive number of spikes a frame")
+    check_empty(options.out)
     transfer = Transfer.parse(options.gamma)
     pictures = open_pictures(options.video, options.picture_rate)
     first = next(iter(pictures.read()))
-    framing = Framing.of((first.shape[1], first.shape[0]), options.width, options.height)
+    size = (first.shape[1], first.shape[0])
+    framing = Framing.of(size, options.width, options.height)
+    poses, optics = (None, None) if options.poses is None else read_poses(options.poses, pictures, size)
     sensor = Sensor(framing.width, framing.height, options.rate, mosaic=options.mosaic, response=options.response)
+    if optics is not None:
+        sensor = replace(sensor, intrinsics=framing.intrinsics(optics))
     sensor = with_optics(sensor, options.fov, options.intrinsics, options.distortion)
     sites = Sites(options.mosaic, DEFAULT_GAIN if options.gain is None else options.gain)
     light = PictureLight(pictures, framing, transfer, sites, options.rate)
-    path = None if options.poses is None else PicturePath.of(Trajectory.read_tum(options.poses), light)
+    path = None if poses is None else PicturePath.of(poses, light)
     _describe(pictures, light)
     with progress("measuring motion", len(pictures.times_s), "pictures") as show:
         spacing = light.spacing(show)

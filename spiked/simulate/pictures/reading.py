@@ -3,6 +3,7 @@
 import os
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -62,7 +63,8 @@ class PictureFolder:
         """See `Pictures.read`."""
         shape = None
         for name in self.names:
-            image = cv2.imread(str(self.path / name), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
+            with _quiet():
+                image = cv2.imread(str(self.path / name), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
             if image is None:
                 raise RecordingError(f"{self.path / name} is no image that can be read; remove it from the folder")
             if image.dtype not in (np.uint8, np.uint16):
@@ -118,7 +120,7 @@ def open_pictures(path: Path | str, rate_hz: float | None = None) -> Pictures:
 
 
 def _open_folder(folder: Path, rate_hz: float | None) -> PictureFolder:
-    names = sorted((one.name for one in folder.iterdir() if one.suffix.lower() in SUFFIXES), key=_natural)
+    names = sorted((one.name for one in folder.iterdir() if one.suffix.lower() in SUFFIXES), key=natural)
     if len(names) < 2:
         raise RecordingError(
             f"{folder} has {_counted(len(names))} ({', '.join(sorted(SUFFIXES))}); spikes need the light between two "
@@ -219,16 +221,28 @@ def _video_times(path: Path) -> Array:
 
 
 def _opened(path: Path) -> cv2.VideoCapture:
-    # FFmpeg would print its own lines beside the one of the error. OpenCV reads the variable when it first decodes.
+    # FFmpeg's own lines; OpenCV reads the variable when it first decodes.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    with _quiet():
+        video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not video.isOpened():
         raise RecordingError(f"{path} is no video that OpenCV can decode; convert it, as with ffmpeg to .mp4")
     return video
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
-    """A key by which frame2 comes before frame10."""
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """OpenCV would print lines of its own beside the one of the error."""
+    before = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(before)
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """A key of names by which frame2 comes before frame10."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 

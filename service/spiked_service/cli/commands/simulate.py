@@ -44,7 +44,10 @@ def simulate(
         int | None, typer.Option(help="Number of frames. Default: 1280; of pictures: as long as they last.", min=1)
     ] = None,
     scene: Annotated[Path | None, typer.Option(help="A 3DGS PLY instead of the built-in room.")] = None,
-    poses: Annotated[Path | None, typer.Option(help="TUM file of the camera path, of --scene or --video.")] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(help="TUM file of the camera path, of --scene or --video; of a video also a transforms.json."),
+    ] = None,
     video: Annotated[
         Path | None,
         typer.Option(help="A video, or a folder of images, instead of the built-in room.", rich_help_panel=_PICTURES),

@@ -61,6 +61,7 @@ READS = {
     "stream",
     "given",
     "token_file",
+    "video",
     "map",
     "map_folder",
     "first",

@@ -415,7 +415,7 @@ class NoiseModel(BaseModel):
     reset_bias: Annotated[
         float,
         Field(
-            description="Half width of the uniform distribution of the pixels' reset voltage, as a share of the threshold (after Eq 18)."
+            description="Half width of the uniform distribution of the pixels' reset voltage, as a share of the swing (after Eq 18)."
         ),
     ] = 0.0208
     hot_share: Annotated[float, Field(description="Share of the pixels that are hot.")] = 0.0

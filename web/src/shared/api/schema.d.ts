@@ -2387,7 +2387,7 @@ export interface components {
             capacitance_mismatch?: number;
             /**
              * Reset Bias
-             * @description Half width of the uniform distribution of the pixels' reset voltage, as a share of the threshold (after Eq 18).
+             * @description Half width of the uniform distribution of the pixels' reset voltage, as a share of the swing (after Eq 18).
              * @default 0.0208
              */
             reset_bias?: number;

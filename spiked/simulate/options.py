@@ -28,7 +28,7 @@ class NoiseOptions(BaseModel):
     """Photo-electrons of one spike; shot noise is Poisson in electrons (Eq 13, 14)."""
     temperature_k: float = Field(default=300.0, ge=0, le=1000)
     """Absolute temperature in kelvin, of the thermal noise of a reset, sqrt(k T / C) (Eq 16); dark current is apart."""
-    swing_v: float = Field(default=1.0, gt=0, le=100)
+    swing_v: float = Field(default=1.0, ge=0.01, le=100)
     """Voltage of the threshold in volts, Vp - Vref (Eq 15); with the electrons it gives the capacitance C of Eq 16."""
     reset_noise: float | None = Field(default=None, ge=0, le=1)
     """Standard deviation of the reset voltage as a share of the threshold, instead of what Eq 16 gives."""

@@ -131,7 +131,8 @@ def simulate(
     With --distortion the recording is distorted; the held-out views are not. The folder views_lens then has the same
     views through the lens, for `spiked evaluate`.
 
-    With --video the light comes from pictures, scaled and cut to --width and --height, and says how far they are apart.
+    With --video the light comes from pictures, scaled and cut to --width and --height, and runs evenly from one to the
+    next. The command says how far apart they are, and warns where that shows edges twice.
 
     Examples:
 

@@ -10,12 +10,16 @@ from spiked.recon.localisation.map_index import MapIndex
 from spiked.recon.merging.known_map import KnownMap
 from spiked.recon.merging.merger import Merged, merge
 from spiked.recon.merging.registration import NotOnePlaceError, Registration
+from spiked.recon.methods import METHODS, Alternation, Initialisation, Method, MethodName, PoseStepName
 from spiked.recon.odometry.tracking_state import State
 from spiked.recon.options import LossName, MapOptions, Options
 from spiked.recon.reconstructor import Reconstructor
 from spiked.recon.report import Sample, Status, Tracked
 
 __all__ = [
+    "METHODS",
+    "Alternation",
+    "Initialisation",
     "KnownMap",
     "Localisation",
     "LocalisedView",
@@ -24,8 +28,11 @@ __all__ = [
     "MapIndex",
     "MapOptions",
     "Merged",
+    "Method",
+    "MethodName",
     "NotOnePlaceError",
     "Options",
+    "PoseStepName",
     "Reconstructor",
     "Registration",
     "Sample",

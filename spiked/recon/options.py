@@ -7,9 +7,10 @@ from spiked.errors import ConfigurationError
 from spiked.recon.frontend.spike_targets import TargetKind
 from spiked.recon.mapping.loss import LossName
 from spiked.recon.mapping.options import MapOptions
+from spiked.recon.methods import Initialisation, Method, MethodName, PoseStepName, method_of
 from spiked.trajectory import Trajectory
 
-__all__ = ["LossName", "MapOptions", "Options"]
+__all__ = ["Initialisation", "LossName", "MapOptions", "MethodName", "Options", "PoseStepName"]
 
 
 @dataclass(frozen=True)
@@ -36,13 +37,25 @@ class Options:
     """The camera's gains, dark rates and defects, from `spiked calibrate`."""
     refine_poses: bool = True
     """Whether the map corrects the trajectory."""
+    method: MethodName = MethodName.SPIKED
+    """Name of one of `spiked.recon.methods.METHODS`; the next three options replace parts of it."""
+    initialisation: Initialisation | None = None
+    """How the path begins; None: as in the method."""
+    pose_step: PoseStepName | None = None
+    """What corrects the poses; None: as in the method."""
     loss: LossName | None = None
-    """What the map is fitted to; None: `mapping.loss`."""
+    """What the map is fitted to; None: as in the method, or `mapping.loss` where that is not the default."""
     mapping: MapOptions = field(default_factory=MapOptions)
 
     def __post_init__(self) -> None:
         if self.window_frames is not None and not 2 <= self.window_frames <= 256:
             raise ConfigurationError(f"window of {self.window_frames} frames is outside 2 to 256")
+        method = method_of(self.method)
+        if self.initialisation is Initialisation.PROGRESSIVE and method.alternation is None:
+            raise ConfigurationError(
+                f"the method {self.method} needs a path before its map: the initialisation {self.initialisation} is "
+                "of the method nope-sgs"
+            )
         if self.steps < 0:
             raise ConfigurationError(f"refinement of {self.steps} steps is negative")
         if self.max_views < 20:
@@ -51,12 +64,27 @@ class Options:
             raise ConfigurationError(f"{self.memory_mb} MiB for images are too few; 16 is the least")
 
     @property
+    def parts(self) -> Method:
+        """The method with the parts that replace its own."""
+        method = method_of(self.method)
+        begin = self.initialisation if self.poses is None else Initialisation.TRACKS
+        return replace(
+            method,
+            initialisation=begin or method.initialisation,
+            pose_step=self.pose_step or method.pose_step,
+            loss=self.loss or method.loss,
+        )
+
+    @property
     def fitted(self) -> MapOptions:
-        """The options of the map, with `loss` where it is given."""
-        return self.mapping if self.loss is None else replace(self.mapping, loss=self.loss)
+        """The options of the map, with what the method changes of them."""
+        mapping = self.parts.fitted(self.mapping)
+        return mapping if self.loss is None else replace(mapping, loss=self.loss)
 
     @property
     def targets(self) -> tuple[TargetKind, ...]:
-        """What views record for the loss."""
-        kind = self.fitted.loss.target
-        return () if kind is None else (kind,)
+        """What views record for the losses."""
+        kinds = {self.fitted.loss.target}
+        if self.parts.initialisation is Initialisation.PROGRESSIVE:
+            kinds.add(LossName.INTERVAL.target)
+        return tuple(sorted(kind for kind in kinds if kind is not None))

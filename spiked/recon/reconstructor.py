@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from spiked.errors import ConfigurationError
 from spiked.pose import Array
 from spiked.recon import report
+from spiked.recon.alternation import Alternator
 from spiked.recon.blas import one_blas_thread
 from spiked.recon.frontend.feature_tracks import Picture, picture, smoothed, white_of
 from spiked.recon.frontend.mosaic_check import layout_warnings
@@ -18,14 +19,17 @@ from spiked.recon.frontend.windowing import View, Windows, luminance
 from spiked.recon.given_poses import GivenPoses
 from spiked.recon.mapping.loss import LossName
 from spiked.recon.mapping.pose_alignment import TrajectoryPrior
+from spiked.recon.mapping.pose_steps import GaussNewton, PoseGradient, PoseStep
 from spiked.recon.mapping.scene_psnr import COMPARED_VIEWS, scene_psnr_db
 from spiked.recon.mapping.trainer import MapTrainer
+from spiked.recon.methods import Initialisation, PoseStepName
 from spiked.recon.odometry.keyframe_pictures import KeyframePictures
 from spiked.recon.odometry.odometry import Odometry
 from spiked.recon.odometry.self_calibration import FIRST_DEG, EstimatedLens, Focal, optics_moved
 from spiked.recon.options import Options
 from spiked.recon.refiner import Refiner
 from spiked.recon.report import Sample, Status, Tracked, WorkLog
+from spiked.recon.untracked import UntrackedOdometry
 from spiked.recon.view_choice import choose
 from spiked.recon.view_store import ViewStore
 from spiked.render import Camera, rasteriser_for
@@ -81,7 +85,14 @@ class Reconstructor:
         self.views = ViewStore(options.max_views, (1 - KEYFRAME_SHARE) * memory_bytes, recorded)
         """One record a view."""
         pictures = KeyframePictures(KEYFRAME_SHARE * memory_bytes, None if recording is None else _Pictures(self))
-        self.odometry = Odometry(intrinsics, options.seed, focal, live, pictures)
+        self._untracked = options.parts.initialisation is Initialisation.PROGRESSIVE
+        if self._untracked and sensor.intrinsics is None:
+            raise ConfigurationError(
+                f"the focal length is not known, and the initialisation {Initialisation.PROGRESSIVE} has no tracks to "
+                "estimate it from: give --fov DEGREES or --intrinsics fx,fy,cx,cy"
+            )
+        made = UntrackedOdometry if self._untracked else Odometry
+        self.odometry = made(intrinsics, options.seed, focal, live, pictures)
         """The tracker: its views, points and states."""
         self.warnings: list[str] = []
         """Warnings about the recording, one sentence each."""
@@ -91,7 +102,7 @@ class Reconstructor:
             known, self.views, options.fitted, options.seed, options.threads, options.calibration
         )
         self._given = None if options.poses is None else GivenPoses(options.poses, sensor.frame_rate_hz)
-        self._refiner: Refiner | None = None
+        self._refiner: Refiner | Alternator | None = None
         self._preview = np.empty((sensor.height, sensor.width), np.float32)
         self._gaps: list[tuple[int, int]] = []
         self._after_gap = True
@@ -336,14 +347,26 @@ class Reconstructor:
                 return  # a rebuilt map without refinement would be worse
         if self.odometry.intrinsics != self.camera.intrinsics:
             self._trainer.restart(self.odometry.intrinsics)
-        align = self.options.refine_poses and self._given is None
-        prior = self._prior() if align else None
-        self._refiner = Refiner(self._trainer, path, self._points(), prior, align)
+        self._refiner = self._make_refiner(path)
         self._continue_refining(self._refiner, progress, cancelled, deadline, save)
+
+    def _make_refiner(self, path: Path) -> Refiner | Alternator:
+        """What fits map and path, by the method."""
+        parts, pose_step = self.options.parts, None
+        if self._given is None and (self.options.refine_poses or self._untracked):
+            pose_step = self._make_pose_step(parts.pose_step)
+        if parts.alternation is None:
+            return Refiner(self._trainer, path, self._points(), pose_step)
+        return Alternator(self._trainer, path, self._points(), pose_step, parts.alternation, self._untracked)
+
+    def _make_pose_step(self, name: PoseStepName) -> PoseStep:
+        if name is PoseStepName.GRADIENT:
+            return PoseGradient(self._trainer, self.options.seed)
+        return GaussNewton(self._trainer, None if self._untracked else self._prior())
 
     def _continue_refining(
         self,
-        refiner: Refiner,
+        refiner: Refiner | Alternator,
         progress: Callable[[Status], None],
         cancelled: Callable[[], bool],
         deadline: float,
@@ -353,6 +376,8 @@ class Reconstructor:
             self._progress = share
             self._log.note(self._trainer.mapper.loss)
             progress(self.status())
+        if isinstance(self.odometry, UntrackedOdometry):
+            self.odometry.follow(refiner.path)
         self._path_version += 1
 
     def _choose_views(self, path: Path) -> None:

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from spiked.pose import Array
-from spiked.recon.mapping.pose_alignment import TrajectoryPrior, align_spline
+from spiked.recon.mapping.pose_steps import PoseStep
 from spiked.recon.mapping.trainer import MapTrainer
 from spiked.spline import Path, Spline, Waypoints
 
-ALIGNED_VIEWS = 160
-"""Most views of an alignment."""
+GRADIENT_STEPS = 100
+"""Steps of a pose step that goes along the gradient, in place of one alignment."""
 PROGRESS_STEPS = 50
 """Steps between reports of progress."""
 
@@ -19,12 +19,10 @@ PROGRESS_STEPS = 50
 class Refiner:
     """Seeds and trains the map on the final path, and aligns the path with the map."""
 
-    def __init__(
-        self, trainer: MapTrainer, path: Path, points: Array, prior: TrajectoryPrior | None, align: bool
-    ) -> None:
-        """points [N, 3] are landmarks on the tracked `path`; `prior` is its information from the tracks.
+    def __init__(self, trainer: MapTrainer, path: Path, points: Array, pose_step: PoseStep | None) -> None:
+        """points [N, 3] are landmarks on the tracked `path`.
 
-        With `align` a path that is a spline is corrected by the map.
+        With a `pose_step` a path that is a spline is corrected by the map.
         """
         self.path = path
         """The path, corrected so far."""
@@ -36,8 +34,7 @@ class Refiner:
         self._trainer = trainer
         self._schedule = trainer.options.schedule
         self._points = points
-        self._prior = prior
-        self._align = align
+        self._pose_step = pose_step
         self._steps: int | None = None
         """Steps of the whole refinement; None before it has begun."""
         self._done = 0
@@ -95,18 +92,8 @@ class Refiner:
 
     def _align_if_due(self, share: float) -> None:
         due = self._schedule.alignments_due(share)
-        if due <= self.aligned or not self._align or not isinstance(self.path, Spline):
+        if due <= self.aligned or self._pose_step is None or not isinstance(self.path, Spline):
             return
         self.aligned = due
-        views = self._trainer.views
-        ids = views.mappable(self.path)
-        ids = ids[:: -(-len(ids) // ALIGNED_VIEWS)]
-        self.path = align_spline(
-            self.path,
-            [views[i].time for i in ids],
-            views.images(ids),
-            self._trainer.mapper,
-            self._trainer.planner,
-            self._prior,
-            self._schedule.alignment_step(due),
-        )
+        ids = self._trainer.views.mappable(self.path)
+        self.path = self._pose_step.improve(self.path, ids, GRADIENT_STEPS, share)

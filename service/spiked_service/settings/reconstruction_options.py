@@ -6,7 +6,7 @@ The defaults are the library's; names, limits and descriptions are here.
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictInt
 
 from spiked.camera import Pinhole
-from spiked.recon import LossName, Options
+from spiked.recon import Initialisation, LossName, MethodName, Options, PoseStepName
 
 _LIBRARY = Options()
 
@@ -48,9 +48,20 @@ class ReconstructionOptions(BaseModel):
         default=_LIBRARY.refine_poses, description="Whether the map corrects the trajectory."
     )
 
+    method: MethodName = Field(
+        default=_LIBRARY.method,
+        description="spiked, or nope-sgs: the method of 3D Gaussian Splatting from Unposed Spike Streams, to compare.",
+    )
+    initialisation: Initialisation | None = Field(
+        default=_LIBRARY.initialisation, description="How the path begins; as in the method if not given."
+    )
+    pose_step: PoseStepName | None = Field(
+        default=_LIBRARY.pose_step,
+        description="What corrects the poses while the map is fitted; as in the method if not given.",
+    )
     loss: LossName | None = Field(
         default=_LIBRARY.loss,
-        description="What the map is fitted to, to compare methods; the charge between spikes if not given.",
+        description="What the map is fitted to; as in the method if not given.",
     )
 
     intrinsics: IntrinsicsOption | None = Field(
@@ -67,5 +78,8 @@ class ReconstructionOptions(BaseModel):
             max_views=self.max_views,
             memory_mb=self.memory_mb,
             refine_poses=self.refine_poses,
+            method=self.method,
+            initialisation=self.initialisation,
+            pose_step=self.pose_step,
             loss=self.loss,
         )

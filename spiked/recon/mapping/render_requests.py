@@ -1,11 +1,12 @@
 """What to render for a view: poses along the camera's motion and the exposure of each pixel, or frames to warp."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spiked.pose import Array
+from spiked.recon.frontend.spike_targets import AdjacentSpikes
 from spiked.recon.frontend.windowing import View
 from spiked.recon.mapping.frame_warp import FrameWarp
 from spiked.render import Camera
@@ -36,6 +37,8 @@ class RenderRequest:
     """[H, W], pixels that these windows describe; None: all."""
     warp: FrameWarp | None = None
     """Fast motion: the frames to compare with the render from the one given pose."""
+    times: Array = field(default_factory=lambda: np.zeros(0))
+    """[S] of the poses in frames, where they are along an exposure."""
 
 
 @dataclass
@@ -62,18 +65,19 @@ class RenderPlanner:
         parts = self.sub_frames
         if parts == 0:
             rotations, centres = path.poses([view.time])
-            return RenderRequest(rotations, centres)
+            return RenderRequest(rotations, centres, times=np.array([view.time]))
         if parts is None:
             times, _, _ = view.exposure(1)
             rotations, centres = path.poses(np.clip(times, path.begin, path.end))
             moved_px = self.motion_px(rotations[0], centres[0], rotations[-1], centres[-1])
             parts = int(np.clip(np.ceil(moved_px / (SUB_FRAME_PX * pixel)), 1, MAX_SUB_FRAMES))
+        windows: Image | None
+        seen: NDArray[np.bool_] | None
         times, windows, seen = view.exposure(parts)
-        if not self.blur_matched:
-            rotations, centres = path.poses(np.clip(0.5 * (times[1:] + times[:-1]), path.begin, path.end))
-            return RenderRequest(rotations, centres)
+        if not self.blur_matched and not isinstance(view.shown, AdjacentSpikes):  # these have instants
+            times, windows, seen = 0.5 * (times[1:] + times[:-1]), None, None
         rotations, centres = path.poses(np.clip(times, path.begin, path.end))
-        return RenderRequest(rotations, centres, windows, seen)
+        return RenderRequest(rotations, centres, windows, seen, times=times)
 
     def warped(self, view: View, path: Path) -> RenderRequest | None:
         """For a view of fast motion: one pose, and the frames around it inside the path; None for others, and for

@@ -2,18 +2,19 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from spiked.calibration import Calibration
 from spiked.pose import Array
 from spiked.recon.frontend.windowing import View, luminance
-from spiked.recon.mapping.loss import LossName
+from spiked.recon.mapping.loss import Comparison, LossName
 from spiked.recon.mapping.mapper import Mapper
 from spiked.recon.mapping.options import MapOptions
 from spiked.recon.mapping.plane_sweep import SWEPT_PIXELS, PosedImage, Sweep, neighbours, sweep
-from spiked.recon.mapping.render_requests import RenderPlanner
+from spiked.recon.mapping.pyramid import Level, Target
+from spiked.recon.mapping.render_requests import RenderPlanner, RenderRequest
 from spiked.recon.mapping.seeding import SweptView
 from spiked.recon.view_store import ViewStore
 from spiked.render import Camera
@@ -29,6 +30,20 @@ UNKNOWN_NOISE = 1e6
 """Deviation of pixels outside of the image, in spikes a frame: they weigh nothing."""
 VERSION_STEPS = 20
 """Steps from one version of the map to the next."""
+
+
+@dataclass(frozen=True)
+class ViewRender:
+    """A rendered view; the rasteriser of its level can go backward until it renders again."""
+
+    level: Level
+    request: RenderRequest
+    """With the times of its sub-frames."""
+    target: Target
+    expected: Image
+    """Rates of the size of the level, with the gains of the pixels."""
+    factor: Image | None
+    """These gains, if they are known."""
 
 
 class MapTrainer:
@@ -194,6 +209,24 @@ class MapTrainer:
             self.mapper.densify(view_id, view, request)
         self._fitted_path = path
         self.version += self.mapper.steps % VERSION_STEPS == 0
+
+    def render(self, path: Path, view_id: int, level: Level) -> ViewRender:
+        """A view rendered over its exposure at the size of a level, with its target, by the sub-frames of its path."""
+        view = self.shown(view_id)
+        request = self.planner.exposed(view, path, level.factor)
+        target = level.target(view, request.windows, request.seen)
+        request = replace(request, windows=target.windows)
+        image = level.render(self.mapper.scene, request)
+        factor = None
+        if level.factor == 1 and self.options.nuisances:
+            factor = self.mapper.nuisances.factor(view_id)
+            image = replace(image, values=image.values * factor)
+        return ViewRender(level, request, target, image.values, factor)
+
+    def compare(self, path: Path, view_id: int) -> Comparison:
+        """A view compared with its render, by the loss of the map."""
+        made = self.render(path, view_id, self.mapper.alignment_level)
+        return self.mapper.view_loss.compare(made.expected, made.target, self.mapper.white, made.level.mosaic)
 
     def prune(self, path: Path, points: Array) -> None:
         """Remove splats that no view of the path needs; points [N, 3] are landmarks."""

@@ -25,7 +25,18 @@ from rich.progress import (
 from rich.text import Text
 
 from spiked.errors import ConfigurationError, SceneError, SpikedError
-from spiked.recon import LossName, Merged, NotOnePlaceError, Reconstructor, State, Status, extend
+from spiked.recon import (
+    Initialisation,
+    LossName,
+    Merged,
+    MethodName,
+    NotOnePlaceError,
+    PoseStepName,
+    Reconstructor,
+    State,
+    Status,
+    extend,
+)
 from spiked.recon.frontend.mosaic_check import detect
 from spiked.recon.frontend.windowing import Windows
 from spiked.recording import Recording, RecordingGeometry
@@ -93,6 +104,9 @@ def reconstruct(
     max_views: Annotated[int, _option("max_views")] = _DEFAULTS.max_views,
     memory_mb: Annotated[int, _option("memory_mb")] = _DEFAULTS.memory_mb,
     refine_poses: Annotated[bool, _option("refine_poses")] = _DEFAULTS.refine_poses,
+    method: Annotated[MethodName, _option("method")] = _DEFAULTS.method,
+    initialisation: Annotated[Initialisation | None, _option("initialisation")] = _DEFAULTS.initialisation,
+    pose_step: Annotated[PoseStepName | None, _option("pose_step")] = _DEFAULTS.pose_step,
     loss: Annotated[LossName | None, _option("loss")] = _DEFAULTS.loss,
     map_option: MapOptionTexts = None,
     watch: Annotated[bool, typer.Option("--watch", help="Serve a progress page.")] = False,
@@ -134,6 +148,8 @@ def reconstruct(
 
     - `spiked reconstruct rec.dat -o out --poses known.tum`
 
+    - `spiked reconstruct rec.dat -o theirs --method nope-sgs --steps 6000`
+
     - `spiked reconstruct --resume out`
     """
     if resume is not None:
@@ -165,6 +181,9 @@ def reconstruct(
         max_views=max_views,
         memory_mb=memory_mb,
         refine_poses=refine_poses,
+        method=method,
+        initialisation=initialisation,
+        pose_step=pose_step,
         loss=loss,
     )
     known = None if poses is None else Trajectory.read_tum(poses)

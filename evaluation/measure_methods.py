@@ -1,0 +1,205 @@
+"""The paper's method beside ours, part by part: the tables of docs/paper.md.
+
+    .venv/bin/python evaluation/measure_methods.py losses|poses|paths STREAMS_DIR [--only NAME] [--steps N] [--json OUT]
+
+losses: maps fitted to given poses with each loss, for equal steps, and then for the seconds that the charge took.
+poses:  a map fitted to the true poses of living is kept; a path disturbed by 0.2 degrees and 0.5 % is corrected by the
+        pose gradient of the paper and by our alignment.
+paths:  no poses are given: the paper's method as it is and with parts of ours, beside ours.
+
+STREAMS_DIR holds folders as `spiked simulate` writes them (NAME.dat, sidecar, groundtruth.tum, views.json, views/). The
+PSNR is of the held-out views at their true poses, with one gain.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from spiked.evaluate import score_trajectory
+from spiked.pose import log_so3
+from spiked.recon import Initialisation, LossName, MethodName, Options, PoseStepName, Reconstructor
+from spiked.recon.mapping.pose_steps import GaussNewton, PoseGradient, PoseStep
+from spiked.recording import Recording, open_recording
+from spiked.spline import Spline
+from spiked.trajectory import Trajectory
+
+CHUNK = 64
+STREAMS = "living", "garden", "garden_fast", "camp_color"
+DISTURBED_DEG, DISTURBED_PERCENT = 0.2, 0.5
+"""RMS rotation, and RMS distance in percent of the RMS radius of the path, of the disturbance."""
+KNOT_FRAMES = 16.0
+POSE_CHUNK = 50
+
+
+@dataclass(frozen=True)
+class Stream:
+    """A recording with its truth."""
+
+    folder: Path
+    frames: int | None
+
+    @property
+    def recording(self) -> Recording:
+        """The recording."""
+        return open_recording(self.folder / f"{self.folder.name}.dat")
+
+    @property
+    def truth(self) -> Trajectory:
+        """The true poses."""
+        return Trajectory.read_tum(self.folder / "groundtruth.tum")
+
+    def reconstruct(self, options: Options, budget_s: float | None = None) -> Reconstructor:
+        """Feed all frames and refine."""
+        recording = self.recording
+        made = Reconstructor(recording.sensor, options, recording=recording)
+        count = min(recording.frames, self.frames or recording.frames)
+        for first in range(0, count, CHUNK):
+            made.feed(first, recording.read(first, min(CHUNK, count - first)))
+        made.finish(budget_s=budget_s)
+        return made
+
+    def psnr_db(self, made: Reconstructor) -> float:
+        """Mean over the held-out views at their true poses, with one gain."""
+        pairs = []
+        for view in json.loads((self.folder / "views.json").read_text())["views"]:
+            truth = cv2.imread(str(self.folder / view["file"]), cv2.IMREAD_UNCHANGED)
+            assert truth is not None
+            image = truth.astype(np.float32) / 255
+            pose = np.array(view["c2w"])
+            shown = made.view(pose[:3, :3], pose[:3, 3])
+            pairs.append((shown, image[..., None] if image.ndim == 2 else image[..., ::-1]))
+        gain = sum(float((a * b).sum()) for a, b in pairs) / sum(float((a * a).sum()) for a, _ in pairs)
+        return float(np.mean([-10 * np.log10(np.mean((np.clip(gain * a, 0, 1) - b) ** 2)) for a, b in pairs]))
+
+
+def losses(streams: list[Stream], steps: int) -> Iterator[dict[str, Any]]:
+    """Each loss on given poses."""
+    for stream in streams:
+        budget_s: float | None = None
+        for name in LossName:
+            for seconds in (None,) if name is LossName.CHARGE else (None, budget_s):
+                many = steps if seconds is None else 50 * steps
+                made = stream.reconstruct(Options(steps=many, poses=stream.truth, loss=name), seconds)
+                work_s = made.report()["seconds"]["refining"]  # type: ignore[index]
+                budget_s = work_s if name is LossName.CHARGE else budget_s
+                kind = "equal steps" if seconds is None else "equal seconds"
+                yield {
+                    "stream": stream.folder.name, "what": f"{name}, {kind}", "psnr_db": stream.psnr_db(made),
+                    "steps": made.trainer.mapper.steps, "refining_s": work_s,
+                }  # fmt: skip
+
+
+def errors(path: Spline, truth: Spline, times: np.ndarray) -> tuple[float, float]:
+    """RMS rotation in degrees, and RMS distance in percent of the RMS radius; the map's frame is that of the truth."""
+    (rotations, centres), (true, at) = path.poses(times), truth.poses(times)
+    turned = log_so3(rotations @ true.swapaxes(1, 2))
+    radius = np.sqrt(((at - at.mean(0)) ** 2).sum(1).mean())
+    away = np.sqrt(((centres - at) ** 2).sum(1).mean())
+    return float(np.degrees(np.sqrt((turned**2).sum(1).mean()))), float(100 * away / radius)
+
+
+def disturbed(path: Spline, times: np.ndarray, seed: int) -> Spline:
+    """The path with random knots, scaled to the disturbance."""
+    rng = np.random.default_rng(seed)
+    turn, way = rng.normal(size=(2, len(path.centres), 3))
+    turn[0] = way[0] = 0  # the gradient keeps the first knot
+    turn *= np.radians(DISTURBED_DEG) / np.radians(errors(path.move(1e-3 * turn, 0 * way), path, times)[0]) * 1e-3
+    way *= DISTURBED_PERCENT / errors(path.move(0 * turn, 1e-3 * way), path, times)[1] * 1e-3
+    return path.move(turn, way)
+
+
+def poses(stream: Stream, steps: int, pose_steps: int) -> Iterator[dict[str, Any]]:
+    """A disturbed path corrected by a map that is kept."""
+    options = Options(steps=steps, poses=stream.truth, method=MethodName.NOPE_SGS)
+    made = stream.reconstruct(options)
+    assert made.path is not None
+    frames = np.arange(np.ceil(made.path.begin), np.floor(made.path.end))
+    rotations, centres = made.path.poses(frames)
+    truth = Spline.fit(frames, rotations, centres, KNOT_FRAMES, 1)
+    ids = made.views.mappable(truth)
+    start = disturbed(truth, frames, seed=0)
+    yield {"what": "disturbed", **dict(zip(("deg", "percent"), errors(start, truth, frames), strict=True))}
+    ways: list[tuple[str, PoseStep, int]] = [
+        ("our alignment", GaussNewton(made.trainer), 5 * POSE_CHUNK),
+        ("pose gradient, difference of renders", PoseGradient(made.trainer, 0), pose_steps),
+        ("pose gradient, each render", PoseGradient(made.trainer, 0, difference=False), pose_steps),
+    ]
+    for name, way, count in ways:
+        path, begin = start, time.perf_counter()
+        for done in range(0, count, POSE_CHUNK):
+            path = way.improve(path, ids, POSE_CHUNK, done / count)
+        found = dict(zip(("deg", "percent"), errors(path, truth, frames), strict=True))
+        number = 5 if isinstance(way, GaussNewton) else count
+        yield {"what": name, **found, "steps": number, "seconds": time.perf_counter() - begin}
+
+
+PATHS: dict[str, dict[str, Any]] = {
+    "ours": {},
+    "nope-sgs": {"method": MethodName.NOPE_SGS},
+    "nope-sgs from tracks": {"method": MethodName.NOPE_SGS, "initialisation": Initialisation.TRACKS},
+    "nope-sgs, charge": {"method": MethodName.NOPE_SGS, "loss": LossName.CHARGE},
+    "nope-sgs, alignment": {"method": MethodName.NOPE_SGS, "pose_step": PoseStepName.ALIGNMENT},
+    "ours, pose gradient": {"pose_step": PoseStepName.GRADIENT},
+}
+
+
+def paths(streams: list[Stream], steps: int, seeds: int) -> Iterator[dict[str, Any]]:
+    """Nothing is given."""
+    for stream in streams:
+        for name, options in PATHS.items():
+            for seed in range(seeds):
+                made = stream.reconstruct(Options(steps=steps, seed=seed, **options))
+                path = made.trajectory()
+                rate = stream.recording.sensor.frame_rate_hz
+                score = score_trajectory(truth=stream.truth, estimate=path, frame_rate_hz=rate)
+                row = {"stream": stream.folder.name, "what": name, "seed": seed, "coverage": score.coverage}
+                if score.errors is not None:
+                    row |= {"ate_percent": score.errors.ate_percent, "rpe_r_deg": score.errors.rpe_r_deg}
+                yield row | {"loss": made.trainer.mapper.loss, "steps": made.trainer.mapper.steps, "s": made.work_s}
+
+
+def line(row: dict[str, Any]) -> str:
+    """A row in Markdown."""
+    return "| " + " | ".join(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values()) + " |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("table", choices=("losses", "poses", "paths"))
+    parser.add_argument("streams", type=Path)
+    parser.add_argument("--only", default="", help="the stream of this name; default: all four")
+    parser.add_argument("--row", default="", help="paths: the row of this name alone")
+    parser.add_argument("--steps", type=int, default=1000, help="steps of the map; of paths: of map and poses")
+    parser.add_argument("--pose-steps", type=int, default=1500, help="of the table poses")
+    parser.add_argument("--seeds", type=int, default=1, help="of the table paths")
+    parser.add_argument("--frames", type=int, help="first frames of each recording; default: all")
+    parser.add_argument("--json", type=Path, help="file for the rows")
+    options = parser.parse_args()
+    if options.row:
+        for name in set(PATHS) - {options.row}:
+            del PATHS[name]
+    chosen = [Stream(options.streams / name, options.frames) for name in STREAMS if options.only in ("", name)]
+    match options.table:
+        case "losses":
+            rows = losses(chosen, options.steps)
+        case "poses":
+            rows = poses(chosen[0], options.steps, options.pose_steps)
+        case _:
+            rows = paths(chosen, options.steps, options.seeds)
+    made = []
+    for row in rows:
+        made.append(row)
+        print(line(row), flush=True)
+    if options.json:
+        options.json.write_text(json.dumps(made, indent=1))
+
+
+if __name__ == "__main__":
+    main()

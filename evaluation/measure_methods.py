@@ -150,12 +150,12 @@ PATHS: dict[str, dict[str, Any]] = {
 }
 
 
-def paths(streams: list[Stream], steps: int, seeds: int) -> Iterator[dict[str, Any]]:
+def paths(streams: list[Stream], steps: int, seeds: int, window_frames: int | None) -> Iterator[dict[str, Any]]:
     """Nothing is given."""
     for stream in streams:
         for name, options in PATHS.items():
             for seed in range(seeds):
-                made = stream.reconstruct(Options(steps=steps, seed=seed, **options))
+                made = stream.reconstruct(Options(steps=steps, seed=seed, window_frames=window_frames, **options))
                 path = made.trajectory()
                 rate = stream.recording.sensor.frame_rate_hz
                 score = score_trajectory(truth=stream.truth, estimate=path, frame_rate_hz=rate)
@@ -179,6 +179,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1000, help="steps of the map; of paths: of map and poses")
     parser.add_argument("--pose-steps", type=int, default=1500, help="of the table poses")
     parser.add_argument("--seeds", type=int, default=1, help="of the table paths")
+    parser.add_argument("--window-frames", type=int, help="paths: frames of a view; default: by the motion")
     parser.add_argument("--frames", type=int, help="first frames of each recording; default: all")
     parser.add_argument("--json", type=Path, help="file for the rows")
     options = parser.parse_args()
@@ -192,7 +193,7 @@ def main() -> None:
         case "poses":
             rows = poses(chosen[0], options.steps, options.pose_steps)
         case _:
-            rows = paths(chosen, options.steps, options.seeds)
+            rows = paths(chosen, options.steps, options.seeds, options.window_frames)
     made = []
     for row in rows:
         made.append(row)

@@ -273,6 +273,15 @@ class ImageFormat(StrEnum):
     exr = "exr"
 
 
+class Initialisation(StrEnum):
+    """
+    How the path begins.
+    """
+
+    tracks = "tracks"
+    progressive = "progressive"
+
+
 class JobState(StrEnum):
     """
     State of a reconstruction.
@@ -352,6 +361,15 @@ class MergeRequest(BaseModel):
     seed: Annotated[int, Field(description="Of all random choices.")] = 0
     threads: Annotated[int | None, Field(description="All cores if not given.")] = None
     priority: Annotated[int, Field(description="Higher ones run earlier; live captures go before all.")] = 0
+
+
+class MethodName(StrEnum):
+    """
+    The names of `METHODS`.
+    """
+
+    spiked = "spiked"
+    nope_sgs = "nope-sgs"
 
 
 class Mosaic(StrEnum):
@@ -572,6 +590,15 @@ class Policy(StrEnum):
     lossless = "lossless"
     priority = "priority"
     latest = "latest"
+
+
+class PoseStepName(StrEnum):
+    """
+    What corrects the poses while the map is fitted.
+    """
+
+    alignment = "alignment"
+    gradient = "gradient"
 
 
 class Problem(BaseModel):
@@ -1325,9 +1352,23 @@ class ReconstructionOptions(BaseModel):
         Field(description="MiB of images held in memory; the others are built anew from the recording."),
     ] = 512
     refine_poses: Annotated[bool, Field(description="Whether the map corrects the trajectory.")] = True
+    method: Annotated[
+        MethodName,
+        Field(
+            description="spiked, or nope-sgs: the method of 3D Gaussian Splatting from Unposed Spike Streams, to compare."
+        ),
+    ] = MethodName.spiked
+    initialisation: Annotated[
+        Initialisation | None,
+        Field(description="How the path begins; as in the method if not given."),
+    ] = None
+    pose_step: Annotated[
+        PoseStepName | None,
+        Field(description="What corrects the poses while the map is fitted; as in the method if not given."),
+    ] = None
     loss: Annotated[
         LossName | None,
-        Field(description="What the map is fitted to, to compare methods; the charge between spikes if not given."),
+        Field(description="What the map is fitted to; as in the method if not given."),
     ] = None
     intrinsics: Annotated[
         IntrinsicsOption | None,

@@ -2098,6 +2098,12 @@ export interface components {
          */
         ImageFormat: "png" | "webp" | "jpeg" | "exr";
         /**
+         * Initialisation
+         * @description How the path begins.
+         * @enum {string}
+         */
+        Initialisation: "tracks" | "progressive";
+        /**
          * IntrinsicsModel
          * @description A pinhole camera behind a lens; pixels, the centre of the first pixel is (0.5, 0.5).
          * @example {
@@ -2321,6 +2327,12 @@ export interface components {
              */
             priority?: number;
         };
+        /**
+         * MethodName
+         * @description The names of `METHODS`.
+         * @enum {string}
+         */
+        MethodName: "spiked" | "nope-sgs";
         /**
          * Mosaic
          * @description Colour of the sites (0,0) (0,1) (1,0) (1,1) of the upright image, row-major.
@@ -2583,6 +2595,12 @@ export interface components {
          */
         Policy: "lossless" | "priority" | "latest";
         /**
+         * PoseStepName
+         * @description What corrects the poses while the map is fitted.
+         * @enum {string}
+         */
+        PoseStepName: "alignment" | "gradient";
+        /**
          * Problem
          * @description RFC 9457 problem details.
          * @example {
@@ -2765,7 +2783,16 @@ export interface components {
              * @default true
              */
             refine_poses?: boolean;
-            /** @description What the map is fitted to, to compare methods; the charge between spikes if not given. */
+            /**
+             * @description spiked, or nope-sgs: the method of 3D Gaussian Splatting from Unposed Spike Streams, to compare.
+             * @default spiked
+             */
+            method?: components["schemas"]["MethodName"];
+            /** @description How the path begins; as in the method if not given. */
+            initialisation?: components["schemas"]["Initialisation"] | null;
+            /** @description What corrects the poses while the map is fitted; as in the method if not given. */
+            pose_step?: components["schemas"]["PoseStepName"] | null;
+            /** @description What the map is fitted to; as in the method if not given. */
             loss?: components["schemas"]["LossName"] | null;
             /** @description Optics, where neither the capture nor its recording says them, or to overrule them. */
             intrinsics?: components["schemas"]["IntrinsicsOption"] | null;

@@ -1,8 +1,10 @@
-"""Timing of repeated work and the rows of a benchmark's table."""
+"""Timing of repeated work, the rows of a benchmark's table, and the name of the processor."""
 
+import platform
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -55,3 +57,13 @@ def peak_per_second() -> float:
     with threadpool_limits(1, "blas"):
         seconds = repeated(lambda: np.matmul(a, b, out=out), 10).best_s
     return float(side**3 / seconds)
+
+
+def processor() -> str:
+    """The name of this machine's processor, as its system has it."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()

@@ -269,12 +269,16 @@ class Spiked(MapMethods, ResultMethods):
         geometry: GeometryModel | None = None,
         form: str | None = None,
         array: str | None = None,
+        profile: ProfileModel | None = None,
+        device: str | None = None,
+        calibration: Path | str | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> CaptureOut:
         """Send a recording, with the sidecar beside it if there is one; it becomes a capture.
 
         Other files with frames are converted: `form` is `usb`, `pcie`, `array` or `bits`, by default detected; `array`
-        is the name of one of several arrays.
+        is the name of one of several arrays. `profile` says what `geometry` does not, or that of a `device`, whose
+        calibration is used, too; `calibration` is a file of `spiked calibrate`.
         `progress` is told of bytes sent and bytes in all. A connection that breaks is taken up where it broke.
         """
         path = Path(path)
@@ -290,8 +294,14 @@ class Spiked(MapMethods, ResultMethods):
             "sha256": _sha256(path),
             "form": form,
             "array": array,
+            "profile": plain(profile),
+            "device": device,
         }
         upload = self._connection.post("uploads", body, UploadOut)
+        if calibration is not None:
+            content = Path(calibration).read_bytes()
+            headers = {"Content-Type": "application/octet-stream"}
+            self._connection.request("PUT", f"uploads/{upload.id}/calibration", content=content, headers=headers)
         with path.open("rb") as file:
             while upload.offset_bytes < size:
                 upload = self._send(upload, file.seek(upload.offset_bytes), file.read(_CHUNK_BYTES))

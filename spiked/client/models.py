@@ -1625,6 +1625,53 @@ class SystemOut(BaseModel):
     ]
 
 
+class UploadProfile(BaseModel):
+    """
+    The profile of the camera that a recording is of.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    rate: Annotated[float | None, Field(description="Frames per second.")] = None
+    mosaic: Annotated[
+        Mosaic | None,
+        Field(description="Colour mosaic of the upright image; none: a grey sensor."),
+    ] = None
+    flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
+    response: Annotated[
+        Response | None,
+        Field(
+            description="How light becomes spikes: integrate-and-fire of spike cameras, or bernoulli of single-photon cameras."
+        ),
+    ] = None
+    fov: Annotated[
+        float | None,
+        Field(
+            description="Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated."
+        ),
+    ] = None
+    intrinsics: IntrinsicsModel | None = None
+    model: Annotated[str, Field(description="Name of the product.")] = ""
+    serial: Annotated[
+        str | None,
+        Field(description="Serial number of the camera that the profile is of; null: of any."),
+    ] = None
+    width: Annotated[int | None, Field(description="Pixels in a row.")] = None
+    height: Annotated[int | None, Field(description="Rows.")] = None
+    calibration: Annotated[
+        None,
+        Field(
+            description="Sent on its own, by `PUT uploads/ID/calibration`: a file name says nothing to another machine."
+        ),
+    ] = None
+    session: Annotated[
+        Session | None,
+        Field(description="How the bridge of a USB camera is made to send."),
+    ] = None
+    note: str = ""
+
+
 class ViewRequest(BaseModel):
     """
     One camera gives a picture; several, or a path, give a ZIP of pictures.
@@ -1860,6 +1907,14 @@ class UploadRequest(BaseModel):
     bytes: Annotated[int, Field(description="Size of the whole file.")]
     sidecar: UploadSidecar | None = None
     geometry: Annotated[GeometryModel | None, Field(description="Wins over the sidecar.")] = None
+    profile: Annotated[
+        UploadProfile | None,
+        Field(description="Camera profile, which says what geometry does not."),
+    ] = None
+    device: Annotated[
+        str | None,
+        Field(description="Device that the recording is of: its profile and its calibration are used."),
+    ] = None
     sha256: Annotated[str | None, Field(description="Of the whole file, in hex; checked at the end.")] = None
     form: Annotated[
         Form | None,

@@ -1,6 +1,7 @@
 """What reconstructions have published: versions, timelines, trajectories, scenes, pictures."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from spiked.client.connection import Connection, plain
 from spiked.client.models import (
@@ -15,6 +16,9 @@ from spiked.client.models import (
     VersionsOut,
 )
 from spiked.scene_changes import SceneChanges, SceneMirror
+
+_PIECE_BYTES = 1 << 20
+"""Bytes of a download that are written at a time."""
 
 
 class ResultMethods:
@@ -74,6 +78,30 @@ class ResultMethods:
         """The scene as a file; a fixed sample of it with max_splats."""
         query = {"format": kind, "version": version, "max_splats": max_splats}
         return self._connection.request("GET", f"reconstructions/{reconstruction_id}/scene", query=query).content
+
+    def report(self, reconstruction_id: str, *, version: int | None = None) -> str:
+        """A version as one HTML file, which opens offline."""
+        path = f"reconstructions/{reconstruction_id}/report"
+        return self._connection.request("GET", path, query={"version": version}).text
+
+    def save_bundle(
+        self, reconstruction_id: str, path: Path | str, *, version: int | None = None, recording: bool = False
+    ) -> Path:
+        """Write a version as one ZIP: report, scene, trajectory in four formats, pictures; with `recording` frames."""
+        path = Path(path)
+        part = path.with_name(f".{path.name}.part")
+        try:
+            with (
+                self._connection.stream(
+                    f"reconstructions/{reconstruction_id}/bundle", version=version, recording=recording or None
+                ) as answer,
+                part.open("wb") as file,
+            ):
+                for chunk in answer.iter_bytes(_PIECE_BYTES):
+                    file.write(chunk)
+            return part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
 
     def update_scene(self, reconstruction_id: str, mirror: SceneMirror, *, level: int | None = None) -> SceneChanges:
         """Bring a mirror of the scene to its newest version; only what has visibly changed since the last call travels.

@@ -478,11 +478,12 @@ class Reconstructor:
         return report.samples(self.views, self._trainer.mapper, self.path, self.sensor.frame_rate_hz, count)
 
     def report(self) -> dict[str, object]:
-        """Versions, parameters, states with reasons, timings and gaps, ready for JSON."""
+        """Versions, machine, parameters, states with reasons, timings and gaps, ready for JSON."""
         sensor, mapper, odometry = self.sensor, self._trainer.mapper, self.odometry
         aligned = self._refiner is not None and self._refiner.aligned > 0
         return {
             "versions": report.versions(),
+            "machine": report.machine(),
             "sensor": {"width": sensor.width, "height": sensor.height, "frame_rate_hz": sensor.frame_rate_hz},
             **report.optics_section(mapper, self.focal, self.odometry.lens),
             "options": report.options_section(self.options),
@@ -490,7 +491,7 @@ class Reconstructor:
             "gaps": [{"first_frame": f, "frames": n} for f, n in self._gaps],
             "outcome": "complete" if self.failure is None else "failed",
             "warnings": list(self.warnings),
-            **report.tracking_section(odometry, sensor.frame_rate_hz),
+            **report.tracking_section(odometry, self.views.since(0), sensor.frame_rate_hz),
             **report.path_section(self.path, odometry, aligned),
             "closures": report.closures_section(self.closures()),
             **report.map_section(mapper),

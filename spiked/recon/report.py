@@ -1,5 +1,6 @@
 """What a reconstruction reports: its status, its tracked views, its work, and the sections of `report.json`."""
 
+import os
 import platform
 import time
 from collections.abc import Iterator
@@ -9,6 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 
+from spiked.measurement import processor
 from spiked.pose import Array, log_so3
 from spiked.recon.frontend.demosaic import fill_mosaic
 from spiked.recon.mapping.mapper import Mapper
@@ -19,6 +21,7 @@ from spiked.recon.odometry.sparse_map import TrackedView
 from spiked.recon.odometry.tracking_state import State
 from spiked.recon.options import Options
 from spiked.recon.view_store import ViewRecord, ViewStore
+from spiked.render.cpu import usable_cores
 from spiked.sensor import Image
 from spiked.spline import Path, Spline
 
@@ -173,27 +176,40 @@ def versions() -> dict[str, str]:
     return {"spiked": release, "python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
 
 
+def machine() -> dict[str, object]:
+    """The machine that runs this: processor, cores that may be used, bytes of memory, system."""
+    pages, page_bytes = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
+    return {
+        "processor": processor(),
+        "cores": usable_cores(),
+        "memory_bytes": pages * page_bytes,
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+    }
+
+
 def options_section(options: Options) -> dict[str, object]:
     """All options; of poses and calibration only whether they were given."""
     given = {"poses": options.poses is not None, "calibration": options.calibration is not None}
     return asdict(replace(options, poses=None, calibration=None)) | given
 
 
-def tracking_section(odometry: Odometry, frame_rate_hz: float) -> dict[str, object]:
-    """State, its changes, and every view."""
+def tracking_section(odometry: Odometry, records: list[ViewRecord], frame_rate_hz: float) -> dict[str, object]:
+    """State, its changes, and every view, of which `records` have the spike rates."""
+    rates = {record.id: record.rate for record in records}
     return {
         "path_error_predicted": odometry.path_error,
         "state": str(odometry.state),
         "reason": odometry.reason,
         "states": [{"time_s": t / frame_rate_hz, "state": str(s), "reason": r} for t, s, r in odometry.changes],
-        "views": [_view(view, frame_rate_hz) for view in odometry.views],
+        "views": [_view(view, frame_rate_hz, rates.get(view.id)) for view in odometry.views],
     }
 
 
-def _view(view: TrackedView, frame_rate_hz: float) -> dict[str, object]:
+def _view(view: TrackedView, frame_rate_hz: float, rate: float | None) -> dict[str, object]:
     return {
         "time_s": view.time / frame_rate_hz,
         "frames": view.length,
+        "rate": None if rate is None else round(rate, 5),
         "motion_px": round(view.motion_px, 3),
         "inliers": round(view.inliers, 3),
         "chi2": None if view.chi2 is None else round(view.chi2, 3),

@@ -14,6 +14,7 @@ from spiked_service.api.idempotency import idempotent
 from spiked_service.api.openapi import describe
 from spiked_service.api.paths import register_path_kinds
 from spiked_service.api.problems import install
+from spiked_service.api.reports import Reports
 from spiked_service.api.routes.captures import capture_routes
 from spiked_service.api.routes.configuration import configuration_routes
 from spiked_service.api.routes.devices import device_routes
@@ -28,11 +29,13 @@ from spiked_service.api.routes.page import mount_page
 from spiked_service.api.routes.previews import preview_routes
 from spiked_service.api.routes.reconstructions import reconstruction_record_routes, reconstruction_routes
 from spiked_service.api.routes.recordings import recording_routes
+from spiked_service.api.routes.reports import report_routes
 from spiked_service.api.routes.results import capture_result_routes, reconstruction_result_routes
 from spiked_service.api.routes.system import system_routes
 from spiked_service.api.routes.uploads import upload_routes
 from spiked_service.api.services import Services
 from spiked_service.base.version import installed_version
+from spiked_service.captures.camera_profiles import CameraProfiles
 
 
 def create_app(services: Services) -> FastAPI:
@@ -75,10 +78,13 @@ def _api(services: Services) -> APIRouter:
     api.include_router(reconstruction_routes(reconstructions, once))
     api.include_router(map_routes(reconstructions, results, once))
     api.include_router(reconstruction_result_routes(reconstructions.rows, results, views, once))
+    api.include_router(report_routes(reconstructions.rows, Reports(results, captures, folder, views), once))
     api.include_router(reconstruction_record_routes(reconstructions.rows, once))
     api.include_router(doctor_routes(folder.path))
     api.include_router(option_routes())
-    api.include_router(upload_routes(services.uploads, captures, once))
+    api.include_router(
+        upload_routes(services.uploads, captures, services.sources, CameraProfiles(folder.profiles), once)
+    )
     api.include_router(event_routes(services.bus, services.event_clients))
     api.include_router(system_routes(services))
     api.include_router(configuration_routes(services.settings, services.tokens))

@@ -135,10 +135,10 @@ class Results:
     """Finds published versions, and serves their scenes and trajectories."""
 
     def __init__(self, rows: ReconstructionRepository, captures: Captures, trajectories: ConcurrencyLimit) -> None:
-        """`trajectories` limits concurrent downloads of trajectories."""
+        """`trajectories` limits concurrent downloads of trajectories and bundles."""
         self._rows = rows
         self._captures = captures
-        self._trajectories = trajectories
+        self.downloads = trajectories
         self.scenes = SceneFiles()
 
     def newest(self, capture_id: str) -> ReconstructionRow:
@@ -182,7 +182,7 @@ class Results:
         version, poses, sensor = result.published.version, result.poses, result.sensor
         if path:
             poses, sensor = self._path(result, path)
-        return trajectory_response(request, poses(), version, sensor, kind, part, self._trajectories)
+        return trajectory_response(request, poses(), version, sensor, kind, part, self.downloads)
 
     def _path(self, result: Result, path: int) -> tuple[Callable[[], PoseFile], Sensor | None]:
         """The poses of another recording in the map of a version, and its sensor."""

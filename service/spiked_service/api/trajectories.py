@@ -1,8 +1,6 @@
 """Trajectories over HTTP: a range of the poses of a version in one of the formats, streamed in pieces."""
 
-import io
 import threading
-import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
@@ -30,6 +28,7 @@ from spiked_service.api import files
 from spiked_service.api.problems import GoneError, NoPoseError
 from spiked_service.api.streams import GuardedStream
 from spiked_service.base.limits import ConcurrencyLimit
+from spiked_service.results.report.zip_stream import Part, zip_pieces
 from spiked_service.results.timeline import Timeline, frames_at
 from spiked_service.results.versions import Published, pose_file
 
@@ -202,32 +201,11 @@ def _state(known: bytes) -> str | None:
 
 def _colmap(parts: Iterable[Trajectory], sensor: Sensor) -> Iterator[bytes]:
     """A ZIP of a text model without points."""
-    sent = _Sent()
-    with zipfile.ZipFile(sent, "w", zipfile.ZIP_STORED) as archive:
-        archive.writestr(zipfile.ZipInfo("cameras.txt"), colmap_camera(sensor))
-        with archive.open(zipfile.ZipInfo("images.txt"), "w", force_zip64=True) as images:
-            for text in colmap_lines(parts):
-                images.write(text.encode())
-                yield sent.taken()
-        archive.writestr(zipfile.ZipInfo("points3D.txt"), "# no points: the poses are from splats\n")
-    yield sent.taken()
-
-
-class _Sent(io.RawIOBase):
-    """A buffer that a ZIP file is written to and read from in pieces."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._parts: list[bytes] = []
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: Any) -> int:
-        self._parts.append(bytes(data))
-        return len(self._parts[-1])
-
-    def taken(self) -> bytes:
-        whole = b"".join(self._parts)
-        self._parts.clear()
-        return whole
+    images = (text.encode() for text in colmap_lines(parts))
+    return zip_pieces(
+        [
+            Part("cameras.txt", [colmap_camera(sensor).encode()], packed=False),
+            Part("images.txt", images, packed=False),
+            Part("points3D.txt", [b"# no points: the poses are from splats\n"], packed=False),
+        ]
+    )

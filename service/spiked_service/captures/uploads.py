@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -19,12 +20,14 @@ from spiked.recording.sidecar import Sidecar
 from spiked_service.base.ids import new_id
 from spiked_service.captures.captures import Captures
 from spiked_service.conversion.reading import Form
+from spiked_service.results.versions import write_atomically
 from spiked_service.store.catalogue import Catalogue, StoreError
 from spiked_service.store.disk_space import DiskFullError, DiskSpace
-from spiked_service.store.folder import DataFolder
+from spiked_service.store.folder import UPLOAD_SUFFIXES, DataFolder
 from spiked_service.store.rows import CaptureRow, CaptureState, Grade, Origin, Plan, Quality, Recorded, UploadRow
 from spiked_service.workers.messages import UploadChecked, UploadCommand, UploadConverts, WorkerError, WorkerEvent
 from spiked_service.workers.process import WorkerProcess
+from spiked_service.workers.roles.recorder import CALIBRATION
 
 _WRITE_BYTES = 1 << 20
 """Most bytes per write."""
@@ -78,10 +81,11 @@ class Uploads:
         sha256: str | None,
         form: Form | None = None,
         array: str | None = None,
+        calibration: Path | None = None,
     ) -> UploadRow:
         """Create an upload of `size` bytes and reserve the space. Raises UploadTooLargeError, DiskFullError.
 
-        `form` and `array` as for `read_content`.
+        `form` and `array` as for `read_content`. `calibration` is a file of this machine, which is copied.
         """
         if size > self._limit_bytes():
             raise UploadTooLargeError(f"{size} bytes exceed the limit of {self._limit_bytes()} for an upload")
@@ -92,6 +96,8 @@ class Uploads:
         with self._disk_space.for_upload(size):
             with _store_errors(row.id):
                 self._folder.upload(row.id).touch(mode=0o600)
+                if calibration is not None:
+                    shutil.copyfile(calibration, self._calibration(row.id))
             self._catalogue.uploads.put(row)
         return row
 
@@ -102,6 +108,19 @@ class Uploads:
     def list(self) -> list[UploadRow]:
         """Uploads that are not captures yet, newest first."""
         return [row for row in self._catalogue.uploads.where("1 ORDER BY id DESC") if row.capture_id is None]
+
+    async def calibrate(self, upload_id: str, chunks: AsyncIterator[bytes]) -> None:
+        """Store the calibration of the camera, which is checked with the recording.
+
+        Raises UnknownIdError, UploadError for a complete upload, UploadBusyError, StoreError.
+        """
+        row = await run_in_threadpool(self.get, upload_id)
+        with self._exclusive(upload_id):
+            if row.capture_id is not None:
+                raise UploadError(f"upload {upload_id} is complete: it is capture {row.capture_id}")
+            content = b"".join([chunk async for chunk in chunks])
+            with _store_errors(upload_id):
+                await run_in_threadpool(write_atomically, self._calibration(upload_id), content)
 
     async def append(
         self, upload_id: str, offset_bytes: int, chunks: AsyncIterator[bytes], length: int | None = None
@@ -150,7 +169,15 @@ class Uploads:
             if row.offset_bytes != row.bytes:
                 raise UploadError(f"{row.offset_bytes} of {row.bytes} bytes were received; send the rest first")
             stated = json.loads(row.geometry or "{}")
-            check = _Check(self._folder.upload(upload_id), row, stated, self._limit_bytes(), self._disk_space)
+            calibration = self._calibration(upload_id)
+            check = _Check(
+                self._folder.upload(upload_id),
+                row,
+                stated,
+                calibration if calibration.exists() else None,
+                self._limit_bytes(),
+                self._disk_space,
+            )
             checked = check.run()
             lost = checked.lost
             recorded = Recorded(
@@ -166,7 +193,7 @@ class Uploads:
         """Remove an upload and its bytes; a capture made of it is kept. Raises UnknownIdError."""
         self.get(upload_id)
         with self._exclusive(upload_id):
-            for suffix in (".part", ".json", ".dat"):
+            for suffix in UPLOAD_SUFFIXES:
                 self._folder.upload(upload_id).with_suffix(suffix).unlink(missing_ok=True)
             self._catalogue.uploads.remove(upload_id)
 
@@ -195,6 +222,8 @@ class Uploads:
             self._folder.capture(row.id).mkdir()
             data = self._folder.recording(row.id)
             part.with_suffix(".json").replace(sidecar_path(data))
+            if self._calibration(upload.id).exists():
+                self._calibration(upload.id).replace(data.with_name(CALIBRATION))
             (part.with_suffix(".dat") if converted else part).replace(data)
         except OSError as error:
             self._folder.remove(self._folder.capture(row.id))
@@ -204,6 +233,9 @@ class Uploads:
             self._catalogue.uploads.set(upload.id, capture_id=row.id)
         part.unlink(missing_ok=True)  # there is one, if it was converted
         return row.id
+
+    def _calibration(self, upload_id: str) -> Path:
+        return self._folder.upload(upload_id).with_suffix(".npz")
 
     def _confirm(self, upload_id: str, offset_bytes: int) -> UploadRow:
         return self._catalogue.uploads.set(upload_id, offset_bytes=offset_bytes, updated_at=datetime.now(UTC))
@@ -278,7 +310,13 @@ class _Check:
     """Verifies and converts the file of an upload in a worker, so that the service never parses uploaded data."""
 
     def __init__(
-        self, path: Path, row: UploadRow, stated: dict[str, Any], limit_bytes: int, disk_space: DiskSpace
+        self,
+        path: Path,
+        row: UploadRow,
+        stated: dict[str, Any],
+        calibration: Path | None,
+        limit_bytes: int,
+        disk_space: DiskSpace,
     ) -> None:
         self._row = row
         self._disk_space = disk_space
@@ -289,6 +327,7 @@ class _Check:
             camera=_camera(stated.get("geometry") or {}),
             form=stated.get("form"),
             array=stated.get("array"),
+            calibration=calibration,
             limit_bytes=limit_bytes,
         )
         self._checked: UploadChecked | None = None
@@ -314,6 +353,8 @@ class _Check:
             raise self._full
         if self._checked is None:
             why = (self._reason or "its worker exited without output").replace(str(self._command.path), self._row.name)
+            if self._command.calibration is not None:
+                why = why.replace(str(self._command.calibration), "the calibration")
             raise RecordingError(f"upload {self._row.id} cannot be used as a recording: {why}")
         return self._checked
 

@@ -24,7 +24,9 @@ from spiked_service.cli.commands.noise_report import noise_report
 from spiked_service.cli.commands.offset import offset
 from spiked_service.cli.commands.openapi import openapi
 from spiked_service.cli.commands.reconstruct import reconstruct
+from spiked_service.cli.commands.record import record
 from spiked_service.cli.commands.render import render
+from spiked_service.cli.commands.report import report
 from spiked_service.cli.commands.serve import serve
 from spiked_service.cli.commands.simulate import simulate
 from spiked_service.cli.commands.token import token
@@ -58,9 +60,9 @@ def _options(
 
 
 for _group, _commands in {
-    "Live": (serve, devices, backup, restore),
+    "Live": (serve, record, devices, backup, restore),
     "Files": (info, verify, convert, offset, simulate, calibrate, noise_report),
-    "Scenes": (reconstruct, localise, merge, render, evaluate, baseline, compare),
+    "Scenes": (reconstruct, localise, merge, render, evaluate, report, baseline, compare),
     "This program": (bench, openapi, version),
 }.items():
     for _command in _commands:

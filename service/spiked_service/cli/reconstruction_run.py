@@ -14,6 +14,7 @@ from spiked.recon.checkpoint import CHECKPOINT, CheckpointSaver, Interrupted, ex
 from spiked.recording import Recording, RecordingGeometry, open_recording
 from spiked_service.cli import outputs
 from spiked_service.cli.console import messages, report_warning
+from spiked_service.results.map_reports import recording_section
 
 RESULTS = "scene.ply", "trajectory.tum", "report.json", "overview.png"
 """Files in OUT."""
@@ -33,6 +34,10 @@ class ReconstructionRun:
     budget_s: float | None
     map: Path | None = None
     """Folder of the map that is extended."""
+
+    def report(self) -> dict[str, object]:
+        """The content of report.json: the reconstructor's, and where the recording is and how it was read."""
+        return {**self.reconstructor.report(), "recording": recording_section(self.recording)}
 
     @classmethod
     def begun(

@@ -13,6 +13,8 @@ from spiked.sensor import Sensor
 from spiked_service.base.ids import is_id
 
 _LOCK = "lock"
+UPLOAD_SUFFIXES = ".part", ".json", ".dat", ".npz"
+"""Files of an upload: its bytes, sidecar, recording if it is converted, and calibration."""
 
 
 @dataclass(frozen=True)

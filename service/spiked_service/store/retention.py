@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from spiked_service.store.catalogue import Catalogue
-from spiked_service.store.folder import DataFolder
+from spiked_service.store.folder import UPLOAD_SUFFIXES, DataFolder
 from spiked_service.store.rows import CaptureRow
 
 _UPLOAD_DAYS = 1.0
@@ -92,7 +92,7 @@ class Retention:
     def _drop_uploads(self, now: datetime) -> None:
         for row in self._catalogue.uploads.where():
             if row.capture_id is not None or now - row.updated_at > timedelta(days=_UPLOAD_DAYS):
-                for suffix in (".part", ".json"):
+                for suffix in UPLOAD_SUFFIXES:
                     self._folder.upload(row.id).with_suffix(suffix).unlink(missing_ok=True)
                 self._catalogue.uploads.remove(row.id)
 

@@ -158,6 +158,8 @@ class UploadCommand(_Command):
     """None: a recording with a sidecar or a stated layout, otherwise detected."""
     array: str | None
     """Name of an array in the file."""
+    calibration: Path | None = None
+    """Gains, dark rates and dead pixels of its camera, checked here."""
     limit_bytes: int
     """Most bytes of the recording that the file is converted to."""
 

@@ -14,7 +14,7 @@ from spiked.recon import Merged, Reconstructor, State, Status, Tracked
 from spiked.scene import Scene
 from spiked.trajectory import Trajectory
 from spiked_service.events.payloads import PosePayload
-from spiked_service.results.map_reports import REGISTRATION, write_report
+from spiked_service.results.map_reports import REGISTRATION, REPORT, write_report
 from spiked_service.results.shown_scene import TOLERANCE
 from spiked_service.results.timeline import frames_at
 from spiked_service.results.timeline_writer import TimelineWriter
@@ -51,6 +51,8 @@ class ProgressReporter:
     ) -> None:
         self._reconstructor = reconstructor
         self._publisher = Publisher(command.folder)
+        if not resumed:
+            (command.folder / REPORT).unlink(missing_ok=True)
         views = len(reconstructor.views)
         self._timeline = TimelineWriter(command.folder, views, reconstructor.frames)
         self._channel = channel
@@ -144,6 +146,7 @@ class ProgressReporter:
                 self._send_version(self._publisher.again(shown), shown.version)
             except OSError as error:
                 raise _write_error(error) from error
+        self._write_report(REPORT, self._reconstructor.report())
         self._send_status(status, shown)
 
     def joining(self, share: float) -> None:
@@ -155,21 +158,21 @@ class ProgressReporter:
 
     def not_joined(self, reason: str) -> None:
         """The map shows another place: the versions show the recording alone."""
-        self._write_report({"joined": False, "reason": reason})
+        self._write_report(REGISTRATION, {"joined": False, "reason": reason})
         self._channel.send(PlaceCompared(recognised=False, reason=reason))
         self._send_status(self._reconstructor.status())
 
     def joined(self, made: Merged, others: Sequence[RecordedPath]) -> None:
         """Publish the map with the recording; `others` are the map's paths."""
-        self._write_report({"joined": True, "reason": "", **made.report()})
+        self._write_report(REGISTRATION, {"joined": True, "reason": "", **made.report()})
         self._channel.send(PlaceCompared(recognised=True, reason=""))
         white = made.scene.colour_of_white
         self._publish_scene(made.scene, made.joint.second.trajectory, white, None, tolerance=0.0, others=others)
         self._send_status(self._reconstructor.status(), self._publisher.versions[-1])
 
-    def _write_report(self, figures: Mapping[str, object]) -> None:
+    def _write_report(self, name: str, figures: Mapping[str, object]) -> None:
         try:
-            write_report(self._publisher.folder, REGISTRATION, figures)
+            write_report(self._publisher.folder, name, figures)
         except OSError as error:
             raise _write_error(error) from error
 

@@ -12,14 +12,15 @@ import httpx
 import numpy as np
 import pytest
 
-from spiked.client import ApiError, GeometryModel, IntrinsicsModel, ReconstructionOptions
+from spiked.calibration import Calibration
+from spiked.client import ApiError, GeometryModel, IntrinsicsModel, ProfileModel, ReconstructionOptions
 from spiked.distortion import Distortion, LensModel
 from spiked.recording import RecordingWriter
 from spiked.sensor import Intrinsics, Sensor
 from spiked.undistortion import Undistortion
 
 from ..survival import moving_recording
-from .conftest import write_recording
+from .conftest import Service, write_recording
 
 CHUNK = {"Content-Type": "application/octet-stream"}
 SENSOR = Sensor(96, 64, 20_000.0)
@@ -289,3 +290,48 @@ def test_more_than_the_disk_has_is_told_at_once(daemon: Any) -> None:
     answer = one.http.post("uploads", json={"name": "a", "bytes": 2**41})
     assert answer.status_code == 507
     assert "do not fit" in answer.json()["detail"]
+
+
+def test_a_profile_and_a_calibration_come_with_an_upload(service: Service, tmp_path: Path) -> None:
+    sensor = write_recording(tmp_path / "plain.dat")
+    (tmp_path / "plain.json").unlink()
+    plain = np.ones((sensor.height, sensor.width), np.float32)
+    Calibration(plain, 0.25 * plain, plain < 0).write(tmp_path / "gains.npz")
+    profile = ProfileModel(width=sensor.width, height=sensor.height, rate=12_500.0, fov=50.0, mosaic="BGGR")
+    geometry = GeometryModel(rate=25_000.0)
+    capture = service.client.upload(
+        tmp_path / "plain.dat", profile=profile, geometry=geometry, calibration=tmp_path / "gains.npz"
+    )
+    assert capture.sensor is not None and capture.sensor.intrinsics is not None
+    assert (capture.sensor.frame_rate_hz, capture.sensor.mosaic) == (25_000, "BGGR")  # what is stated wins
+    assert capture.sensor.intrinsics.fx == pytest.approx(Intrinsics.from_fov(sensor.width, sensor.height, 50).fx)
+    saved = service.client.save_recording(capture.id, tmp_path / "again.dat")
+    assert json.loads(saved.with_suffix(".json").read_text())["calibration"] == "calibration.npz"
+    (folder,) = Path(service.http.get("system").json()["data_folder"]).glob(f"captures/{capture.id}")
+    assert np.array_equal(Calibration.read(folder / "calibration.npz").dark, 0.25 * plain)
+
+
+def test_the_device_of_an_upload_gives_its_profile_and_calibration(service: Service, tmp_path: Path) -> None:
+    sensor = write_recording(tmp_path / "plain.dat")
+    (tmp_path / "plain.json").unlink()
+    with pytest.raises(ApiError, match=r"has no profile|there is no device"):
+        service.client.upload(tmp_path / "plain.dat", device="sim:")
+    service.client.set_profile("sim:", ProfileModel(width=sensor.width, height=sensor.height, rate=15_000.0))
+    try:
+        capture = service.client.upload(tmp_path / "plain.dat", device="sim:")
+    finally:
+        service.http.delete("devices/sim%3A/profile")
+    assert capture.sensor is not None and capture.sensor.frame_rate_hz == 15_000
+
+
+def test_a_calibration_of_another_camera_is_refused(service: Service, tmp_path: Path) -> None:
+    write_recording(tmp_path / "plain.dat")
+    other = np.ones((8, 16), np.float32)
+    Calibration(other, 0 * other, other < 0).write(tmp_path / "other.npz")
+    (tmp_path / "none.npz").write_bytes(b"not a calibration")
+    for name, words in (("other.npz", "calibration is of 16x8"), ("none.npz", "is not a calibration")):
+        with pytest.raises(ApiError, match=words) as error:
+            service.client.upload(tmp_path / "plain.dat", calibration=tmp_path / name)
+        assert "uploads/" not in str(error.value)
+    for upload in service.http.get("uploads").json()["items"]:
+        assert service.http.delete(f"uploads/{upload['id']}").status_code == 204

@@ -189,7 +189,7 @@ class Security:
         )
 
     def _most(self, request: "RequestInfo") -> int:
-        chunk = request.method == "PATCH" and request.path.startswith("/api/v1/uploads/")
+        chunk = request.method in ("PATCH", "PUT") and request.path.startswith("/api/v1/uploads/")
         return self._settings.now.limit_chunk_bytes if chunk else self._settings.now.limit_body_bytes
 
     def _limited(self, request: "RequestInfo", receive: Receive) -> Receive:

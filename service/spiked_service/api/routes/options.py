@@ -1,4 +1,4 @@
-"""`options`: the options of a reconstruction, of each kind of source and of a camera profile, as JSON Schema."""
+"""`options`: of a reconstruction, each kind of source, a camera profile and an upload, as JSON Schema."""
 
 from typing import Any
 
@@ -7,6 +7,7 @@ from spiked_driver.source_kinds import KINDS
 
 from spiked_service.api.problems import problems
 from spiked_service.api.schemas.captures import ProfileModel, SourceKindOut, SourceKindsOut
+from spiked_service.api.schemas.uploads import UploadRequest
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 
 
@@ -32,6 +33,7 @@ def whole(schema: dict[str, Any]) -> dict[str, Any]:
 
 _SCHEMA = whole(ReconstructionOptions.model_json_schema())
 _PROFILE = whole(ProfileModel.model_json_schema())
+_UPLOAD = whole(UploadRequest.model_json_schema())
 
 
 def _answer(schema: dict[str, Any]) -> dict[int | str, dict[str, Any]]:
@@ -74,5 +76,10 @@ def option_routes() -> APIRouter:
     def get_profile_options() -> dict[str, Any]:
         """The fields of a camera profile as JSON Schema."""
         return _PROFILE
+
+    @router.get("/options/upload", tags=["uploads"], responses=_answer(_UPLOAD))
+    def get_upload_options() -> dict[str, Any]:
+        """What an upload can state of its file and of the camera, as JSON Schema."""
+        return _UPLOAD
 
     return router

@@ -3,12 +3,11 @@
 import os
 import platform
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from spiked.measurement import Measurement, peak_per_second, repeated
+from spiked.measurement import Measurement, peak_per_second, processor, repeated
 from spiked.render.cpu import usable_cores
 
 
@@ -34,16 +33,7 @@ class Machine:
         target = np.empty_like(source)
         copy = repeated(lambda: np.copyto(target, source), 5).best_s
         system = f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"
-        return cls(_processor(), usable_cores(), system, load, peak_per_second(), source.nbytes / copy)
-
-
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
+        return cls(processor(), usable_cores(), system, load, peak_per_second(), source.nbytes / copy)
 
 
 def text(machine: Machine, rows: list[Measurement]) -> list[str]:

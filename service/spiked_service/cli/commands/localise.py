@@ -10,13 +10,14 @@ from rich.progress import track
 
 from spiked.errors import RecordingError
 from spiked.recon import Localisation, Localiser, MapIndex
+from spiked.recon.report import machine, versions
 from spiked.recording import Recording, RecordingGeometry
 from spiked.sensor import Sensor
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import messages, output, report_warning
 from spiked_service.results.map_folder import MapFolder, camera_in
-from spiked_service.results.map_reports import localisation_figures
+from spiked_service.results.map_reports import LOCALISATION, localisation_figures, recording_section
 from spiked_service.results.recording_feed import pieces
 
 NOT_RECOGNISED = 1
@@ -26,7 +27,9 @@ NOT_RECOGNISED = 1
 def localise(
     map_folder: Annotated[Path, typer.Argument(metavar="MAP", help="Output folder of `spiked reconstruct`.")],
     file: Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording.", readable=False)],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for trajectory.tum.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for trajectory.tum and localisation.json.")
+    ] = None,
     start: Annotated[int, typer.Option(help="First stored frame to use.", min=0)] = 0,
     frames: Annotated[int | None, typer.Option(help="Number of frames to use. Default: all.", min=1)] = None,
     json_out: Annotated[Path | None, typer.Option("--json", help="Also write the figures to this file.")] = None,
@@ -47,7 +50,8 @@ def localise(
     """Find where the camera of a recording was in a map.
 
     Prints the first and the last pose, in the map's frame of reference and unit of length, and how sure they are. With
-    `-o`, trajectory.tum has one pose for each window of frames. 1,000 frames at 20 kHz suffice.
+    `-o`, trajectory.tum has one pose for each window of frames, and localisation.json the figures for `spiked report`.
+    1,000 frames at 20 kHz suffice.
     If the map is not recognised, the exit code is 1.
 
     Examples:
@@ -57,7 +61,7 @@ def localise(
     - `spiked localise out again.dat -o where --start 20000 --frames 1000`
     """
     if out is not None:
-        outputs.try_folder("--out", out, ("trajectory.tum",))
+        outputs.try_folder("--out", out, ("trajectory.tum", LOCALISATION))
     if json_out is not None:
         outputs.try_file("--json", json_out)
     known = MapFolder.read(map_folder)
@@ -86,8 +90,24 @@ def localise(
     if out is not None:
         with outputs.writing("--out", out):
             out.mkdir(parents=True, exist_ok=True)
+            report = _report(found, index, recording, sensor)
+            (out / LOCALISATION).write_text(json.dumps(report, indent=1), encoding="utf-8")
             found.trajectory(sensor.frame_rate_hz).write_tum(out / "trajectory.tum")
         output.print(f"{out / 'trajectory.tum'}: {len(found.views)} poses", markup=False)
+
+
+def _report(found: Localisation, index: MapIndex, recording: Recording, sensor: Sensor) -> dict[str, object]:
+    """For `spiked report`: the figures, and what they were found with."""
+    lens = index.camera.intrinsics
+    return {
+        "versions": versions(),
+        "machine": machine(),
+        "sensor": {"width": sensor.width, "height": sensor.height, "frame_rate_hz": sensor.frame_rate_hz},
+        "focal_px": [lens.fx, lens.fy],
+        "principal_point_px": [lens.cx, lens.cy],
+        "recording": recording_section(recording),
+        "localisation": localisation_figures(found, sensor),
+    }
 
 
 def _end(recording: Recording, start: int, frames: int | None) -> int:

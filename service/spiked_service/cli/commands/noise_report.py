@@ -1,4 +1,4 @@
-"""`spiked noise-report`: noise of spike counts and of the charge between spikes."""
+"""`spiked noise-report`: noise of spike counts and of the charge between spikes, or of photon counts."""
 
 import json
 from dataclasses import asdict
@@ -8,7 +8,9 @@ from typing import Annotated
 import typer
 
 from spiked.noise import NoiseReport, measure_noise
+from spiked.photon_noise import PhotonNoiseReport, measure_photon_noise
 from spiked.recording import RecordingGeometry
+from spiked.sensor import Response
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import output, report_warning
@@ -25,6 +27,7 @@ def noise_report(
     bit_order: g.Bits = None,
     flipped: g.Flipped = None,
     mosaic: g.Colours = None,
+    response: g.SensorResponse = None,
     profile: g.Profile = None,
 ) -> None:
     """Measure the noise of a camera from a recording of a static scene.
@@ -32,20 +35,26 @@ def noise_report(
     A count of spikes in a window is off by up to half a spike at each end. The charge between two spikes is known to
     one frame. The report compares the two for this camera.
 
+    Of a single-photon camera (`--response bernoulli`, or its sidecar says so) the report has the flux, the variance of
+    counts against that of independent photons, afterpulsing or dead time, and crosstalk between neighbours.
+
     Examples:
 
     - `spiked noise-report still.dat`
+
+    - `spiked noise-report cube.dat --response bernoulli`
 
     - `spiked noise-report still.dat --width 400 --height 250 --rate 20000 --json noise.json`
     """
     if json_file is not None:
         outputs.try_file("--json", json_file)
-    stated = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic)
+    stated = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic, response=response)
     recording = g.open_described(file, stated, profile).recording
     for warning in recording.warnings:
         report_warning(warning)
-    report = measure_noise(recording, frames)
-    for line in text(report):
+    counted = recording.sensor.response is Response.BERNOULLI
+    report = measure_photon_noise(recording, frames) if counted else measure_noise(recording, frames)
+    for line in text(report) if isinstance(report, NoiseReport) else photon_text(report):
         output.print(line, markup=False)
     if json_file is not None:
         with outputs.writing("--json", json_file):
@@ -61,6 +70,22 @@ def text(report: NoiseReport) -> list[str]:
         head,
         *(
             f"{row.frames:8d} {row.variance:19.3f} {row.binomial_variance:9.3f} {row.counted:15.2%} {row.charge:10.2%}"
+            for row in report.windows
+        ),
+    ]
+
+
+def photon_text(report: PhotonNoiseReport) -> list[str]:
+    """The report of a single-photon camera as lines."""
+    after = "dead time" if report.afterpulsing < 0 else "afterpulsing"
+    head = f"{'window':>8s} {'variance / photons':>19s} {'error of flux':>14s} {'by photons':>11s}"
+    return [
+        f"{report.frames} frames, a pixel fires in {report.rate:.2%} of them; flux {report.flux:.4f} photons a pixel "
+        "and frame",
+        f"{after} {abs(report.afterpulsing):.2%}, crosstalk {report.crosstalk:.2%}, {report.hot_pixels} hot pixels",
+        head,
+        *(
+            f"{row.frames:8d} {row.variance:19.3f} {row.flux_error:14.2%} {row.photon_error:11.2%}"
             for row in report.windows
         ),
     ]

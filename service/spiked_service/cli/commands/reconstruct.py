@@ -243,9 +243,8 @@ def _extended(known: MapFolder, reconstructor: Reconstructor) -> tuple[Merged | 
 
 
 def _write_joint(run: ReconstructionRun, known: MapFolder, made: Merged) -> None:
-    reconstructor = run.reconstructor
     figures = {"map": str(run.map), "joined": True, "versions": known.versions, **made.report()}
-    report = {**reconstructor.report(), "splats": len(made.scene), "extended": figures}
+    report = {**run.report(), "splats": len(made.scene), "extended": figures}
     with outputs.writing("--out", run.out):
         run.out.mkdir(parents=True, exist_ok=True)
         _draw(run)
@@ -412,7 +411,7 @@ class ProgressDisplay:
 def _write(run: ReconstructionRun, extended: dict[str, object]) -> None:
     """Write the reconstruction alone; `extended` says why the map is not in it, if there is one."""
     reconstructor, out = run.reconstructor, run.out
-    report = {**reconstructor.report(), **({"extended": extended} if extended else {})}
+    report = {**run.report(), **({"extended": extended} if extended else {})}
     with outputs.writing("--out", out):
         out.mkdir(parents=True, exist_ok=True)
         reconstructor.scene().write_ply(out / "scene.ply", reconstructor.white)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from spiked.calibration import Calibration
 from spiked.camera import MOST_SIDE, StoredCameraOptions
 from spiked.errors import ConfigurationError, RecordingError
 from spiked.recon.frontend.mosaic_check import recorded_layout_warnings
@@ -17,6 +18,7 @@ from spiked_service.conversion.reading import RECORDINGS, Form, detect_form, rea
 from spiked_service.conversion.writing import write_content
 from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.messages import UploadChecked, UploadCommand, UploadConverts
+from spiked_service.workers.roles.recorder import CALIBRATION
 
 _CHUNK_BYTES = 4 << 20
 """Bytes hashed at a time."""
@@ -93,6 +95,9 @@ def _checked(command: UploadCommand, path: Path, camera: StoredCameraOptions, di
     if max(sensor.width, sensor.height) > MOST_SIDE:
         raise RecordingError(f"{sensor.width}x{sensor.height} pixels are more than {MOST_SIDE} on a side")
     more: dict[str, Any] = {"assumed": recording.assumed}
+    if command.calibration is not None:
+        Calibration.read(command.calibration).check(sensor)
+        more["calibration"] = CALIBRATION
     if command.sidecar is not None:
         more |= {"note": command.sidecar.note, "device": command.sidecar.device}
     write_sidecar(beside, Sidecar.of(sensor, recording.frames, gaps=recording.gaps, clock=recording.clock, **more))

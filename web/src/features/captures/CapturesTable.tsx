@@ -14,6 +14,7 @@ import { PageLink } from "../../shared/ui/PageLink";
 import { CaptureBadge, Empty, ErrorMessage, JobBadge, JobReason, Loading } from "../../shared/ui/parts";
 import { Table } from "../../shared/ui/Table";
 import { removeWithUndo } from "./remove";
+import { UploadPanel } from "./UploadPanel";
 
 const ROWS = 50;
 const TYPING_MS = 200;
@@ -40,6 +41,7 @@ export function CapturesTable(): JSX.Element {
   const [listed, setListed] = useState<Listed | null>(null);
   const [problem, setProblem] = useState<string | null>(null);
   const [round, setRound] = useState(0);
+  const [uploads, setUploads] = useState(false);
   const known = useService((state) => state.captures);
   const newest = Object.keys(known).sort().at(-1);
 
@@ -85,7 +87,13 @@ export function CapturesTable(): JSX.Element {
             onChange={(event) => adjust({ search: event.target.value })}
           />
         </label>
+        {!uploads && (
+          <ActionButton className="opens-upload" onClick={() => setUploads(true)}>
+            Upload
+          </ActionButton>
+        )}
       </header>
+      {uploads && <UploadPanel onClose={() => setUploads(false)} />}
       {problem !== null && <ErrorMessage text={problem} again={() => setRound((n) => n + 1)} />}
       {listed === null && problem === null && <Loading what="captures" />}
       {listed !== null &&

@@ -77,6 +77,14 @@ export function ResultPanel({
       )}
       {ready ? (
         <>
+          <div className="downloads" role="group" aria-label="Report">
+            <a className="button" href={calls.address.report(job.id)} target="_blank" rel="noopener">
+              Report
+            </a>
+            <a className="button" href={calls.address.bundle(job.id)} download>
+              <Icon name="download" /> All as ZIP
+            </a>
+          </div>
           <div className="downloads" role="group" aria-label="Scene">
             <a className="button" href={calls.address.scene(job.id, "ply")} download>
               <Icon name="download" /> PLY

@@ -13,7 +13,7 @@ import { Fetched } from "../../shared/ui/Fetched";
 import { OptionsForm } from "../../shared/ui/OptionsForm";
 import { Empty, Panel } from "../../shared/ui/parts";
 import { CalibrationPanel } from "./CalibrationPanel";
-import { lensOfText, textOfLens } from "./lensText";
+import { lensOfText, textOfLens } from "../../shared/state/lensText";
 
 export function ProfilePanel(): JSX.Element {
   const devices = useService((state) => state.devices);

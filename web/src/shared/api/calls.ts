@@ -21,6 +21,8 @@ import type {
   Timeline,
   Token,
   Trajectory,
+  Upload,
+  UploadRequest,
   Version,
 } from "./types";
 
@@ -64,6 +66,34 @@ export const calibrate = (device_id: string, body: { dark: string | null; flat: 
     client.POST("/api/v1/devices/{device_id}/profile:calibrate", {
       body,
       params: { path: { device_id }, header: idempotent() },
+    }),
+  );
+
+/** What an upload can state of its file and of the camera. */
+export const uploadSchema = async (): Promise<OptionSchema> => await answered(client.GET("/api/v1/options/upload"));
+export const createUpload = (body: UploadRequest): Promise<Upload> =>
+  answered(client.POST("/api/v1/uploads", { body, params: { header: idempotent() } }));
+export const upload = (upload_id: string): Promise<Upload> =>
+  answered(client.GET("/api/v1/uploads/{upload_id}", { params: { path: { upload_id } } }));
+export const removeUpload = (upload_id: string): Promise<unknown> =>
+  answered(client.DELETE("/api/v1/uploads/{upload_id}", { params: { path: { upload_id } } }));
+/** Send the next bytes; answers how far the upload is. */
+export const sendChunk = async (id: string, offset: number, chunk: Blob, signal: AbortSignal): Promise<Upload> => {
+  const headers = { "Upload-Offset": String(offset), "Content-Type": "application/octet-stream" };
+  return (await (await request(`uploads/${id}`, { method: "PATCH", body: chunk, headers, signal })).json()) as Upload;
+};
+/** Send the camera's calibration. */
+export const sendCalibration = (id: string, file: Blob): Promise<unknown> =>
+  request(`uploads/${id}/calibration`, {
+    method: "PUT",
+    body: file,
+    headers: { "Content-Type": "application/octet-stream" },
+  });
+/** Make a capture of a whole upload; its check takes a while. */
+export const completeUpload = (upload_id: string): Promise<Capture> =>
+  answered(
+    client.POST("/api/v1/uploads/{upload_id}:complete", {
+      params: { path: { upload_id }, header: idempotent() },
     }),
   );
 
@@ -156,6 +186,8 @@ export const address = {
   scene: (id: string, format: "ply" | "spz"): string => `${API}/reconstructions/${id}/scene${query({ format })}`,
   changes: (id: string, asked: { level: number; version?: number | undefined; since?: string | undefined }): string =>
     `${API}/reconstructions/${id}/scene/changes${query(asked)}`,
+  report: (id: string): string => `${API}/reconstructions/${id}/report`,
+  bundle: (id: string): string => `${API}/reconstructions/${id}/bundle`,
   trajectory: (id: string, format: string): string => `${API}/reconstructions/${id}/trajectory${query({ format })}`,
 };
 

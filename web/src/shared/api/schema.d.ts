@@ -870,6 +870,50 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/api/v1/reconstructions/{reconstruction_id}/report": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Report
+         * @description A version as one HTML file, which opens offline: pictures, path, plots, options, machine, warnings.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["get_report_api_v1_reconstructions__reconstruction_id__report_get"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/reconstructions/{reconstruction_id}/bundle": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Bundle
+         * @description A version as one ZIP: report, scene, trajectory as TUM, KITTI, COLMAP and nerfstudio, pictures, sidecar.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["get_bundle_api_v1_reconstructions__reconstruction_id__bundle_get"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
     "/api/v1/reconstructions/{reconstruction_id}/versions": {
         parameters: {
             query?: never;
@@ -1024,6 +1068,28 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/api/v1/options/upload": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Upload Options
+         * @description What an upload can state of its file and of the camera, as JSON Schema.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["get_upload_options_api_v1_options_upload_get"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
     "/api/v1/uploads": {
         parameters: {
             query?: never;
@@ -1084,6 +1150,28 @@ export interface paths {
          *     Scope of a token: `operate`.
          */
         patch: operations["append_to_upload_api_v1_uploads__upload_id__patch"];
+        trace?: never;
+    };
+    "/api/v1/uploads/{upload_id}/calibration": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        get?: never;
+        /**
+         * Calibrate Upload
+         * @description Send the camera's calibration, an .npz of `spiked calibrate`; `:complete` checks it and keeps it.
+         *
+         *     Scope of a token: `operate`.
+         */
+        put: operations["calibrate_upload_api_v1_uploads__upload_id__calibration_put"];
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
         trace?: never;
     };
     "/api/v1/uploads/{upload_id}:complete": {
@@ -3464,6 +3552,74 @@ export interface components {
             capture_id: string | null;
         };
         /**
+         * UploadProfile
+         * @description The profile of the camera that a recording is of.
+         * @example {
+         *       "height": 1000,
+         *       "model": "M1K40",
+         *       "mosaic": "BGGR",
+         *       "width": 1000
+         *     }
+         */
+        UploadProfile: {
+            /**
+             * Rate
+             * @description Frames per second.
+             */
+            rate?: number | null;
+            /** @description Colour mosaic of the upright image; none: a grey sensor. */
+            mosaic?: components["schemas"]["Mosaic"] | null;
+            /**
+             * Flipped
+             * @description Rows come bottom-up; false: top-down.
+             */
+            flipped?: boolean | null;
+            /** @description How light becomes spikes: integrate-and-fire of spike cameras, or bernoulli of single-photon cameras. */
+            response?: components["schemas"]["Response"] | null;
+            /**
+             * Fov
+             * @description Horizontal field of view in degrees of a pinhole camera with square pixels; without optics they are estimated.
+             */
+            fov?: number | null;
+            intrinsics?: components["schemas"]["IntrinsicsModel"] | null;
+            /**
+             * Model
+             * @description Name of the product.
+             * @default
+             */
+            model?: string;
+            /**
+             * Serial
+             * @description Serial number of the camera that the profile is of; null: of any.
+             */
+            serial?: string | null;
+            /**
+             * Width
+             * @description Pixels in a row.
+             */
+            width?: number | null;
+            /**
+             * Height
+             * @description Rows.
+             */
+            height?: number | null;
+            /**
+             * Calibration
+             * @description Sent on its own, by `PUT uploads/ID/calibration`: a file name says nothing to another machine.
+             */
+            calibration?: null;
+            /**
+             * Session
+             * @description How the bridge of a USB camera is made to send.
+             */
+            session?: ("auto" | "request" | "stream") | null;
+            /**
+             * Note
+             * @default
+             */
+            note?: string;
+        } & unknown;
+        /**
          * UploadRequest
          * @description A recording, or another file with the frames of one, that is about to come.
          * @example {
@@ -3502,6 +3658,13 @@ export interface components {
             sidecar?: components["schemas"]["UploadSidecar"] | null;
             /** @description Wins over the sidecar. */
             geometry?: components["schemas"]["GeometryModel"] | null;
+            /** @description Camera profile, which says what geometry does not. */
+            profile?: components["schemas"]["UploadProfile"] | null;
+            /**
+             * Device
+             * @description Device that the recording is of: its profile and its calibration are used.
+             */
+            device?: string | null;
             /**
              * Sha256
              * @description Of the whole file, in hex; checked at the end.
@@ -3514,7 +3677,7 @@ export interface components {
              * @description Name of the array of spikes, where the file has several with three axes.
              */
             array?: string | null;
-        };
+        } & unknown;
         /**
          * UploadSidecar
          * @description A recording's sidecar, as it stands beside the `.dat`.
@@ -8474,6 +8637,255 @@ export interface operations {
             };
         };
     };
+    get_report_api_v1_reconstructions__reconstruction_id__report_get: {
+        parameters: {
+            query?: {
+                /** @description Default: the newest; `GET versions` lists them. */
+                version?: number | null;
+            };
+            header?: never;
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description The file. */
+            200: {
+                headers: {
+                    /** @description Changes with the content. */
+                    ETag?: string;
+                    /** @description Its version. */
+                    "X-Scene-Version"?: number;
+                    /** @description With a file name. */
+                    "Content-Disposition"?: string;
+                    [name: string]: unknown;
+                };
+                content: {
+                    "text/html": string;
+                };
+            };
+            /** @description The requested range. */
+            206: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "text/html": string;
+                };
+            };
+            /** @description The content has not changed. */
+            304: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The range lies outside the file. */
+            416: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_bundle_api_v1_reconstructions__reconstruction_id__bundle_get: {
+        parameters: {
+            query?: {
+                /** @description Default: the newest; `GET versions` lists them. */
+                version?: number | null;
+                /** @description Also put the frames of the recording into it. */
+                recording?: boolean;
+            };
+            header?: never;
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description The archive. */
+            200: {
+                headers: {
+                    /** @description Changes with the content. */
+                    ETag?: string;
+                    /** @description Its version. */
+                    "X-Scene-Version"?: number;
+                    /** @description With a file name. */
+                    "Content-Disposition"?: string;
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/zip": string;
+                };
+            };
+            /** @description The content has not changed. */
+            304: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It conflicts with the current state. */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
     list_versions_api_v1_reconstructions__reconstruction_id__versions_get: {
         parameters: {
             query?: never;
@@ -9099,6 +9511,91 @@ export interface operations {
             };
         };
     };
+    get_upload_options_api_v1_options_upload_get: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description JSON Schema 2020-12. */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": {
+                        [key: string]: unknown;
+                    };
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
     list_uploads_api_v1_uploads_get: {
         parameters: {
             query?: never;
@@ -9227,6 +9724,15 @@ export interface operations {
             };
             /** @description The scope of the token does not allow it. */
             403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -9516,6 +10022,130 @@ export interface operations {
                 content: {
                     "application/json": components["schemas"]["UploadOut"];
                 };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It conflicts with the current state. */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The content type is not supported. */
+            415: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    calibrate_upload_api_v1_uploads__upload_id__calibration_put: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                upload_id: string;
+            };
+            cookie?: never;
+        };
+        /** @description The whole file, with a limit as for chunks. */
+        requestBody: {
+            content: {
+                "application/octet-stream": string;
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            204: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
             };
             /** @description The request is malformed. */
             400: {

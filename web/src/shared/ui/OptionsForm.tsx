@@ -13,6 +13,7 @@ export function OptionsForm({
   action,
   onSubmit,
   onCancel,
+  onChange,
 }: {
   schema: OptionSchema;
   initial: OptionValues;
@@ -20,13 +21,19 @@ export function OptionsForm({
   action: string;
   onSubmit: (values: OptionValues) => Promise<void>;
   onCancel?: () => void;
+  /** Told of all values while they are changed. */
+  onChange?: (values: OptionValues) => void;
 }): JSX.Element {
   const fields = fieldsOf(schema);
   const [texts, setTexts] = useState<Record<string, string>>(() =>
     Object.fromEntries(fields.map((field) => [field.key, textOf(initial[field.key] ?? field.initial)])),
   );
   const [busy, setBusy] = useState(false);
-  const change = (key: string, text: string): void => setTexts((old) => ({ ...old, [key]: text }));
+  const change = (key: string, text: string): void => {
+    const now = { ...texts, [key]: text };
+    setTexts(now);
+    onChange?.(valuesOf(fields, now));
+  };
   const submit = (event: SubmitEvent): void => {
     event.preventDefault();
     setBusy(true);

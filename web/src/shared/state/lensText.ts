@@ -1,6 +1,6 @@
 /** Focal lengths, centre and distortion as the text that sources and commands take. */
 
-import type { Intrinsics } from "../../shared/api/types";
+import type { Intrinsics } from "../api/types";
 
 const OPENCV = ["k1", "k2", "p1", "p2", "k3"] as const;
 const FISHEYE = ["k1", "k2", "k3", "k4"] as const;

@@ -1,0 +1,40 @@
+"""`spiked record`: devices of a running service, started together, with the offsets of their clocks."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from click.testing import Result
+from spiked_service.cli.main import app
+from typer.testing import CliRunner
+
+from spiked.client import ApiError
+from spiked.errors import ConfigurationError
+from spiked.recording import open_recording
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, ["record", *map(str, arguments)])
+
+
+def test_devices_are_recorded_together(daemon: Callable[..., Any], tmp_path: Path) -> None:
+    one = daemon("--no-capture", "--device", "sim:")
+    both = [f"sim:?width=64&height=48&rate=1000&pace=1&seed={seed}" for seed in (1, 2)]
+    done = run(*both, "--seconds", "1", "--name", "pair", "-o", tmp_path / "pair", "--address", one.address)
+    assert done.exit_code == 0, (done.output, done.exception)
+    assert len(re.findall(r"complete, [\d,]+ frames, \d+ lost", done.output)) == 2
+    assert re.search(r"begins [+-][\d.]+( \+- [\d.]+)? us after sim:", done.output)
+    files = sorted((tmp_path / "pair").glob("*.dat"))
+    assert [file.name for file in files] == ["1-sim_.dat", "2-sim_.dat"]
+    assert all(open_recording(file).frames == 1000 for file in files)
+    items = one.http.get("captures").json()["items"]
+    assert len({item["group"] for item in items}) == 1 and {item["name"][:4] for item in items} == {"pair"}
+
+    alone = run(both[0], "--frames", "100", "--address", one.address)
+    assert alone.exit_code == 0 and "complete, 100 frames, 0 lost" in alone.output
+    assert "begins" not in alone.output
+
+    refused = run("sim:", "replay:nothing.dat", "--seconds", "1", "--address", one.address)
+    assert isinstance(refused.exception, ApiError) and "nothing.dat" in str(refused.exception)
+    assert isinstance(run("sim:", "--seconds", "1", "--frames", "5").exception, ConfigurationError)

@@ -120,3 +120,13 @@ def test_pictures_without_features_are_told(room: Recording, tmp_path: Path) -> 
             spike_pictures(room, PictureOptions(pictures=3))]  # fmt: skip
     with pytest.raises(SceneError, match="none of 3 pictures"):
         run_colmap(flat, room.sensor.intrinsics, tmp_path)
+
+
+@pytest.mark.slow
+def test_the_pictures_alone_have_poses(room: Recording, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    arguments = ["--images", "charge", "--pictures", "16", "--window-frames", "32", "--map", "none", "--pictures-only"]
+    done = CliRunner().invoke(app, ["baseline", str(room.path), "-o", str(out), *arguments])
+    assert done.exit_code == 0, done.output
+    registered = json.loads((out / "report.json").read_text())["baseline"]["registered"]
+    assert len(Trajectory.read_tum(out / "trajectory.tum")) == registered

@@ -80,6 +80,13 @@ def baseline(
     pictures: Annotated[
         int | None, typer.Option(help="Number of pictures for COLMAP, evenly spaced; by default 60.", min=2)
     ] = None,
+    all_frames: Annotated[
+        bool,
+        typer.Option(
+            "--all-frames/--pictures-only",
+            help="Interpolate poses of the frames between COLMAP's pictures, or write those of the pictures alone.",
+        ),
+    ] = True,
     steps: Annotated[int, typer.Option(help="Gradient steps of the map.", min=0)] = Options().steps,
     seed: Annotated[int, typer.Option(help="Of COLMAP and of the map.", min=0)] = 0,
     threads: Annotated[int | None, typer.Option(help="All cores if not given.", min=1)] = None,
@@ -124,7 +131,7 @@ def baseline(
     if poses is PoseSource.GIVEN:
         posed = _Posed(Trajectory.read_tum(given or file.parent / TRUTH), {})
     else:
-        posed = _by_colmap(recording, options, out, (threads, seed))
+        posed = _by_colmap(recording, options, out, (threads, seed), all_frames=all_frames)
     report: dict[str, Any] = {"images": images, "poses": poses, "map": map, **posed.report}
     if map is MapSource.NONE:
         (out / "scene.ply").unlink(missing_ok=True)
@@ -149,9 +156,14 @@ def _window(options: PictureOptions, recording: Recording) -> int:
 
 
 def _by_colmap(
-    recording: Recording, options: PictureOptions, out: Path, threads_and_seed: tuple[int | None, int]
+    recording: Recording,
+    options: PictureOptions,
+    out: Path,
+    threads_and_seed: tuple[int | None, int],
+    *,
+    all_frames: bool,
 ) -> _Posed:
-    """Poses of all frames, and what the report says of them."""
+    """Poses of all frames or of the pictures, and what the report says of them."""
     intrinsics = picture_intrinsics(recording.sensor)
     threads, seed = threads_and_seed
     begin = time.perf_counter()
@@ -159,8 +171,11 @@ def _by_colmap(
     messages.print(f"COLMAP on {len(made)} pictures ({options.kind})", markup=False)
     with outputs.writing("--out", out):
         found = run_colmap(made, intrinsics, out / "colmap", threads=threads, seed=seed)
-    rate_hz = recording.sensor.frame_rate_hz
-    path = interpolated(found.times, (found.rotations, found.centres), frames=recording.frames, frame_rate_hz=rate_hz)
+    poses, rate_hz = (found.rotations, found.centres), recording.sensor.frame_rate_hz
+    if all_frames:
+        path = interpolated(found.times, poses, frames=recording.frames, frame_rate_hz=rate_hz)
+    else:
+        path = Trajectory(found.times / rate_hz, *poses)
     if found.models > 1:
         report_warning(f"COLMAP made {found.models} models that it could not join; the largest one is taken")
     return _Posed(

@@ -106,7 +106,8 @@ def _true_strip(name: str, where: str, cells: dict[str, Path]) -> Strip | None:
     pictures: dict[str, bytes] = {}
     for row, folder in cells.items():
         for kind, key in (("truth", "truth"), ("render", row)):
-            image = cv2.imread(str(folder / PICTURES / f"{name}-{kind}.png"), cv2.IMREAD_COLOR_RGB)
+            file = folder / PICTURES / f"{name}-{kind}.png"
+            image = cv2.imread(str(file), cv2.IMREAD_COLOR_RGB) if file.exists() else None
             if image is not None:
                 pictures.setdefault(key, _webp(np.asarray(image, np.float32) / np.float32(255)))
     return Strip(f"held-out view {name}, {where}", "truth", pictures) if pictures else None

@@ -4,6 +4,7 @@ __all__ = [
     "CalibrationError",
     "CheckpointError",
     "ConfigurationError",
+    "DatasetError",
     "ProfileError",
     "RecordingError",
     "SceneError",
@@ -42,3 +43,7 @@ class ProfileError(SpikedError):
 
 class CheckpointError(SpikedError):
     """The checkpoint of an interrupted reconstruction cannot be used."""
+
+
+class DatasetError(SpikedError):
+    """A folder of a data set is incomplete, damaged, changed, or laid out otherwise than the data set is."""

@@ -15,6 +15,7 @@ from spiked_service.cli.commands.calibrate import calibrate
 from spiked_service.cli.commands.compare import compare
 from spiked_service.cli.commands.config import config
 from spiked_service.cli.commands.convert import convert
+from spiked_service.cli.commands.datasets import datasets
 from spiked_service.cli.commands.devices import devices
 from spiked_service.cli.commands.evaluate import evaluate
 from spiked_service.cli.commands.info import info
@@ -68,6 +69,7 @@ for _group, _commands in {
     for _command in _commands:
         app.command(rich_help_panel=_group)(_command)
 app.add_typer(config, name="config", rich_help_panel="Live")
+app.add_typer(datasets, name="datasets", rich_help_panel="Scenes")
 app.add_typer(token, name="token", rich_help_panel="Live")
 
 

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 from spiked.errors import SpikedError
-from spiked.evaluate import MATCH_FRAMES, pose_errors
+from spiked.evaluate import MATCH_FRAMES, pose_errors, score_trajectory
 from spiked.recording import open_recording
 from spiked.trajectory import Trajectory
 from spiked_service.cli.dataset_runs.children import run_spiked
@@ -14,7 +14,10 @@ FEWEST_POSES = 3
 
 
 def score(result: Path, recording: Path, log: Path) -> dict[str, float]:
-    """Figures of `spiked evaluate`; of few true poses the coverage and the ATE alone; none without truth."""
+    """Figures of `spiked evaluate`; of few true poses the coverage and the ATE alone; none without truth.
+
+    Without intrinsics in the recording no view can be rendered, and poses alone are scored.
+    """
     if not (recording.parent / "groundtruth.tum").exists():
         return {}
     sensor = open_recording(recording).sensor
@@ -26,14 +29,17 @@ def score(result: Path, recording: Path, log: Path) -> dict[str, float]:
         if run_spiked(arguments, log, lambda line: None) == 0:
             figures = {name: value for name, value in json.loads(made.read_text()).items() if value is not None}
     if "ate_percent" not in figures:
-        figures |= _few_poses(result, recording, sensor.frame_rate_hz)
+        figures |= _pose_figures(result, recording, sensor.frame_rate_hz)
     return figures
 
 
-def _few_poses(result: Path, recording: Path, frame_rate_hz: float) -> dict[str, float]:
+def _pose_figures(result: Path, recording: Path, frame_rate_hz: float) -> dict[str, float]:
     truth = Trajectory.read_tum(recording.parent / "groundtruth.tum")
     try:
         estimate = Trajectory.read_tum(result / "trajectory.tum")
+        full = score_trajectory(truth=truth, estimate=estimate, frame_rate_hz=frame_rate_hz)
+        if full.errors is not None:
+            return {"coverage": full.coverage, **vars(full.errors)}
         rows = estimate.nearest(truth.times_s, MATCH_FRAMES / frame_rate_hz)
         found = rows >= 0
         figures = {"coverage": float(found.mean())}

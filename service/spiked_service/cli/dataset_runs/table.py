@@ -24,6 +24,7 @@ COLUMNS = {
     "rpe_r_deg": "RPE_r deg",
     "psnr_db": "PSNR dB",
     "ssim": "SSIM",
+    "lpips": "LPIPS",
     "seconds": "seconds",
 }
 """Figures of a row, and their headings."""

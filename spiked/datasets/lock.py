@@ -18,6 +18,8 @@ from spiked.datasets.clip import Dataset
 from spiked.errors import DatasetError
 
 LOCK_NAME = "spiked-dataset.lock.json"
+_ANY_WRITES = 0o222
+"""Bits of a mode that let anybody write."""
 READ_BYTES = 4 << 20
 """Bytes that are read at a time."""
 
@@ -72,7 +74,7 @@ def lock_path(folder: Path) -> Path:
     """Where the lock of a folder is, or will be."""
     beside = folder / LOCK_NAME
     elsewhere = _data_folder() / f"{hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16]}.json"
-    if beside.exists() or (os.access(folder, os.W_OK) and not elsewhere.exists()):
+    if beside.exists() or (_may_write(folder) and not elsewhere.exists()):
         return beside
     return elsewhere
 
@@ -95,6 +97,11 @@ def compare(dataset: Dataset, progress: Callable[[int, int], None] = lambda done
     if added:
         _write(path, before.model_copy(update={"files": before.files | {name: found[name] for name in added}}))
     return Comparison(path, False, before.recorded, tuple(changed), tuple(missing), tuple(added))
+
+
+def _may_write(folder: Path) -> bool:
+    """Whether a folder may be written: one that is marked as read-only is left as it is, by root, too."""
+    return os.access(folder, os.W_OK) and folder.stat().st_mode & _ANY_WRITES != 0
 
 
 def _data_folder() -> Path:

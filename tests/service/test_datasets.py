@@ -22,6 +22,8 @@ from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
 from spiked.trajectory import Trajectory
 
+from ..datasets.layouts import Source, save_picture, write_colmap
+
 SENSOR = Sensor(400, 250, 20_000.0, intrinsics=Intrinsics.from_fov(400, 250, 60))
 FRAMES = 192
 OPTIONS = ("--steps", "0", "--fov", "60")
@@ -146,3 +148,27 @@ def test_a_stream_of_a_recording_of_our_own_is_left_as_it_is(tmp_path: Path) -> 
     done = spiked("run", "outdoor-spike", tmp_path, "-o", tmp_path / "out", *OPTIONS)
     assert done.exit_code == 1, f"{done.output} {done.exception}"
     assert (tmp_path / "own.json").read_bytes() == before
+
+
+@pytest.mark.slow
+def test_spikes_made_of_a_scene_of_pictures_are_reconstructed(tmp_path: Path) -> None:
+    scene = tmp_path / "tanks" / "room"
+    camera = SimulatedCamera(SENSOR, 3, MotionKind.ARC, flow_px=0.3, step_px=0.8)
+    frames = np.arange(0, 384, 4)
+    rotations, centres = camera.truth(frames)
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rotations, centres
+    names = [f"{number}.png" for number in range(len(frames))]
+    for name, pose in zip(names, poses, strict=True):
+        light = camera.view(pose[:3, :3], pose[:3, 3], undistorted=True) / camera.gain
+        save_picture(scene / "images" / name, np.round(255 * np.clip(light, 0, 1)).astype(np.uint8))
+    path = Trajectory(frames / 1.0, rotations, centres)
+    source = Source(np.zeros((1, SENSOR.height, SENSOR.width), np.uint8), camera.intrinsics, path)
+    write_colmap(scene / "sparse" / "0", names, poses, source)
+    made = ("--simulate", "--picture-rate 5000 --gamma linear")
+    out = tmp_path / "out"
+    done = spiked("run", "tanks-and-temples", tmp_path / "tanks", "-o", out, *made, "--steps", "200")
+    assert done.exit_code == 0, f"{done.output} {done.exception}"
+    with (out / "table.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert float(row["ate_percent"]) < 5 and float(row["psnr_db"]) > 20

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
 from rich.table import Table
+from rich.text import Text
 
 from spiked.datasets import KINDS, Clip, Comparison, Dataset, DatasetKind, compare, find_kind, recognise
 from spiked.errors import ConfigurationError
@@ -42,7 +43,7 @@ def listing(context: typer.Context) -> None:
         output.print(f"[bold]{kind.name}[/bold]", highlight=False)
         grid = Table.grid(padding=(0, 2))
         for label, text in _summary(kind):
-            grid.add_row(f"  {label}", text)
+            grid.add_row(f"  {label}", Text(text))
         output.print(grid, soft_wrap=False)
     messages.print("`spiked datasets show NAME` prints the layout, how it is known, and what to cite", markup=False)
 
@@ -55,7 +56,7 @@ def show(name: Name) -> None:
     rows = [*_summary(kind)[1:], ("layout", kind.layout.strip()), ("known", kind.certainty), ("cite", kind.citation)]
     grid = Table.grid(padding=(0, 2))
     for label, text in rows:
-        grid.add_row(label, text)
+        grid.add_row(label, Text(text))
     output.print(grid, soft_wrap=False)
 
 

@@ -7,12 +7,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import typer
 from pydantic import BaseModel, ValidationError
 
 from spiked.datasets import Clip, Dataset, DatasetKind, PictureScene
 from spiked.errors import ConfigurationError, DatasetError, SpikedError
 from spiked.recording import open_recording
 from spiked_service.cli import outputs
+from spiked_service.cli.commands.reconstruct import reconstruct
+from spiked_service.cli.commands.simulate import simulate
 from spiked_service.cli.dataset_runs.children import INTERRUPTED, run_spiked
 from spiked_service.cli.dataset_runs.pictures import simulation_arguments
 from spiked_service.cli.dataset_runs.scores import score
@@ -53,8 +56,11 @@ class DatasetRun:
     _rows: list[Row] = field(default_factory=list)
 
     def begin(self) -> None:
-        """Claim the folder. Raises ConfigurationError where it is another run's."""
+        """Check the options and claim the folder. Raises ConfigurationError where it is another run's."""
         outputs.try_folder("--out", self.out)
+        check_options(reconstruct, ["recording.dat", "-o", "out", *self.options])
+        if any(isinstance(item, PictureScene) for item in self.dataset.items):
+            check_options(simulate, ["-o", "out", *self.simulation])
         begun = _Begun(
             dataset=self.kind.name,
             folder=str(self.dataset.folder.resolve()),
@@ -170,6 +176,13 @@ class DatasetRun:
         if status == INTERRUPTED or status < 0:
             raise InterruptedRunError(f"interrupted; the same command goes on with what is left of {self.out}")
         return status
+
+
+def check_options(command: Callable[..., None], arguments: list[str]) -> None:
+    """End the program with the usage of a command for arguments that it does not take."""
+    program = typer.Typer()
+    program.command()(command)
+    typer.main.get_command(program).make_context(f"spiked {command.__name__}", arguments)
 
 
 def _folder_name(name: str) -> str:

@@ -24,6 +24,7 @@ from spiked.sensor import Response, Sensor
 SIDE = 512
 """Pixels of a side of the sensor."""
 FRAME_BYTES = SIDE * SIDE // 8
+"""Bytes of a frame."""
 END = b"DONE"
 """Last bytes of a file of the camera."""
 Blocks = Callable[[], Iterator[NDArray[np.uint8]]]

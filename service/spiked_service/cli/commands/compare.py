@@ -34,7 +34,7 @@ def compare(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for tables, page and cells.")] = None,
     methods: Annotated[
         str, typer.Option(help="Rows or groups of rows, with commas; --list shows them.")
-    ] = "methods,baselines",
+    ] = "spiked,baselines",
     row: Annotated[
         list[str] | None,
         typer.Option(help="A row of your own, NAME=COMMAND OPTIONS, with `reconstruct` or `baseline`; repeatable."),

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from spiked.errors import ConfigurationError
+from spiked.recon import METHODS, MethodName
 
 TRUTH = "{truth}"
 """Stands for the file of true poses beside the recording."""
@@ -57,12 +58,20 @@ def _given(name: str, options: str, summary: str) -> Row:
     return _row(name, f"reconstruct --poses {TRUTH} {named}", summary)
 
 
+def _theirs(name: str, options: str, summary: str) -> Row:
+    """A variant of the method of the paper, which the row `nope-sgs` is the measure of."""
+    return _row(f"nope-sgs-{name}", f"reconstruct --method nope-sgs {options}", summary)
+
+
 def _plain(name: str) -> bool:
     return bool(name) and name[0].isalnum() and all(letter.isalnum() or letter in "._+-" for letter in name)
 
 
 GROUPS: dict[str, tuple[Row, ...]] = {
-    "methods": (_row("spiked", "reconstruct", "this program with default options"),),
+    "methods": (
+        _row("spiked", "reconstruct", "this program with default options"),
+        _row("nope-sgs", "reconstruct --method nope-sgs", METHODS[MethodName.NOPE_SGS].summary),
+    ),
     "baselines": (
         _row("colmap-tfp", "baseline --images tfp", "COLMAP on means of a window, and a map of them"),
         _row("colmap-tfi", "baseline --images tfi", "COLMAP on intervals between spikes, and a map of them"),
@@ -89,6 +98,20 @@ GROUPS: dict[str, tuple[Row, ...]] = {
             ("binomial", "likelihood of the spikes of 16 pixels and 32 frames"),
             ("accumulation+binomial", "accumulation and likelihood, as the paper fits its scene"),
         )
+    ),
+    "paper-ablation": (
+        _theirs("no-accumulation", "--loss binomial", "without the accumulation loss: likelihood alone"),
+        _theirs("no-likelihood", "--loss accumulation", "accumulation loss alone"),
+        _theirs("interval", "--loss interval", "interval loss instead"),
+        _theirs("photometric-poses", "--pose-step alignment", "poses by our photometric alignment, not its gradient"),
+        _theirs("tracked", "--initialisation tracks", "a tracked path to begin with"),
+        *(
+            _theirs(f"sub-frames-{n}", f"--map-option sub_frames={n}", f"{n} sub-frames instead of 4")
+            for n in (1, 2, 8)
+        ),
+        _theirs(
+            "demosaic-first", "--map-option demosaic_first=true", "of a mosaic: colours interpolated before the fit"
+        ),
     ),
     "ablation": (
         _given("still", "sub_frames=0", "camera taken as still during a view"),

@@ -25,6 +25,8 @@ WRITERS: dict[tuple[str, str], list[str]] = {
     ("evaluate", "--pictures"): [MISSING, "--recording", MISSING],
     ("baseline", "--out"): [MISSING],
     ("compare", "--out"): [MISSING],
+    ("report", "--out"): [MISSING],
+    ("record", "--out"): ["sim:"],
     ("localise", "--out"): [MISSING, MISSING],
     ("localise", "--json"): [MISSING, MISSING],
     ("merge", "--out"): [MISSING, MISSING],
@@ -42,6 +44,7 @@ FOLDERS = {
     ("evaluate", "--pictures"),
     ("baseline", "--out"),
     ("compare", "--out"),
+    ("record", "--out"),
     ("localise", "--out"),
     ("merge", "--out"),
     ("bench", "--folder"),
@@ -66,6 +69,7 @@ READS = {
     "map_folder",
     "first",
     "second",
+    "evaluation",
 }
 """Parameters that are paths to read."""
 OF_THE_SERVICE = {"data", "runtime", "config"}

@@ -115,14 +115,14 @@ def disturbed(path: Spline, times: np.ndarray, seed: int) -> Spline:
     return path.move(turn, way)
 
 
-def poses(stream: Stream, steps: int, pose_steps: int) -> Iterator[dict[str, Any]]:
+def poses(stream: Stream, steps: int, pose_steps: int, window_frames: int | None) -> Iterator[dict[str, Any]]:
     """A disturbed path corrected by a map that is kept."""
-    options = Options(steps=steps, poses=stream.truth, method=MethodName.NOPE_SGS)
+    options = Options(steps=steps, poses=stream.truth, method=MethodName.NOPE_SGS, window_frames=window_frames)
     made = stream.reconstruct(options)
     assert made.path is not None
     frames = np.arange(np.ceil(made.path.begin), np.floor(made.path.end))
     rotations, centres = made.path.poses(frames)
-    truth = Spline.fit(frames, rotations, centres, KNOT_FRAMES, 1)
+    truth = Spline.fit(frames, rotations, centres, max(KNOT_FRAMES, window_frames or 0), 1)
     ids = made.views.mappable(truth)
     start = disturbed(truth, frames, seed=0)
     yield {"what": "disturbed", **dict(zip(("deg", "percent"), errors(start, truth, frames), strict=True))}
@@ -179,7 +179,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1000, help="steps of the map; of paths: of map and poses")
     parser.add_argument("--pose-steps", type=int, default=1500, help="of the table poses")
     parser.add_argument("--seeds", type=int, default=1, help="of the table paths")
-    parser.add_argument("--window-frames", type=int, help="paths: frames of a view; default: by the motion")
+    parser.add_argument("--window-frames", type=int, help="of a view, not of losses; default: by the motion")
     parser.add_argument("--frames", type=int, help="first frames of each recording; default: all")
     parser.add_argument("--json", type=Path, help="file for the rows")
     options = parser.parse_args()
@@ -191,7 +191,7 @@ def main() -> None:
         case "losses":
             rows = losses(chosen, options.steps)
         case "poses":
-            rows = poses(chosen[0], options.steps, options.pose_steps)
+            rows = poses(chosen[0], options.steps, options.pose_steps, options.window_frames)
         case _:
             rows = paths(chosen, options.steps, options.seeds, options.window_frames)
     made = []

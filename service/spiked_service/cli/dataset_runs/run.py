@@ -174,7 +174,8 @@ class DatasetRun:
     def _run(self, arguments: list[str], log: Path) -> int:
         status = run_spiked(arguments, log, lambda line: self.show(f"    {line}"))
         if status == INTERRUPTED or status < 0:
-            raise InterruptedRunError(f"interrupted; the same command goes on with what is left of {self.out}")
+            how = "interrupted" if status == INTERRUPTED else f"`spiked {arguments[0]}` was ended by signal {-status}"
+            raise InterruptedRunError(f"{how}; the same command goes on with what is left of {self.out}")
         return status
 
 

@@ -23,12 +23,14 @@ from spiked.recon.mapping.pose_steps import GaussNewton, PoseGradient, PoseStep
 from spiked.recon.mapping.scene_psnr import COMPARED_VIEWS, scene_psnr_db
 from spiked.recon.mapping.trainer import MapTrainer
 from spiked.recon.methods import Initialisation, PoseStepName
+from spiked.recon.odometry.keyframe_adjuster import LONG_FRAMES
 from spiked.recon.odometry.keyframe_pictures import KeyframePictures
 from spiked.recon.odometry.odometry import Odometry
 from spiked.recon.odometry.self_calibration import FIRST_DEG, EstimatedLens, Focal, optics_moved
 from spiked.recon.options import Options
-from spiked.recon.refiner import Refiner
+from spiked.recon.refiner import Refiner, plan_of
 from spiked.recon.report import Sample, Status, Tracked, WorkLog
+from spiked.recon.time_left import Part, TimeLeft
 from spiked.recon.untracked import UntrackedOdometry
 from spiked.recon.view_choice import choose
 from spiked.recon.view_store import ViewStore
@@ -114,6 +116,8 @@ class Reconstructor:
         self._unit = 1.0
         """Length of the map's unit in the trajectory's unit."""
         self._log = WorkLog()
+        self._time_left = TimeLeft()
+        self._refined_from_s = 0.0
         self.tracking_ended = False
         """All frames are tracked, and the path is final up to its alignment with the map."""
 
@@ -173,10 +177,17 @@ class Reconstructor:
 
     def feed(self, first_frame: int, frames: NDArray[np.uint8]) -> None:
         """Add stored frames uint8 [n, frame_bytes] that begin at absolute index `first_frame`."""
+        self._time_left.start()
+        before = len(self.views)
         with self._log.measure("tracking"), one_blas_thread():
             for view in self._windows.feed(first_frame, frames):
                 self._track_spaced(view)
             self._frames = first_frame + len(frames)
+        self._time_left.tracked(self._frames, len(self.views), len(self.views) - before, self._windows.sensor)
+
+    def expect(self, frames: int) -> None:
+        """Say how many frames will have been fed before `finish`, for `Status.left_s`."""
+        self._time_left.frames = frames
 
     @property
     def latest_frames(self) -> int:
@@ -298,13 +309,20 @@ class Reconstructor:
         """
         deadline = np.inf if budget_s is None else time.perf_counter() + budget_s
         progress = progress or (lambda status: None)
+        self.expect(self._frames)
+        self._time_left.start(deadline)
         if not self.tracking_ended:
 
             def stop() -> bool:
                 return cancelled() or time.perf_counter() > deadline
 
+            def saved() -> None:
+                self._time_left.ended(self.odometry.end_left, self.odometry.long)
+                save()
+                progress(self.status())
+
             with self._log.measure("tracking"):
-                self._end_tracking(stop, save)
+                self._end_tracking(stop, saved)
             if not stop():  # otherwise loops may be open
                 self.tracking_ended = True
                 save()
@@ -327,6 +345,7 @@ class Reconstructor:
                 self._unit = self._given.end(self.odometry, self._frames)
         if isinstance(path := self.path, Waypoints):
             self._choose_views(path)
+        self._time_left.ended(0.0, self.odometry.long)
         self._warn(report.path_warning(self.odometry.path_error))
         self._warn(self.odometry.remark)
 
@@ -348,6 +367,7 @@ class Reconstructor:
         if self.odometry.intrinsics != self.camera.intrinsics:
             self._trainer.restart(self.odometry.intrinsics)
         self._refiner = self._make_refiner(path)
+        self._refined_from_s = self.work_s
         self._continue_refining(self._refiner, progress, cancelled, deadline, save)
 
     def _make_refiner(self, path: Path) -> Refiner | Alternator:
@@ -356,7 +376,7 @@ class Reconstructor:
         if self._given is None and (self.options.refine_poses or self._untracked):
             pose_step = self._make_pose_step(parts.pose_step)
         if parts.alternation is None:
-            return Refiner(self._trainer, path, self._points(), pose_step)
+            return Refiner(self._trainer, path, self._points(), pose_step, self._time_left)
         return Alternator(self._trainer, path, self._points(), pose_step, parts.alternation, self._untracked)
 
     def _make_pose_step(self, name: PoseStepName) -> PoseStep:
@@ -405,7 +425,30 @@ class Reconstructor:
         pose = (last.inliers, last.chi2, last.sigma_px) if last is not None else (None, None, None)
         reason = o.reason if o.spline is None else "; ".join(map(str, [o.reason, *self._estimated()]))
         version = self._path_version + self._trainer.version
-        return Status(o.state, reason, self._stage, self._frames, len(m.scene), m.loss, version, self._progress, *pose)
+        left_s = 0.0 if self._stage == "done" else self._time_left.told(self._work_left)
+        if isinstance(self._refiner, Alternator) and 0 < self._progress < 1:  # as fast as so far
+            left_s = (self.work_s - self._refined_from_s) * (1 / self._progress - 1)
+        status = Status(
+            o.state, reason, self._stage, self._frames, len(m.scene), m.loss, version, self._progress, *pose
+        )
+        return replace(status, left_s=left_s)
+
+    def _work_left(self) -> dict[Part, float] | None:
+        """The work that is left, while it is known how many frames come."""
+        expected, now = self._time_left.frames, max(self._frames, 1)
+        if isinstance(self._refiner, Refiner) and (left := self._refiner.left) is not None:
+            return left
+        if expected is None or self.options.parts.alternation is not None:
+            return None
+        tracking: dict[Part, float] = {}
+        travelled_px = self.views.travelled_px
+        if not self.tracking_ended:
+            tracking = self._time_left.tracking(self.odometry.long, travelled_px / now, self.sensor)
+            travelled_px *= max(expected / now, 1.0)
+        long = self.odometry.sparse or expected > LONG_FRAMES
+        align = self.options.refine_poses and self._given is None and not long
+        plan = plan_of(self._trainer, self.options.steps, self.views.kept, travelled_px, align, long)
+        return {**tracking, **plan.work(None, 0)}
 
     def tracked(self, since: int = 0) -> list[Tracked]:
         """The views tracked so far, in order, without the first `since`."""

@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from spiked.pose import Array
-from spiked.recon.mapping.pose_steps import PoseStep
+from spiked.recon.mapping.pose_steps import ALIGNED_VIEWS, PoseStep
 from spiked.recon.mapping.trainer import MapTrainer
+from spiked.recon.time_left import Part, RefinementPlan, TimeLeft
 from spiked.spline import Path, Spline, Waypoints
 
 GRADIENT_STEPS = 100
@@ -16,13 +17,36 @@ PROGRESS_STEPS = 50
 """Steps between reports of progress."""
 
 
+def plan_of(
+    trainer: MapTrainer, most_steps: int, ids: list[int], travelled_px: float, align: bool, prune: bool
+) -> RefinementPlan:
+    """The refinement of a map to the views `ids` of a path of so much image motion, in at most `most_steps` steps for
+    small images."""
+    options, camera = trainer.options, trainer.camera
+    pixels, extent = camera.width * camera.height, trainer.extent_of(travelled_px)
+    fast = float(np.mean([trainer.views[i].frames.warped is not None for i in ids])) if ids else 0.0
+    return RefinementPlan(
+        options.schedule.steps(most_steps, pixels, fast, extent),
+        len(options.seeding.order(ids, extent)) if ids else 0,
+        min(len(ids), ALIGNED_VIEWS) if align else 0,
+        min(len(ids), options.pruning.views) if prune else 0,
+        pixels,
+        trainer.mapper.cap_of(extent),
+        trainer.sensor.mosaic is not None or fast > 0.5,
+        options,
+        trainer.threads,
+    )
+
+
 class Refiner:
     """Seeds and trains the map on the final path, and aligns the path with the map."""
 
-    def __init__(self, trainer: MapTrainer, path: Path, points: Array, pose_step: PoseStep | None) -> None:
+    def __init__(
+        self, trainer: MapTrainer, path: Path, points: Array, pose_step: PoseStep | None, clock: TimeLeft
+    ) -> None:
         """points [N, 3] are landmarks on the tracked `path`.
 
-        With a `pose_step` a path that is a spline is corrected by the map.
+        With a `pose_step` a path that is a spline is corrected by the map. The `clock` measures the work.
         """
         self.path = path
         """The path, corrected so far."""
@@ -35,8 +59,9 @@ class Refiner:
         self._schedule = trainer.options.schedule
         self._points = points
         self._pose_step = pose_step
-        self._steps: int | None = None
-        """Steps of the whole refinement; None before it has begun."""
+        self._clock = clock
+        self._plan: RefinementPlan | None = None
+        """None before the refinement has begun."""
         self._done = 0
         self._spent_s = 0.0
         """Time since the first step, without the time between a kill and the next start."""
@@ -53,9 +78,11 @@ class Refiner:
         If the steps would end after `deadline`, a time of `time.perf_counter`, the schedule is compressed to fewer.
         `save` is called before each step: a refiner saved there goes on with that step.
         """
-        if self._steps is None:
-            self._steps = self._begin(most_steps)
-        steps, begin = self._steps, time.perf_counter() - self._spent_s
+        self._clock.start(deadline)
+        if self._plan is None:
+            self._plan = self._begin(most_steps)
+        plan, steps = self._plan, self._plan.steps
+        begin = time.perf_counter() - self._spent_s
         available_s = max(deadline - begin, 1e-9)
         while self._done < steps:
             self._spent_s = time.perf_counter() - begin
@@ -64,36 +91,46 @@ class Refiner:
             if share >= 1 or cancelled():
                 break
             self._trainer.step(self.path, self._schedule.rate(share), self._schedule.coarseness(share), share)
-            self._align_if_due(share)
-            self._prune_if_due(share)
+            self._clock.lap(Part.STEPS, plan.step_s(share * steps, len(self._trainer.mapper.scene)))
+            self._align_if_due(share, plan)
+            self._prune_if_due(share, plan)
             self._done += 1
             if self._done % PROGRESS_STEPS == 0:
                 yield max(share, self._done / steps)
 
-    def _begin(self, most_steps: int) -> int:
-        """Seed the map; returns the number of steps."""
-        trainer, schedule = self._trainer, self._schedule
+    @property
+    def left(self) -> dict[Part, float] | None:
+        """Work that is left; None before the refinement has begun."""
+        return None if self._plan is None else self._plan.work(self._done, len(self._trainer.mapper.scene))
+
+    def _begin(self, most_steps: int) -> RefinementPlan:
+        """Seed the map."""
+        trainer = self._trainer
         if trainer.stale(self.path):
             trainer.restart()
         trainer.reshuffle()
         ids = trainer.views.mappable(self.path)
+        align = self._pose_step is not None and isinstance(self.path, Spline)
+        plan = plan_of(trainer, most_steps, ids, trainer.views.travelled_px, align, self._prunes)
         trainer.seed(self.path, self._points, trainer.options.seeding.order(ids, trainer.extent))
         if self._prunes and len(trainer.mapper.scene):
             trainer.mapper.limit_sizes()
-        fast = float(np.mean([trainer.views[i].frames.warped is not None for i in ids]))
-        pixels = trainer.camera.width * trainer.camera.height
-        return schedule.steps(most_steps, pixels, fast, trainer.extent)
+        self._clock.lap(Part.SEEDING, plan.seeding_s())
+        return plan
 
-    def _prune_if_due(self, share: float) -> None:
+    def _prune_if_due(self, share: float, plan: RefinementPlan) -> None:
         due = self._trainer.options.pruning.due(share)
         if self._prunes and due > self._pruned:
             self._pruned = due
+            work_s = plan.pruning_s(len(self._trainer.mapper.scene))
             self._trainer.prune(self.path, self._points)
+            self._clock.lap(Part.PRUNING, work_s)
 
-    def _align_if_due(self, share: float) -> None:
+    def _align_if_due(self, share: float, plan: RefinementPlan) -> None:
         due = self._schedule.alignments_due(share)
         if due <= self.aligned or self._pose_step is None or not isinstance(self.path, Spline):
             return
         self.aligned = due
         ids = self._trainer.views.mappable(self.path)
         self.path = self._pose_step.improve(self.path, ids, GRADIENT_STEPS, share)
+        self._clock.lap(Part.ALIGNING, plan.aligning_s(len(self._trainer.mapper.scene)))

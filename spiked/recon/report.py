@@ -51,6 +51,8 @@ class Status:
     """Squared median residual over the expected one; 1 if the noise explains it."""
     sigma_px: float | None = None
     """Predicted error, as a displacement of the image at the median depth."""
+    left_s: float | None = None
+    """Predicted seconds to the end of `Reconstructor.finish`; None while it is not known how many frames will come."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import cv2
@@ -288,17 +288,24 @@ def test_command_line_http_and_library_have_one_table_of_options() -> None:
     assert set(library) - set(described) == {"poses", "calibration", "mapping"}
 
 
-def test_progress_fits_80_columns_with_a_bar_that_shows_something() -> None:
+def shown(status: Status) -> list[str]:
+    """The lines of the progress display at its end."""
     terminal = Console(file=io.StringIO(), force_terminal=True, width=80, color_system=None)
     with ProgressDisplay(1_000_000, terminal) as display:
-        status = Status(State.DEGRADED, "its scale drifts", "refining", 1_000_000, 123_456, 1.2e-3, 1, 0.5)
         display.show(status)
     assert isinstance(terminal.file, io.StringIO)
-    lines = re.split(r"[\r\n]+", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.file.getvalue()))
+    return re.split(r"[\r\n]+", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.file.getvalue()))
+
+
+def test_progress_fits_80_columns_with_a_bar_and_the_time_left() -> None:
+    status = Status(State.DEGRADED, "its scale drifts", "refining", 1_000_000, 123_456, 1.2e-3, 1, 0.5, left_s=3700.0)
+    lines = shown(status)
     assert max(map(len, lines)) <= 80
     bar = next(line for line in lines if line.startswith("refining"))
-    assert bar.count("━") == round(0.65 * 28) and bar.index("65%") >= 38 and "left" in bar
+    assert bar.rstrip().endswith("1 h 2 min left") and "  0%" in bar
     assert "1000000/1000000 frames  degraded  loss 1.20e-03  123456 splats" in lines
+    bar = next(line for line in shown(replace(status, stage="done")) if line.startswith("done"))
+    assert bar.count("━") == 28 and bar.index("100%") >= 38
 
 
 @pytest.mark.parametrize("arguments", [("-h",), ("--help",), ("reconstruct", "-h"), ("config", "show", "-h")])

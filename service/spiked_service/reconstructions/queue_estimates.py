@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 
+from spiked.recon.time_left import typical_work_s
 from spiked_service.store.catalogue import Catalogue
 from spiked_service.store.rows import JobState, ReconstructionRow, Task
 
@@ -12,8 +13,6 @@ NEXT = "state = ? ORDER BY priority DESC, id"
 """SQL condition and order of the queue; the parameter is a state."""
 _RECENT = 8
 """Complete reconstructions that the pace is estimated from."""
-_STEPS_OF_TRACKING = 200
-"""Tracking takes about as long as this many refinement steps."""
 _MERGE_SHARE, _LOCALISATION_SHARE = 0.2, 0.1
 """Time of a merge, and of localising all frames, over that of reconstructing the capture (decisions 16 and 18)."""
 _CHANGE_S = 5.0
@@ -78,12 +77,11 @@ class QueueEstimates:
         return [pace for pace in found if pace < float("inf")]
 
     def _effort(self, row: ReconstructionRow) -> float | None:
-        """Pixels x frames x steps, of a reconstruction; None while the recording is not closed."""
+        """Seconds of work on a reference machine; None while the recording is not closed."""
         capture = self._catalogue.captures.find(row.capture_id)
         if capture is None or capture.sensor is None or capture.recording is None or not capture.recording.frames:
             return None
-        pixels = capture.sensor.width * capture.sensor.height
-        frames = capture.recording.frames
+        width, height, frames = capture.sensor.width, capture.sensor.height, capture.recording.frames
         match row.task:
             case Task.MERGE:
                 share = _MERGE_SHARE
@@ -91,7 +89,7 @@ class QueueEstimates:
                 share = _LOCALISATION_SHARE * (min(row.part.count, frames) / frames if row.part else 1)
             case _:
                 share = 1.0
-        return share * pixels * frames * (row.options.steps + _STEPS_OF_TRACKING)
+        return share * typical_work_s(width, height, frames, row.options.steps)
 
 
 def _remaining_s(row: ReconstructionRow) -> float:

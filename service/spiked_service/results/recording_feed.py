@@ -51,6 +51,7 @@ def reconstruct_recording(
     wherever a checkpoint can be taken.
     """
     deadline = math.inf if budget_s is None else time.monotonic() + budget_s
+    reconstructor.expect(recording.capture_index(recording.frames - 1) + 1)
     expected = reconstructor.frames
     for piece in pieces(recording, begin=expected):
         save()

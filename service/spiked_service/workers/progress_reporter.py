@@ -70,15 +70,8 @@ class ProgressReporter:
         self._candidates: set[int] = set()
         """Versions that the last one is compared with, see `_best`."""
         self._refines = False
-        self._begun_s = time.monotonic()
-        self._refining_s: float | None = None
         self._joining_s: float | None = None
-        self._expected: int | None = None
         self._state = State.BOOT
-
-    def expect(self, frames: int) -> None:
-        """Set the number of frames, for the estimate of the remaining time."""
-        self._expected = frames
 
     def lost(self, first: int, count: int, cause: str) -> None:
         self._timeline.lost(first, count, cause)
@@ -277,18 +270,11 @@ class ProgressReporter:
         )
 
     def _eta_s(self, status: Status) -> float | None:
-        """Seconds to the end of the current stage; None if unknown."""
-        now_s = time.monotonic()
-        if status.stage == Stage.JOINING and self._joining_s is not None:
-            done, since_s = status.progress, self._joining_s
-        elif status.stage == Stage.REFINING:
-            self._refining_s = self._refining_s or now_s
-            done, since_s = status.progress, self._refining_s
-        elif self._expected:
-            done, since_s = status.frames / self._expected, self._begun_s
-        else:
-            return None
-        return (now_s - since_s) * (1 - done) / done if done > 0.02 else None
+        """Seconds to the end of the refinement, or of the joining; None if unknown."""
+        if status.stage != Stage.JOINING or self._joining_s is None:
+            return status.left_s
+        done = status.progress
+        return (time.monotonic() - self._joining_s) * (1 - done) / done if done > 0.02 else None
 
 
 def _estimated_better(one: Published, other: Published) -> bool:

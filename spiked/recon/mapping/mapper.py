@@ -85,8 +85,12 @@ class Mapper:
     @property
     def cap(self) -> int:
         """Maximum number of splats."""
+        return self.cap_of(self.extent)
+
+    def cap_of(self, extent: float) -> int:
+        """Maximum number of splats of a map of that size."""
         share = self.options.splats_a_pixel * self.camera.width * self.camera.height
-        return min(int(share * self.extent), self.options.most_splats)
+        return min(int(share * extent), self.options.most_splats)
 
     def seed(self, swept: SweptView, surer: float = 0.0) -> int:
         """Add splats at the pixels of a swept view that the map does not cover, with a depth confidence of at least

@@ -65,7 +65,8 @@ class MapTrainer:
         self.options = options.for_photons() if sensor.response is Response.BERNOULLI else options
         self.version = 0
         """Increases when the map changes."""
-        self._seed, self._threads, self._calibration = seed, threads, calibration
+        self.threads = threads
+        self._seed, self._calibration = seed, calibration
         self._rng = np.random.default_rng(seed)
         self.loss = options.loss
         """What the map is fitted to."""
@@ -84,7 +85,7 @@ class MapTrainer:
         if intrinsics is not None:
             self.sensor = replace(self.sensor, intrinsics=intrinsics)
             self.planner.camera = replace(self.camera, intrinsics=intrinsics)
-        self.mapper = Mapper(self.sensor, self.camera, self.options, self._seed, self._threads, self._calibration)
+        self.mapper = Mapper(self.sensor, self.camera, self.options, self._seed, self.threads, self._calibration)
         self._queue: list[int] = []
         self._seeded_at = -np.inf
         """Time in frames of the view that was seeded last."""
@@ -93,10 +94,14 @@ class MapTrainer:
 
     @property
     def extent(self) -> float:
-        """Size of the map by the path so far, see `MapOptions.extent_px`; limited by the number of splats."""
+        """Size of the map by the path so far, see `extent_of`."""
+        return self.extent_of(self.views.travelled_px)
+
+    def extent_of(self, travelled_px: float) -> float:
+        """Size of the map of a path, see `MapOptions.extent_px`; limited by the number of splats."""
         pixels, options = self.camera.width * self.camera.height, self.options
         most = max(1.0, options.most_splats / (options.splats_a_pixel * pixels))
-        return float(np.clip(self.views.travelled_px / options.extent_px, 1.0, most))
+        return float(np.clip(travelled_px / options.extent_px, 1.0, most))
 
     def reshuffle(self) -> None:
         """Draw a new random order of the views at the next step."""
@@ -153,7 +158,7 @@ class MapTrainer:
         pixels = SWEPT_PIXELS // QUICK_SWEEP if quick else SWEPT_PIXELS
         noise = seeding.noise * view.deviation
         if lens is None:
-            swept = sweep(posed(row), others, self.camera.intrinsics, planes, noise, pixels, self._threads)
+            swept = sweep(posed(row), others, self.camera.intrinsics, planes, noise, pixels, self.threads)
         else:
             swept = self._sweep_straight(lens, posed(row), others, planes, noise, pixels)
         return SweptView(view, rotations[row], centres[row], float(np.median(depths[depths > 0])), swept)
@@ -172,7 +177,7 @@ class MapTrainer:
         filled = replace(reference, image=np.where(known, reference.image, np.float32(0)))
         straight = np.where(known, lens.straighten(noise), np.float32(UNKNOWN_NOISE))
         pixels = round(pixels * known.size / noise.size)
-        swept = sweep(filled, others, lens.straight, planes, straight, pixels, self._threads)
+        swept = sweep(filled, others, lens.straight, planes, straight, pixels, self.threads)
         return Sweep(lens.bend(swept.inverse_depth), lens.bend(np.where(known, swept.confidence, np.float32(0))))
 
     def shown(self, view_id: int) -> View:

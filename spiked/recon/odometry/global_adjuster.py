@@ -81,6 +81,11 @@ class GlobalAdjuster:
     """Number of views at which the next adjustment is due."""
 
     @property
+    def end_left(self) -> float:
+        """See `PathAdjuster.end_left`: `finish` is one piece."""
+        return 1.0
+
+    @property
     def reference_views(self) -> list[TrackedView]:
         """None: the newest views are adjusted to those just before them."""
         return []

@@ -62,6 +62,8 @@ MOST_LOG_SCALE = 0.3
 FINAL_ROUNDS = 3
 """Final adjustments, each with the points that the one before dropped or that the closed loops tell anew (decision
 15)."""
+LOOP_SHARE = 0.25
+"""Share of the work of `finish` that its first search for loops is taken to be, with the adjustment after it."""
 TOLERANCE = 1e-3
 """Relative gain of an iteration below which an adjustment ends."""
 
@@ -98,6 +100,12 @@ class KeyframeAdjuster:
     _loop_rounds: int = 0
     _final_rounds: int = 0
     """Rounds of `finish` that are done."""
+
+    @property
+    def end_left(self) -> float:
+        """See `PathAdjuster.end_left`."""
+        loops = LOOP_SHARE if self._loop_rounds == 0 else 0.0
+        return loops + (1 - LOOP_SHARE) * (1 - self._final_rounds / FINAL_ROUNDS)
 
     @property
     def reference_views(self) -> list[TrackedView]:

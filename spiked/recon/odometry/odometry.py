@@ -162,6 +162,11 @@ class Odometry:
         """The path is long: keyframes are adjusted."""
         return self._keyframes is not None or (self._second is not None and self._second.long)
 
+    @property
+    def end_left(self) -> float:
+        """Share of the work of `end` that is left."""
+        return self._adjuster.end_left
+
     def waypoints(self) -> Waypoints | None:
         """The path interpolated between views with a pose; None before the bootstrap."""
         return self._map.waypoints()

@@ -20,6 +20,10 @@ class PathAdjuster(Protocol):
     """Closed loops: times in frames of an earlier view and of a later one that sees the same place again."""
 
     @property
+    def end_left(self) -> float:
+        """Share of the work of `finish` that is left, by its rounds."""
+
+    @property
     def reference_views(self) -> list[TrackedView]:
         """Earlier views, oldest first, from which tracks are triangulated and to which the newest views are adjusted.
 

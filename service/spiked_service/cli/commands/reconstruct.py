@@ -20,7 +20,6 @@ from rich.progress import (
     TaskProgressColumn,
     TextColumn,
     TimeElapsedColumn,
-    TimeRemainingColumn,
 )
 from rich.text import Text
 
@@ -58,8 +57,6 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C: 128 + SIGINT, as in shells."""
 _STDERR = 2
 """File descriptor: a signal handler must not use buffered output."""
-_FEED_SHARE = 0.3
-"""Part of the progress bar for feeding; the refinement has the rest."""
 
 
 _DEFAULTS = ReconstructionOptions()
@@ -377,15 +374,15 @@ class ProgressDisplay:
             BarColumn(bar_width=28),
             TaskProgressColumn(),
             TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
+            TextColumn("{task.fields[left]}"),
             console=console,
         )
-        self._task = self._bar.add_task("waiting", total=1.0)
+        self._task = self._bar.add_task("waiting", total=1.0, left="")
         self._figures = Text()
         self._live = Live(Group(self._bar, self._figures), console=console)
-        self._last = time.monotonic()
+        self._begun = self._last = time.monotonic()
         self._stage = ""
+        self._done = 0.0
 
     def __enter__(self) -> "ProgressDisplay":
         if self._console.is_terminal:
@@ -399,13 +396,27 @@ class ProgressDisplay:
         """Show the status."""
         loss = "" if status.loss is None else f"  loss {status.loss:.2e}"
         figures = f"{status.frames}/{self._frames} frames  {status.state}{loss}  {status.splats} splats"
-        fed = min(1.0, status.frames / max(self._frames, 1))
-        done = _FEED_SHARE * fed + (1 - _FEED_SHARE) * status.progress
-        self._bar.update(self._task, description=status.stage, completed=1.0 if status.stage == "done" else done)
+        left = "" if status.left_s is None else f"{_duration(status.left_s)} left"
+        self._done = 1.0 if status.stage == "done" else max(self._done, self._share(status.left_s))
+        self._bar.update(self._task, description=status.stage, completed=self._done, left=left)
         self._figures.plain = figures
         if not self._console.is_terminal and (status.stage != self._stage or time.monotonic() - self._last > 5):
             self._last, self._stage = time.monotonic(), status.stage
-            self._console.print(f"{status.stage}: {figures}  {100 * status.progress:.0f} % refined", markup=False)
+            refined = f"{100 * status.progress:.0f} % refined"
+            self._console.print(f"{status.stage}: {figures}  {refined}{left and f', {left}'}", markup=False)
+
+    def _share(self, left_s: float | None) -> float:
+        """Share of the time that has passed; 0 while that is not known."""
+        passed_s = time.monotonic() - self._begun
+        return 0.0 if left_s is None else passed_s / max(passed_s + left_s, 1e-9)
+
+
+def _duration(seconds: float) -> str:
+    """A time left in words, no finer than it is known."""
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    minutes, hours = round(seconds / 60), int(seconds / 3600)
+    return f"{minutes} min" if minutes < 60 else f"{hours} h {round((seconds - 3600 * hours) / 60)} min"
 
 
 def _write(run: ReconstructionRun, extended: dict[str, object]) -> None:

@@ -71,7 +71,7 @@ def run_reconstruction(command: ReconstructionCommand, channel: WorkerChannel) -
         saver = CheckpointSaver(command.folder / CHECKPOINT, recording, _parameters(command), _log.warning)
         work = _resume(command, channel, recording) or _begin(command, recording.sensor, channel, recording)
         work = replace(work, checkpoints=saver)
-        work.reporter.expect(recording.capture_index(recording.frames - 1) + 1)
+        work.reconstructor.expect(recording.capture_index(recording.frames - 1) + 1)
         _read(recording, work)
     work.finish()
     if command.map is not None:

@@ -20,7 +20,8 @@ from spiked.recon.odometry.keyframe_adjuster import LONG_FRAMES
 from spiked.sensor import Sensor
 
 REFERENCE_PIXELS = 100_000
-"""Pixels of the images that the constants below were measured with: 400x250, on two cores of an AMD EPYC (Zen 4, AVX-512)."""
+"""Pixels of the images that the constants below were measured with: 400x250, on two cores of an AMD EPYC (Zen 4,
+AVX-512)."""
 VIEW_S, VIEW_POWER = 0.0165, 1.2
 """Time to track one view, and the power of its pixels with which it grows: 14 ms on living and 18 on the walk, 240 on
 camp_color, whose images have ten times the pixels."""
@@ -128,7 +129,7 @@ class RefinementPlan:
         return self.scale * STEP_S * size * full * (COLOUR_WORK if self.coloured else 1.0)
 
     def steps_s(self, done: int, splats: int) -> float:
-        """Work of the steps that are left, with so many splats now: densification adds to them, prunings remove some."""
+        """Work of the steps that are left, with so many splats now: densification adds some, prunings remove some."""
         each = (self.steps - done) / STEP_SAMPLES
         if each <= 0:
             return 0.0

@@ -187,7 +187,7 @@ class Reconstructor:
 
     def expect(self, frames: int) -> None:
         """Say how many frames will have been fed before `finish`, for `Status.left_s`."""
-        self._time_left.frames = frames
+        self._time_left.expect(frames)
 
     @property
     def latest_frames(self) -> int:

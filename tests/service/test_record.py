@@ -38,3 +38,15 @@ def test_devices_are_recorded_together(daemon: Callable[..., Any], tmp_path: Pat
     refused = run("sim:", "replay:nothing.dat", "--seconds", "1", "--address", one.address)
     assert isinstance(refused.exception, ApiError) and "nothing.dat" in str(refused.exception)
     assert isinstance(run("sim:", "--seconds", "1", "--frames", "5").exception, ConfigurationError)
+
+
+def test_a_token_may_come_from_a_file(daemon: Callable[..., Any], tmp_path: Path) -> None:
+    one = daemon("--no-capture", "--device", "sim:", "--token", "open-sesame-0123456789")
+    source = "sim:?width=64&height=48&rate=1000&pace=1"
+    file = tmp_path / "token"
+    file.write_text("open-sesame-0123456789\n")
+    done = run(source, "--frames", "100", "--address", one.address, "--token-file", file)
+    assert done.exit_code == 0 and "complete, 100 frames, 0 lost" in done.output
+    assert isinstance(run(source, "--frames", "100", "--address", one.address).exception, ApiError)
+    both = run(source, "--frames", "5", "--token", "a", "--token-file", file)
+    assert isinstance(both.exception, ConfigurationError)

@@ -159,10 +159,14 @@ class Tokens:
 
 def token_of(settings: Settings) -> str | None:
     """The token of the settings, given there or in a file that they name. Raises ConfigurationError."""
-    file = settings.token_file
+    return chosen_token(settings.token.get_secret_value() if settings.token else None, settings.token_file)
+
+
+def chosen_token(token: str | None, file: Path | None) -> str | None:
+    """A token that is given itself or in a file; None if neither is. Raises ConfigurationError."""
     if file is None:
-        return settings.token.get_secret_value() if settings.token else None
-    if settings.token is not None:
+        return token
+    if token is not None:
         raise ConfigurationError("token and token_file both say what opens the service: give one of them")
     try:
         found = file.read_text(encoding="utf-8").strip()

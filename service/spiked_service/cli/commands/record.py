@@ -13,6 +13,7 @@ from spiked.errors import ConfigurationError
 from spiked_service.cli import outputs
 from spiked_service.cli.console import messages, output, report_warning
 from spiked_service.results.map_folder import file_name
+from spiked_service.settings.tokens import chosen_token
 
 _POLL_S = 0.25
 """Interval at which the captures are looked at, seconds."""
@@ -31,7 +32,17 @@ def record(
         Path | None, typer.Option("--out", "-o", help="Folder that the recordings are copied to afterwards.")
     ] = None,
     address: Annotated[str, typer.Option(help="Address of the service.")] = "http://127.0.0.1:8650",
-    token: Annotated[str | None, typer.Option(help="Token of the service.", envvar="SPIKED_TOKEN")] = None,
+    token: Annotated[
+        str | None,
+        typer.Option(
+            help="Token of the service. Users of this machine see it in the list of processes: better set "
+            "SPIKED_TOKEN, or give a file.",
+            envvar="SPIKED_TOKEN",
+        ),
+    ] = None,
+    token_file: Annotated[
+        Path | None, typer.Option(help="File that holds the token.", envvar="SPIKED_TOKEN_FILE")
+    ] = None,
 ) -> None:
     """Record devices of a running service together, and print how their clocks lie to each other.
 
@@ -61,7 +72,7 @@ def record(
         )
         for source in sources
     ]
-    with Spiked(address, token=token) as client:
+    with Spiked(address, token=chosen_token(token, token_file)) as client:
         run = _Run(client, plans)
         stopped = run.wait()
         _show(run)

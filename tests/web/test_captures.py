@@ -49,7 +49,7 @@ def test_everything_can_be_downloaded(studied: Studied, visit: Callable[..., Any
     page = visit(f"{studied.address}?page=captures&capture={studied.capture_id}")
     page.get_by_role("link", name="nerfstudio").wait_for()
     targets = page.eval_on_selector_all("a[download]", "links => links.map(link => link.href)")
-    assert len(targets) == 9
+    assert len(targets) == 10
     for target in targets:
         answer = studied.http.get(target)
         assert answer.status_code == 200, target

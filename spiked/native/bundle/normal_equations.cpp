@@ -162,8 +162,8 @@ struct PointSums {
 };
 
 // Derivatives of the two rows of an observation by the free optics.
-inline void by_optics(const System& system, const Pinhole& k, const double* rotation, const Projection& projection,
-                      const double* pixel, double out[2][kMostOptics]) {
+SPIKED_INLINE void by_optics(const System& system, const Pinhole& k, const double* rotation,
+                             const Projection& projection, const double* pixel, double out[2][kMostOptics]) {
     if (system.focal) {
         out[0][0] = projection.error[0] + pixel[0] - k.cx;
         out[1][0] = projection.error[1] + pixel[1] - k.cy;
@@ -192,8 +192,8 @@ inline void by_optics(const System& system, const Pinhole& k, const double* rota
 }
 
 // Adds one row of an observation, with its derivatives `d` by the free optics.
-inline void add_optics(const Projection& projection, int row, double weight, const double* d, const System& system,
-                       double* own, PointSums& sums) {
+SPIKED_INLINE void add_optics(const Projection& projection, int row, double weight, const double* d,
+                              const System& system, double* own, PointSums& sums) {
     const int optics = system.optics();
     if (!optics) return;
     double a[6];
@@ -209,8 +209,8 @@ inline void add_optics(const Projection& projection, int row, double weight, con
 }
 
 // Adds one row (u or v) of an observation; `cross` [3][kPoseStride] is its block of point and pose.
-inline void add_row(const Projection& projection, int row, double weight, double* own, double* own_gradient,
-                    double* cross, PointSums& sums) {
+SPIKED_INLINE void add_row(const Projection& projection, int row, double weight, double* own, double* own_gradient,
+                           double* cross, PointSums& sums) {
     const double* b = projection.by_point[row];
     double a[kPoseStride] = {};
     by_pose(b, projection.ray, a);
@@ -229,8 +229,8 @@ inline void add_row(const Projection& projection, int row, double weight, double
 }
 
 // Eliminates a point: writes its root, its whitened gradient and its rows of `eliminated`.
-inline void eliminate(const System& system, int64_t p, PointSums& sums, const std::vector<int64_t>& used,
-                      double* cross) {
+SPIKED_INLINE void eliminate(const System& system, int64_t p, PointSums& sums, const std::vector<int64_t>& used,
+                             double* cross) {
     for (int i = 0; i < 3; ++i) sums.hessian[4 * i] = sums.hessian[4 * i] * (1 + system.damping) + kDiagonal;
     double* root = system.roots + 9 * p;
     inverse_cholesky(sums.hessian, root);

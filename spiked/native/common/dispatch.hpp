@@ -6,6 +6,8 @@
 #include <string>
 #include <vector>
 
+#include "cpu_features.hpp"
+
 namespace spiked {
 
 template <class Kernels>
@@ -32,10 +34,13 @@ std::vector<const Kernels*> runnable_kernels(std::initializer_list<KernelChoice<
 
 #if defined(__x86_64__)
 // The instructions that the floating-point kernels are compiled for.
-inline bool has_avx2_floats() { return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"); }
+inline bool has_avx2_floats() {
+    const CpuFeatures cpu = cpu_features();
+    return cpu.avx2 && cpu.fma;
+}
 inline bool has_avx512_floats() {
-    return has_avx2_floats() && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-           __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl");
+    const CpuFeatures cpu = cpu_features();
+    return has_avx2_floats() && cpu.avx512f && cpu.avx512dq && cpu.avx512bw && cpu.avx512vl;
 }
 #endif
 

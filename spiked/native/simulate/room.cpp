@@ -92,7 +92,7 @@ struct BoxIntersection {
     float enter, leave, enter_face, leave_face;
 };
 
-inline BoxIntersection intersect_box(const float* half, const View& view, float x, float y) {
+SPIKED_INLINE BoxIntersection intersect_box(const float* half, const View& view, float x, float y) {
     float in[3], out[3], backwards[3];
     for (int a = 0; a < 3; ++a) {
         float d = view.corner.v[a] + x * view.dx.v[a] + y * view.dy.v[a];

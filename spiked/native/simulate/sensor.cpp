@@ -29,7 +29,7 @@ uint64_t mix64(uint64_t x) {
 
 // Standard normal from 32 random bits: the sum of four bytes (integers, so the same on every machine), its kurtosis
 // corrected by the first Cornish-Fisher term: variance 1, kurtosis 2.9, no value beyond 3.85.
-inline float normal(uint32_t bits) {
+SPIKED_INLINE float normal(uint32_t bits) {
     const uint32_t pairs = (bits & 0x00ff00ffU) + ((bits >> 8) & 0x00ff00ffU);
     const int sum = static_cast<int>((pairs >> 16) + (pairs & 0xffffU)) - 510;
     const float z = static_cast<float>(sum) * (1.0f / 147.80054f);

@@ -18,10 +18,9 @@ namespace {
 
 std::vector<const SpikeKernels*> supported_kernels() {
 #if defined(__x86_64__)
-    __builtin_cpu_init();
-    const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("bmi2");
-    const bool avx512 = __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl") &&
-                        __builtin_cpu_supports("avx512bitalg") && __builtin_cpu_supports("gfni");
+    const CpuFeatures cpu = cpu_features();
+    const bool avx2 = cpu.avx2 && cpu.bmi2;
+    const bool avx512 = cpu.avx512bw && cpu.avx512vl && cpu.avx512bitalg && cpu.gfni;
     return runnable_kernels<SpikeKernels>(
         {{spike_kernels_avx512, avx512}, {spike_kernels_avx2, avx2}, {spike_kernels_baseline, true}});
 #elif defined(__aarch64__)

@@ -44,10 +44,10 @@ constexpr uint8_t kByte = 0xFF;  // the largest number of a byte; all of them ar
 constexpr uint16_t kWord = 0xFFFF;
 // Relative error of the scale of a charge, which does not fall with the number of spikes.
 constexpr float kChargeError = 0.01f;
-inline float bound(bool seen, float per_frame) { return (seen ? 2.0f : 1.0f) * per_frame; }
+SPIKED_INLINE float bound(bool seen, float per_frame) { return (seen ? 2.0f : 1.0f) * per_frame; }
 
 template <class T>
-inline void rate_pixels(Intervals<T> e, T never, float per_frame, float* __restrict out) {
+SPIKED_INLINE void rate_pixels(Intervals<T> e, T never, float per_frame, float* __restrict out) {
     for (int64_t i = 0; i < e.count; ++i) {
         const float m = e.spikes[i], time = static_cast<float>(e.stop[i] - e.start[i]);
         out[i] = m > 0 ? m / time : 0.5f * bound(e.start[i] != never, per_frame);
@@ -55,7 +55,7 @@ inline void rate_pixels(Intervals<T> e, T never, float per_frame, float* __restr
 }
 
 template <class T>
-inline void deviation_pixels(Intervals<T> e, T never, float per_frame, float jitter, float* __restrict out) {
+SPIKED_INLINE void deviation_pixels(Intervals<T> e, T never, float per_frame, float jitter, float* __restrict out) {
     for (int64_t i = 0; i < e.count; ++i) {
         const float m = e.spikes[i], per_time = 1 / std::max(static_cast<float>(e.stop[i] - e.start[i]), 1.0f);
         const float p = m * per_time;
@@ -66,7 +66,8 @@ inline void deviation_pixels(Intervals<T> e, T never, float per_frame, float jit
 }
 
 template <class T>
-inline void time_pixels(Intervals<T> e, float middle, float half, float* __restrict first, float* __restrict last) {
+SPIKED_INLINE void time_pixels(Intervals<T> e, float middle, float half, float* __restrict first,
+                               float* __restrict last) {
     for (int64_t i = 0; i < e.count; ++i) {
         first[i] = e.spikes[i] > 0 ? static_cast<float>(e.start[i]) + 0.5f - middle : -half;
         last[i] = e.spikes[i] > 0 ? static_cast<float>(e.stop[i]) + 0.5f - middle : half;
@@ -224,8 +225,8 @@ void picture(const Array<const float, 2>& rate, double white, const Array<uint8_
 // Twice the mean middle of the intervals in rows [top, bottom) and `columns` columns, weighted by squared slopes, minus
 // `twice` the middle of the window (frames).
 template <int kLanes, class T>
-inline float weighted_time(const uint8_t* picture, Intervals<T> intervals, int64_t stride, int64_t top, int64_t bottom,
-                           int columns, float twice) {
+SPIKED_INLINE float weighted_time(const uint8_t* picture, Intervals<T> intervals, int64_t stride, int64_t top,
+                                  int64_t bottom, int columns, float twice) {
     float sum[kColumns] = {}, weights[kColumns] = {};
     const int lanes = kLanes ? kLanes : columns;
     for (int64_t y = top; y < bottom; ++y) {
@@ -257,8 +258,8 @@ inline float weighted_time(const uint8_t* picture, Intervals<T> intervals, int64
 }
 
 template <class T>
-inline float weighted_time_any(const uint8_t* picture, Intervals<T> intervals, int64_t width, int64_t left, int64_t top,
-                               int64_t bottom, int columns, float twice) {
+SPIKED_INLINE float weighted_time_any(const uint8_t* picture, Intervals<T> intervals, int64_t width, int64_t left,
+                                      int64_t top, int64_t bottom, int columns, float twice) {
     intervals.spikes += left;
     intervals.start += left;
     intervals.stop += left;

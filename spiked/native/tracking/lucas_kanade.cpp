@@ -236,7 +236,7 @@ inline Matrix products(const Window& window) {
 
 // Moves (*u, *v) to the position of a window in `to`, by steps until one is smaller than sqrt(last2). Returns whether
 // it was found.
-inline bool iterate(const Window& window, const PaddedImage& to, float last2, float* u, float* v) {
+SPIKED_INLINE bool iterate(const Window& window, const PaddedImage& to, float last2, float* u, float* v) {
     const Matrix g = products(window);
     const float spread = std::sqrt((g.xx - g.yy) * (g.xx - g.yy) + 4 * g.xy * g.xy);
     if (g.xx + g.yy - spread < 2 * kLeastEdge * kWindow * kWindow) return false;

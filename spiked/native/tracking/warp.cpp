@@ -13,7 +13,7 @@ namespace {
 constexpr int kWeightCell = 4;  // the weight image has one pixel for 4x4 of the sensor's
 
 // Adds `value` at (x, y) to the four pixels around it, bilinearly; pixel centres are at whole numbers.
-inline void splat_bilinear(float* image, int64_t width, int64_t height, float x, float y, float value) {
+SPIKED_INLINE void splat_bilinear(float* image, int64_t width, int64_t height, float x, float y, float value) {
     if (!(x >= 0 && y >= 0 && x < static_cast<float>(width - 1) && y < static_cast<float>(height - 1))) return;
     const auto column = static_cast<int32_t>(x), row = static_cast<int32_t>(y);
     const float u = x - static_cast<float>(column), v = y - static_cast<float>(row);
@@ -25,7 +25,7 @@ inline void splat_bilinear(float* image, int64_t width, int64_t height, float x,
 }
 
 // The displacement of every grid column on one sensor row: linear between the grid rows above and below.
-void grid_row(const float* grid, int64_t rows, int64_t columns, float y, std::vector<float>& out) {
+SPIKED_INLINE void grid_row(const float* grid, int64_t rows, int64_t columns, float y, std::vector<float>& out) {
     const float at = std::min(std::max(y, 0.0f), static_cast<float>(rows - 1));
     const int64_t i = std::min(static_cast<int64_t>(at), rows - 2);
     const float v = at - static_cast<float>(i);

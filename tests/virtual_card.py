@@ -1,8 +1,8 @@
 """A capture card without hardware: a process that writes the raw stream of the PCIe camera into a pipe.
 
 `python virtual_card.py FRAMES PIPE` writes the compact 1000x1000 frames of the file FRAMES. Like the card it sends at
-its own rate; unlike it, it waits for its reader unless `--drop` is given: then frames for which the pipe has no room
-are lost, as in the card.
+its own rate; unlike it, it waits for its reader unless `--drop` is given: then it keeps `CARD_FRAMES` for a reader that
+is late, and loses those that come while it is full.
 """
 
 import argparse
@@ -21,8 +21,8 @@ from spiked_driver.pcie import PCIE_COMPACT_BYTES, PCIE_FRAME_BYTES, encode_pcie
 
 PIPE_BYTES = 1 << 20
 """Room in the pipe: eight frames."""
-LATE_S = 0.1
-"""Longest time for which a frame that was begun is waited for, with `--drop`."""
+CARD_FRAMES = 256
+"""Frames that the card keeps, with `--drop`: 32 MB."""
 
 
 @contextmanager
@@ -55,19 +55,11 @@ def damaged(wire: NDArray[np.uint8], kinds: list[str]) -> bytes:
     return (b"\x55" * 1000 if "junk" in kinds else b"") + sent
 
 
-def write(pipe: int, data: bytes, drop: bool) -> bool:
-    """Write a frame; false if there was no room for its first byte, with `drop`."""
-    sent, due_s = 0, time.monotonic() + LATE_S
+def write(pipe: int, data: bytes | memoryview) -> None:
+    """Write a frame; waits for room."""
+    sent = 0
     while sent < len(data):
-        try:
-            sent += os.write(pipe, data[sent:])
-        except BlockingIOError:
-            if drop and not sent:
-                return False
-            if drop and time.monotonic() > due_s:
-                return True  # the rest of a frame is lost in the card, too
-            time.sleep(0.0002)
-    return True
+        sent += os.write(pipe, data[sent:])
 
 
 def main() -> None:
@@ -87,14 +79,20 @@ def main() -> None:
         kinds.setdefault(int(frame), []).append(kind)
     pipe = os.open(given.pipe, os.O_WRONLY)
     fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
-    os.set_blocking(pipe, not given.drop)
+    kept_s = CARD_FRAMES / given.rate if given.drop and given.rate else float("inf")
     begin_s, dropped = time.monotonic(), 0
     for number in range(given.repeat * len(wire)):
-        if given.rate:
-            time.sleep(max(0.0, begin_s + number / given.rate - time.monotonic()))
+        ahead_s = begin_s + number / given.rate - time.monotonic() if given.rate else 0.0
+        if ahead_s > 0:
+            time.sleep(ahead_s)
+        if -ahead_s > kept_s:
+            dropped += 1
+            continue
         frame = wire[number % len(wire)]
-        data = damaged(frame, kinds[number]) if number in kinds else memoryview(frame)
-        dropped += not write(pipe, data, given.drop)  # type: ignore[arg-type]
+        try:
+            write(pipe, damaged(frame, kinds[number]) if number in kinds else memoryview(frame))
+        except BrokenPipeError:  # nobody reads any more
+            break
     os.close(pipe)
     print(dropped, flush=True)
 

@@ -23,6 +23,7 @@ _UNKNOWN = {
     for name in (
         "trigger_input",
         "trigger_output",
+        "ptp",
         "exposure",
         "threshold",
         "gain",

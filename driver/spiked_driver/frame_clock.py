@@ -1,9 +1,12 @@
 """Host time of frames, from the times at which they were seen to arrive.
 
 A busy host sees a frame late and never early. The line frame -> time of a camera with a constant rate therefore lies
-below all points (frame, time seen) and touches those seen without delay. Only their lower convex hull is kept.
+below all points (frame, time seen) and touches those seen without delay. Their lower convex hull says which points
+those are. A single one may be early, by a frame where a transfer ends with one, so the line goes through the earliest
+points of many windows: its rate by least squares, its height by their median.
 """
 
+import statistics
 import time
 from collections import deque
 from itertools import chain
@@ -24,6 +27,10 @@ _DELAY_NS = 20_000_000
 """... plus this delay of a busy host divided by the span, ns."""
 _PUNCTUAL_NS = 500_000
 """Largest distance above the line of a point seen without delay, ns."""
+_UNTIMELY = 2
+"""Windows whose earliest point may be too early."""
+_LEAST_FITTED = 8
+"""Windows without delay that a rate by least squares needs, 2 s."""
 _REFINEMENTS = 4
 """Iterations of the slope; it converges in two or three."""
 
@@ -91,9 +98,21 @@ class FrameClock:
         self._slope_ns = self._measured_ns or self._stated_ns
         if not self.settled and self.wrong_rate() is None:
             self._slope_ns = self._stated_ns
-        recent = list(self._windows)[-_OFFSET_WINDOWS:]
-        self._offset_ns = min(seen - self._slope_ns * frame for frame, seen in chain.from_iterable(recent))
+        elif self._measured_ns is not None:
+            self._measured_ns = self._slope_ns = _fitted_slope_ns(self._earliest(_SLOPE_WINDOWS), self._slope_ns)
+        early = self._earliest(_OFFSET_WINDOWS)
+        self._offset_ns = statistics.median(seen - self._slope_ns * frame for frame, seen in early)
         return True
+
+    def _earliest(self, windows: int) -> list[Point]:
+        """The earliest point of each of the last windows by the present rate, without delayed and untimely ones."""
+        found = [
+            min(window, key=lambda point: point[1] - self._slope_ns * point[0])
+            for window in list(self._windows)[-windows:]
+        ]
+        delays = [seen - self._slope_ns * frame for frame, seen in found]
+        usual = sorted(delays)[min(_UNTIMELY, len(delays) // 4)]
+        return [point for point, delay in zip(found, delays, strict=True) if abs(delay - usual) <= _PUNCTUAL_NS]
 
     def unix_ns(self, frame: int) -> int | None:
         """Unix time in ns at which the frame had arrived whole, by the last line; None before there is one."""
@@ -127,6 +146,14 @@ def _slope_ns(hull: list[Point]) -> float | None:
         low, high = min(low, punctual[0]), max(high, punctual[-1])
     (first, begin_ns), (last, end_ns) = hull[low], hull[high]
     return (end_ns - begin_ns) / (last - first) if end_ns > begin_ns else None
+
+
+def _fitted_slope_ns(early: list[Point], known_ns: float) -> float:
+    """Nanoseconds a frame by least squares; as known with too few points, or if they are not spread."""
+    if len(early) < _LEAST_FITTED:
+        return known_ns
+    slope, _ = statistics.linear_regression(*zip(*early, strict=True))
+    return float(slope) if slope > 0 else known_ns
 
 
 def _extend(hull: list[Point], point: Point) -> None:

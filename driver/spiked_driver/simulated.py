@@ -16,13 +16,9 @@ from spiked_driver.source import Chunk, Pacer, former_source_names
 from spiked_driver.source_kind import Device, PacedOptions, SourceKind, SourceOptions, SourceSpec, Warn
 
 
-class SimulationOptions(PacedOptions, SourceOptions, NoiseOptions):
-    """Options of `sim:`."""
+class RoomOptions(SourceOptions):
+    """The camera in the room: what it is, its size and its motion."""
 
-    seed: int = Field(0, ge=0, lt=1 << 32)
-    """The same seed gives the same frames."""
-    seconds: float | None = Field(None, gt=0, le=1e7)
-    """Length in seconds; without it the simulation does not end."""
     width: Side = 320
     """Pixels in a row."""
     height: Side = 180
@@ -33,8 +29,16 @@ class SimulationOptions(PacedOptions, SourceOptions, NoiseOptions):
     """Path of the camera."""
     flow_px: float = Field(0.12, ge=1e-4, le=8)
     """Mean image motion per frame in pixels."""
+    seconds: float | None = Field(None, gt=0, le=1e7)
+    """Length in seconds; without it the simulation does not end."""
+    seed: int = Field(0, ge=0, lt=1 << 32)
+    """The same seed gives the same frames."""
     threads: int = Field(1, ge=1, le=64)
     """Threads of the simulation. The frames do not depend on it."""
+
+
+class SimulationOptions(PacedOptions, NoiseOptions, RoomOptions):
+    """Options of `sim:`. Fields of the last base come first: the camera, its noise, then faults and pace."""
 
 
 @former_source_names

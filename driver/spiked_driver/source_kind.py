@@ -49,7 +49,7 @@ class PacedOptions(FaultOptions):
     """Factor of the sensor's frame rate; 0 or `max`: as fast as lossless consumers take frames."""
 
 
-class SourceOptions(CameraOptions, CameraFiles):
+class SourceOptions(CameraFiles, CameraOptions):
     """What a camera is, as options of a source; what is stated wins over what the source itself says."""
 
 

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from spiked_driver import Chunk, FaultySource, acquire, open_source, source_kinds
 from spiked_driver.source_kind import Device, PacedOptions, SourceKind, SourceSpec, Warn
-from spiked_driver.source_kinds import KINDS, find_kind, is_camera, known_devices
+from spiked_driver.source_kinds import KINDS, find_kind, is_camera, kind_of, known_devices
 
+from spiked.camera import CameraOptions
 from spiked.errors import SourceError
 from spiked.ring import (
     DeviceState,
@@ -151,3 +152,17 @@ def test_the_text_names_its_kind(spec: str, name: str | None) -> None:
 def test_every_option_has_a_description_in_its_schema(kind: SourceKind) -> None:  # type: ignore[type-arg]
     for name, option in kind.options.model_json_schema()["properties"].items():
         assert option.get("description"), name
+
+
+def test_the_options_of_a_simulation_begin_with_its_camera() -> None:
+    """Forms and help show them in this order: size and motion before noise, faults and pace at the end."""
+    names = list(kind_of("sim:").options.model_fields)
+    assert names[:6] == list(CameraOptions.model_fields)
+    wanted = ["width", "motion", "electrons_a_spike", "flicker", "drop", "pace"]
+    assert [name for name in names if name in wanted] == wanted
+
+
+@pytest.mark.parametrize("source", ["usb0", "pcie:/dev/none"])
+def test_a_camera_says_whether_it_has_triggers_and_ptp(source: str) -> None:
+    capabilities = kind_of(source).describe(SourceSpec.parse(source)).capabilities
+    assert [str(capabilities[name]) for name in ("trigger_input", "trigger_output", "ptp")] == ["not supported"] * 3

@@ -33,7 +33,7 @@ def run(*arguments: object, code: int = 0) -> str:
 def test_the_offset_of_two_recordings_is_printed(tmp_path: Path) -> None:
     left, right = recorded(tmp_path / "left.dat", 0.0, 9), recorded(tmp_path / "right.dat", 0.25, 9)
     text = run("offset", left, right, "--frame", 500)
-    assert "right.dat begins 250.000 ms after left.dat (standard deviation 0.000 ms)" in text
+    assert "right.dat begins 250.000 ms after left.dat (standard deviation 0.071 ms)" in text
     assert "frame 500 of left.dat came with frame 250.00 of right.dat" in text
     assert "250.000 ms before right.dat" in run("offset", right, left)
     figures = json.loads(run("offset", left, right, "--frame", 500, "--json"))

@@ -1,6 +1,7 @@
 """The machine with cameras: serves a test bed's device nodes and does what its standard input says, line by line."""
 
 import json
+import os
 import selectors
 import socket
 import sys
@@ -19,6 +20,9 @@ from .faults import Fault, Kind
 from .stream import COMPACT_BYTES, MAGIC, Stream
 from .testbed import Testbed
 from .usbfs import Client, Limits, Node
+
+SHORTEST_WAIT_S = 20e-6
+"""A frame is late by at most so much because the loop sleeps."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,8 @@ class Socketed:
         self._host = host
         self._syspath = ""
         self._fifo = Path()
-        self._listener: socket.socket | None = None
+        self.listener: socket.socket | None = None
+        """Where clients of the node come."""
         self._old: list[Node] = []
         if settings.plugged:
             self.plug(self.port)
@@ -102,16 +107,16 @@ class Socketed:
             self.camera.stream.power_on(lines=1000 * self.plugs, nbytes=77 * self.plugs)
         self.plugs += 1
         self.port = port
-        self._syspath, self._fifo, self._listener = self._host.testbed.plug(self.camera, port, self.mode)
+        self._syspath, self._fifo, self.listener = self._host.testbed.plug(self.camera, port, self.mode)
         self.node = Node(self.camera, str(self._fifo), self._host.limits, self._fault)
-        self._host.selector.register(self._listener, selectors.EVENT_READ, self._accept)
+        self._host.selector.register(self.listener, selectors.EVENT_READ, self.accept)
 
     def unplug(self) -> None:
         """Go."""
-        if self.node is None or self._listener is None:
+        if self.node is None or self.listener is None:
             raise ValueError("the camera is not plugged in")
-        self._host.selector.unregister(self._listener)
-        self._listener.close()
+        self._host.selector.unregister(self.listener)
+        self.listener.close()
         self.node.unplug()
         self._old.append(self.node)
         self.node = None
@@ -129,11 +134,12 @@ class Socketed:
             port = fault.port or self.port
             self._host.later(fault.seconds, lambda: self.plug(port))
 
-    def _accept(self) -> None:
-        assert self._listener is not None
+    def accept(self) -> None:
+        """A client opens the node."""
+        assert self.listener is not None
         node = self.node
         assert node is not None
-        client = Client(self._listener.accept()[0], node)
+        client = Client(self.listener.accept()[0], node)
         node.clients.append(client)
 
         def serve() -> None:
@@ -153,6 +159,28 @@ class Socketed:
             node.close()
 
 
+class Elsewhere:
+    """A camera of the host that another process serves. It stays plugged in."""
+
+    def __init__(self, commands: socket.socket) -> None:
+        self._commands = commands
+        self._answers = commands.makefile("r")
+
+    def ask(self, command: dict[str, Any]) -> dict[str, Any]:
+        """What the camera's process answers."""
+        if command["do"] in ("plug", "unplug"):
+            raise ValueError("a camera with a process of its own stays plugged in")
+        self._commands.sendall((json.dumps(command) + "\n").encode())
+        answer: dict[str, Any] = json.loads(self._answers.readline())
+        return answer
+
+    def close(self) -> None:
+        """End the camera's process."""
+        self._answers.close()
+        self._commands.close()
+        os.wait()
+
+
 class Host:
     """Cameras at one test bed, and the loop that serves them."""
 
@@ -161,12 +189,44 @@ class Host:
         self.testbed = Testbed(usbfs_memory_mb)
         self.limits = limits
         self._timers: list[tuple[float, Callable[[], None]]] = []
-        self._sockets = [Socketed(settings, self) for settings in cameras]
+        self._sockets: list[Socketed | Elsewhere] = [Socketed(settings, self) for settings in cameras]
         self._commands, self._wake = socket.socketpair()
         self._lines: list[str] = []
         self._over = False
         self.selector.register(self._commands, selectors.EVENT_READ, self._obey)
         threading.Thread(target=self._listen, daemon=True).start()
+
+    def spread(self) -> None:
+        """Serve each camera but the first in a process of its own, so that none waits for what another does."""
+        for at, socketed in enumerate(self._sockets[1:], 1):
+            assert isinstance(socketed, Socketed)
+            here, there = socket.socketpair()
+            if not os.fork():
+                for other in (here, self._commands, self._wake):
+                    other.close()
+                self._alone(socketed, there)
+                os._exit(0)
+            there.close()
+            if socketed.listener is not None:
+                self.selector.unregister(socketed.listener)
+            self._sockets[at] = Elsewhere(here)
+
+    def _alone(self, socketed: Socketed, commands: socket.socket) -> None:
+        """Serve only this camera, until the other end of `commands` is closed."""
+        self.selector = selectors.SelectSelector()
+        self._sockets = [socketed]
+        if socketed.listener is not None:
+            self.selector.register(socketed.listener, selectors.EVENT_READ, socketed.accept)
+
+        def obey() -> None:
+            line = commands.makefile("r").readline()
+            if line:
+                commands.sendall((json.dumps(self._answer(json.loads(line))) + "\n").encode())
+            else:
+                self._over = True
+
+        self.selector.register(commands, selectors.EVENT_READ, obey)
+        self._serve()
 
     def later(self, seconds: float, action: Callable[[], None]) -> None:
         """Do something after a while."""
@@ -174,6 +234,12 @@ class Host:
 
     def run(self) -> None:
         """Serve until standard input ends."""
+        self._serve()
+        for each in self._sockets:
+            each.close()
+        self.testbed.close()
+
+    def _serve(self) -> None:
         while not self._over:
             for key, _ in self.selector.select(self._timeout()):
                 key.data()
@@ -184,18 +250,15 @@ class Host:
             self._timers = [timer for timer in self._timers if timer[0] > now_s]
             for _, action in due:
                 action()
-        for each in self._sockets:
-            each.close()
-        self.testbed.close()
 
     def _nodes(self) -> list[Node]:
-        return [each.node for each in self._sockets if each.node is not None]
+        return [each.node for each in self._sockets if isinstance(each, Socketed) and each.node is not None]
 
     def _timeout(self) -> float | None:
         now_s = time.monotonic()
         waits = [timer[0] - now_s for timer in self._timers]
         waits += [wait for node in self._nodes() if (wait := node.wait_s(now_s)) is not None]
-        return max(0.0002, min(waits)) if waits else None
+        return max(SHORTEST_WAIT_S, min(waits)) if waits else None
 
     def _listen(self) -> None:
         for line in sys.stdin:
@@ -208,14 +271,18 @@ class Host:
             self._over = True
             return
         command = json.loads(self._lines.pop(0))
-        try:
-            answer = self._do(command.pop("camera", 0), **command)
-        except Exception as error:  # the test is told, and the cameras stay
-            answer = {"error": f"{type(error).__name__}: {error}"}
-        print(json.dumps(answer), flush=True)
+        print(json.dumps(self._answer(command)), flush=True)
 
-    def _do(self, camera: int, do: str, **values: Any) -> dict[str, Any]:
-        socketed = self._sockets[camera]
+    def _answer(self, command: dict[str, Any]) -> dict[str, Any]:
+        socketed = self._sockets[command.pop("camera", 0)]
+        try:
+            if isinstance(socketed, Elsewhere):
+                return socketed.ask(command)
+            return self._do(socketed, **command)
+        except Exception as error:  # the test is told, and the cameras stay
+            return {"error": f"{type(error).__name__}: {error}"}
+
+    def _do(self, socketed: Socketed, do: str, **values: Any) -> dict[str, Any]:
         stream = socketed.camera.stream
         match do:
             case "plug":
@@ -254,6 +321,8 @@ def main() -> None:
     megabytes = settings.get("usbfs_memory_mb", 16)
     limits = Limits(megabytes << 20 if megabytes else None, settings.get("direct_memory", True))
     host = Host([settings_from(values) for values in settings["cameras"]], limits, megabytes)
+    if settings.get("own_processes", False):
+        host.spread()
     print(json.dumps({"root": str(host.testbed.root)}), flush=True)
     host.run()
 

@@ -70,7 +70,9 @@ class VirtualCameras:
         *,
         usbfs_memory_mb: int = 16,
         direct_memory: bool = True,
+        own_processes: bool = False,
     ) -> None:
+        """`own_processes`: each camera but the first is served by a process of its own."""
         environment = {**os.environ, "PYTHONPATH": str(_HERE.parent)}
         self._process = subprocess.Popen(
             [sys.executable, "-m", "virtual_camera.host"],
@@ -83,6 +85,7 @@ class VirtualCameras:
             cameras=[asdict(camera) for camera in cameras],
             usbfs_memory_mb=usbfs_memory_mb,
             direct_memory=direct_memory,
+            own_processes=own_processes,
         )
         self.root = Path(answer["root"])
 
@@ -145,7 +148,9 @@ class VirtualCameras:
 
     def hurry(self) -> None:
         """Before all that is not real-time: a camera is not kept waiting by a busy host. Raises PermissionError."""
-        os.sched_setscheduler(self._process.pid, os.SCHED_FIFO, os.sched_param(30))
+        children = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children").read_text().split()
+        for pid in (self._process.pid, *map(int, children)):
+            os.sched_setscheduler(pid, os.SCHED_FIFO, os.sched_param(30))
 
     def close(self) -> None:
         """End the cameras."""

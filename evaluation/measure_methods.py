@@ -1,10 +1,12 @@
 """The paper's method beside ours, part by part: the tables of docs/paper.md.
 
-    .venv/bin/python evaluation/measure_methods.py losses|poses|paths STREAMS_DIR [--only NAME] [--steps N] [--json OUT]
+    .venv/bin/python evaluation/measure_methods.py losses|poses|paths|depths STREAMS_DIR [--only NAME] [--steps N]
 
 losses: maps fitted to given poses with each loss, for equal steps, and then for the seconds that the charge took.
 poses:  a map fitted to the true poses of living is kept; a path disturbed by 0.2 degrees and 0.5 % is corrected by the
         pose gradient of the paper and by our alignment.
+depths: the paper's method from a first view that is flat, or at the depth of --scene, a PLY with the unit and frame of
+        the truth of living, with noise of a share of the depth.
 paths:  no poses are given: the paper's method as it is and with parts of ours, beside ours.
 
 STREAMS_DIR holds folders as `spiked simulate` writes them (NAME.dat, sidecar, groundtruth.tum, views.json, views/). The
@@ -27,6 +29,8 @@ from spiked.pose import log_so3
 from spiked.recon import Initialisation, LossName, MethodName, Options, PoseStepName, Reconstructor
 from spiked.recon.mapping.pose_steps import GaussNewton, PoseGradient, PoseStep
 from spiked.recording import Recording, open_recording
+from spiked.render import Camera, rasteriser_for
+from spiked.scene import Scene
 from spiked.spline import Spline
 from spiked.trajectory import Trajectory
 
@@ -35,6 +39,8 @@ STREAMS = "living", "garden", "garden_fast", "camp_color"
 DISTURBED_DEG, DISTURBED_PERCENT = 0.2, 0.5
 """RMS rotation, and RMS distance in percent of the RMS radius of the path, of the disturbance."""
 KNOT_FRAMES = 16.0
+FIRST_VIEW_FRAME = 16
+"""About the middle of the first view."""
 POSE_CHUNK = 50
 
 
@@ -109,7 +115,7 @@ def disturbed(path: Spline, times: np.ndarray, seed: int) -> Spline:
     """The path with random knots, scaled to the disturbance."""
     rng = np.random.default_rng(seed)
     turn, way = rng.normal(size=(2, len(path.centres), 3))
-    turn[0] = way[0] = 0  # the gradient keeps the first knot
+    turn[1] = way[1] = 0  # the gradient keeps the knot of the first view
     turn *= np.radians(DISTURBED_DEG) / np.radians(errors(path.move(1e-3 * turn, 0 * way), path, times)[0]) * 1e-3
     way *= DISTURBED_PERCENT / errors(path.move(0 * turn, 1e-3 * way), path, times)[1] * 1e-3
     return path.move(turn, way)
@@ -122,14 +128,15 @@ def poses(stream: Stream, steps: int, pose_steps: int, window_frames: int | None
     assert made.path is not None
     frames = np.arange(np.ceil(made.path.begin), np.floor(made.path.end))
     rotations, centres = made.path.poses(frames)
-    truth = Spline.fit(frames, rotations, centres, max(KNOT_FRAMES, window_frames or 0), 1)
-    ids = made.views.mappable(truth)
+    ids, spacing = made.views.mappable(made.path), max(KNOT_FRAMES, window_frames or 0)
+    span = made.views[ids[0]].time - spacing, made.views[ids[-1]].time + spacing  # a knot for each view
+    truth = Spline.fit(frames, rotations, centres, spacing, 1, span)
     start = disturbed(truth, frames, seed=0)
     yield {"what": "disturbed", **dict(zip(("deg", "percent"), errors(start, truth, frames), strict=True))}
     ways: list[tuple[str, PoseStep, int]] = [
         ("our alignment", GaussNewton(made.trainer), 5 * POSE_CHUNK),
-        ("pose gradient, difference of renders", PoseGradient(made.trainer, 0), pose_steps),
-        ("pose gradient, each render", PoseGradient(made.trainer, 0, difference=False), pose_steps),
+        ("pose gradient, each render", PoseGradient(made.trainer, 0), pose_steps),
+        ("pose gradient, difference of renders", PoseGradient(made.trainer, 0, difference=True), pose_steps),
     ]
     for name, way, count in ways:
         path, begin = start, time.perf_counter()
@@ -165,6 +172,24 @@ def paths(streams: list[Stream], steps: int, seeds: int, window_frames: int | No
                 yield row | {"loss": made.trainer.mapper.loss, "steps": made.trainer.mapper.steps, "s": made.work_s}
 
 
+def depths(stream: Stream, scene: Path, steps: int, seeds: int) -> Iterator[dict[str, Any]]:
+    """The path that grows with its map, from first views of several qualities."""
+    sensor, truth = stream.recording.sensor, stream.truth
+    assert sensor.intrinsics is not None
+    rasteriser = rasteriser_for(Camera(sensor.intrinsics, sensor.width, sensor.height))
+    at = truth.rotations[FIRST_VIEW_FRAME][None], truth.centres[FIRST_VIEW_FRAME][None]
+    depth = rasteriser.forward(Scene.read_ply(scene), *at).depth.astype(np.float64)
+    noise = np.random.default_rng(0).normal(size=depth.shape)
+    chosen = {"flat": None, **{f"true, noise {share:.0%}": depth * np.exp(share * noise) for share in (0.0, 0.1, 0.3)}}
+    for name, given in chosen.items():
+        for seed in range(seeds):
+            options = Options(steps=steps, seed=seed, method=MethodName.NOPE_SGS, first_depth=given)
+            path = stream.reconstruct(options).trajectory()
+            score = score_trajectory(truth=truth, estimate=path, frame_rate_hz=sensor.frame_rate_hz)
+            assert score.errors is not None
+            yield {"what": name, "seed": seed, "ate_percent": score.errors.ate_percent, "rpe": score.errors.rpe_r_deg}
+
+
 def line(row: dict[str, Any]) -> str:
     """A row in Markdown."""
     return "| " + " | ".join(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values()) + " |"
@@ -172,7 +197,7 @@ def line(row: dict[str, Any]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("table", choices=("losses", "poses", "paths"))
+    parser.add_argument("table", choices=("losses", "poses", "paths", "depths"))
     parser.add_argument("streams", type=Path)
     parser.add_argument("--only", default="", help="the stream of this name; default: all four")
     parser.add_argument("--row", default="", help="paths: the row of this name alone")
@@ -181,6 +206,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="of the table paths")
     parser.add_argument("--window-frames", type=int, help="of a view, not of losses; default: by the motion")
     parser.add_argument("--frames", type=int, help="first frames of each recording; default: all")
+    parser.add_argument("--scene", type=Path, help="of the table depths")
     parser.add_argument("--json", type=Path, help="file for the rows")
     options = parser.parse_args()
     if options.row:
@@ -192,6 +218,8 @@ def main() -> None:
             rows = losses(chosen, options.steps)
         case "poses":
             rows = poses(chosen[0], options.steps, options.pose_steps, options.window_frames)
+        case "depths":
+            rows = depths(chosen[0], options.scene, options.steps, options.seeds)
         case _:
             rows = paths(chosen, options.steps, options.seeds, options.window_frames)
     made = []

@@ -1,25 +1,27 @@
 """The schedule of Nope-SGS: poses and scene in turn, on key frames, with views that are added one by one."""
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from enum import Enum, auto
 
 import numpy as np
 
+from spiked.errors import ConfigurationError
 from spiked.pose import Array, exp_so3, log_so3
 from spiked.recon.mapping.loss import LossName
 from spiked.recon.mapping.pose_steps import PoseStep
 from spiked.recon.mapping.trainer import MapTrainer
 from spiked.recon.methods import Alternation
+from spiked.recon.run_progress import PROGRESS_STEPS, RunProgress
+from spiked.sensor import Image
 from spiked.spline import Path, Spline
 
-PROGRESS_STEPS = 50
-"""Steps between reports of progress."""
 LEAST_STEPS = 3
 """Steps for each view that is added, one of them of its pose."""
+LEAST_KNOT_FRAMES = 8.0
+"""Least spacing of the knots of a path."""
 FLAT_DEPTH = 1.0
-"""Depth of the first splats, where the path grows with the map: it is the unit of length."""
+"""Depth of the first splats, the median if it is given, where the path grows with the map: it is the unit of length."""
 
 
 class _Kind(Enum):
@@ -53,9 +55,11 @@ class Alternator:
         pose_step: PoseStep | None,
         options: Alternation,
         progressive: bool,
+        first_depth: Array | None = None,
     ) -> None:
         """points [N, 3] are landmarks on `path`. Without a `pose_step` the path is not changed; `progressive`: nothing
-        is known of the path, a linear spline, and views are added one by one."""
+        is known of the path, a linear spline, and views are added one by one, from the first at `first_depth` [H, W]
+        in any unit, or flat."""
         self.path = path
         """The path so far."""
         self._trainer = trainer
@@ -63,15 +67,14 @@ class Alternator:
         self._pose_step = pose_step
         self._options = options
         self._progressive = progressive
+        self._first_depth = first_depth
         self._used: list[int] = []
         self._keys: list[int] = []
         self._growing = progressive
         self._plan: list[_Action] | None = None
         self._next = 0
         """Number of the action that comes next."""
-        self._done = 0
-        """Steps taken."""
-        self._spent_s = 0.0
+        self._progress = RunProgress()
 
     def run(
         self,
@@ -83,20 +86,14 @@ class Alternator:
         """As `Refiner.run`; `most_steps` counts pose steps and scene steps."""
         if self._plan is None:
             self._plan = self._begin(most_steps)
-        plan, begin = self._plan, time.perf_counter() - self._spent_s
-        total = max(1, sum(count for kind, count in plan if kind in (_Kind.SCENE, _Kind.POSE)))
-        available_s, reported = max(deadline - begin, 1e-9), self._done
-        while self._next < len(plan):
-            self._spent_s = time.perf_counter() - begin
-            share = max(self._done / total, self._spent_s / available_s)
-            save()
-            if share >= 1 or cancelled():
-                break
+        plan, progress, reported = self._plan, self._progress, self._progress.done
+        total = sum(count for kind, count in plan if kind in (_Kind.SCENE, _Kind.POSE))
+        for share in progress.shares(total, deadline, cancelled, save):
             self._act(*plan[self._next], share)
             self._next += 1
-            if self._done - reported >= PROGRESS_STEPS:
-                reported = self._done
-                yield max(share, self._done / total)
+            if progress.done - reported >= PROGRESS_STEPS:
+                reported = progress.done
+                yield max(share, progress.done / total)
         self._trainer.use_only(None)
 
     def _begin(self, most_steps: int) -> list[_Action]:
@@ -106,6 +103,8 @@ class Alternator:
         pixels = trainer.camera.width * trainer.camera.height
         steps = trainer.options.schedule.steps(most_steps, pixels, fast, trainer.extent)
         if not self._progressive:
+            if self._pose_step is not None and isinstance(self.path, Spline):
+                self.path = through_views(self.path, [trainer.views[i].time for i in ids])
             if trainer.stale(self.path):
                 trainer.restart()
             trainer.seed(self.path, self._points, trainer.options.seeding.order(ids, trainer.extent))
@@ -114,7 +113,8 @@ class Alternator:
         trainer.restart()
         self._used = ids[:1]
         rotations, centres = self.path.poses([trainer.views[ids[0]].time])
-        trainer.mapper.seed_flat(trainer.views.image(ids[0]), rotations[0], centres[0], FLAT_DEPTH)
+        view = trainer.views.image(ids[0])
+        trainer.mapper.seed_view(view, rotations[0], centres[0], _scaled(self._first_depth, view.rate.shape[:2]))
         trainer.planner.depth = trainer.mapper.depth = FLAT_DEPTH
         trainer.fit_with(LossName.INTERVAL)
         self._use(self._used)
@@ -140,8 +140,10 @@ class Alternator:
         epochs = max(o.least_epochs, round(steps / length))
         pose, scene = posing * steps // (length * epochs), o.scene_steps * steps // (length * epochs)
         chunks = [min(o.chunk, pose - begin) for begin in range(0, pose, o.chunk)]
-        epoch: list[_Action] = [(_Kind.SELECT, 0), *[(_Kind.POSE, count) for count in chunks]]
-        return [*epoch, (_Kind.SELECT, 0), *[(_Kind.SCENE, 1)] * scene] * epochs
+        poses: list[_Action] = [(_Kind.SELECT, 0), *[(_Kind.POSE, count) for count in chunks]]
+        scenes: list[_Action] = [(_Kind.SELECT, 0), *[(_Kind.SCENE, 1)] * scene]
+        # A map that was only seeded would spoil a path that is known.
+        return [*poses, *scenes] * epochs if self._progressive else [*scenes, *poses] * epochs
 
     def _act(self, kind: _Kind, count: int, share: float) -> None:
         trainer, schedule = self._trainer, self._trainer.options.schedule
@@ -158,7 +160,7 @@ class Alternator:
                 self._use(self._used)
             case _Kind.SELECT:
                 self._select()
-        self._done += count
+        self._progress.done += count
 
     def _use(self, ids: list[int]) -> None:
         self._keys = ids
@@ -187,10 +189,29 @@ class Alternator:
         self._use([i for i, loss in zip(self._used, losses, strict=True) if loss >= losses.mean()])
 
 
+def _scaled(depth: Array | None, shape: tuple[int, ...]) -> Image:
+    """A depth [H, W] with `FLAT_DEPTH` as its median and where nothing is known; flat without one."""
+    if depth is None:
+        return np.full(shape, FLAT_DEPTH, np.float32)
+    if depth.shape != shape:
+        raise ConfigurationError(f"the depth of the first view is {depth.shape}, expected {shape} as its views")
+    known = np.isfinite(depth) & (depth > 0)
+    return np.where(known, depth * FLAT_DEPTH / np.median(depth[known]), FLAT_DEPTH).astype(np.float32)
+
+
+def through_views(path: Spline, times: Sequence[float]) -> Spline:
+    """The path as a linear spline with a knot for each view at `times` (frames): knots that no view sees would follow
+    noise."""
+    spacing = max(float(np.median(np.diff(times))), LEAST_KNOT_FRAMES)
+    frames = np.arange(np.ceil(path.begin), path.end)
+    span = times[0] - spacing, times[-1] + spacing
+    return Spline.fit(frames, *path.poses(frames), spacing, 1, span)
+
+
 def continued(path: Spline, time: float) -> Spline:
     """The path with constant velocity from `time` (frames) on: each later knot is one step further."""
-    first, _ = path.locate([time])
-    last = int(first[0]) + path.degree
+    first, weights = path.locate([time])
+    last = int(first[0]) + int(weights[0, 1] > 0.5 - 1e-6)
     if last + 1 >= len(path.centres):
         return path
     rotations, centres = path.rotations.copy(), path.centres.copy()

@@ -41,8 +41,8 @@ SAMPLED_BYTES, SAMPLES = 65_536, 32
 """Size and number of the pieces of a recording, evenly spread, that tell it from others."""
 LOOSE_RATIO, LOOSE_BYTES = 2, 64 << 20
 """The file of arrays is written anew when it is larger than this many times what the state needs of it, and this."""
-_SHARED = "odometry", "views", "_windows"
-"""Attributes of the reconstructor that do not change after the tracking."""
+_SHARED = "odometry", "views", "windows"
+"""Names of `Reconstructor.tracking_parts`."""
 _PACKAGES = ("recon", "render", "native")
 """Packages whose code decides whether a state fits, with the modules of `spiked` itself."""
 _MODULES = tuple(
@@ -253,8 +253,7 @@ class CheckpointSaver:
         once = _Once(self._placed, self._folder.arrays_bytes)
         if self._tracking is None or not reconstructor.tracking_ended:
             once.allow(reconstructor.odometry.fixed_arrays())
-            shared = tuple(getattr(reconstructor, name) for name in _SHARED)
-            tracking = _pickle(shared, once, {}, reconstructor, self._recording)
+            tracking = _pickle(reconstructor.tracking_parts, once, {}, reconstructor, self._recording)
             if reconstructor.tracking_ended:
                 self._tracking = np.frombuffer(tracking, np.uint8)
         else:
@@ -265,7 +264,7 @@ class CheckpointSaver:
         else:
             at = once.place(self._tracking)
             tracking, place = b"", (at.begin, at.dtype, at.shape)
-        names = {id(getattr(reconstructor, name)): name for name in _SHARED}
+        names = {id(part): name for part, name in zip(reconstructor.tracking_parts, _SHARED, strict=True)}
         rest = _pickle(reconstructor, once, names, reconstructor, self._recording)
         status = reconstructor.status()
         header = self._fixed_header() | {

@@ -36,7 +36,7 @@ class PoseStepName(StrEnum):
     ALIGNMENT = "alignment"
     """Gauss-Newton over the whole path with landmarks marginalised."""
     GRADIENT = "gradient"
-    """The rasteriser's exact gradient by the pose of each sub-frame (Eq 6 to 12), by Adam."""
+    """The rasteriser's exact gradient by the pose of each sub-frame (Eq 6 to 12), divided by its curvature."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from spiked.calibration import Calibration
 from spiked.errors import ConfigurationError
 from spiked.recon.frontend.spike_targets import TargetKind
@@ -41,6 +44,9 @@ class Options:
     """Name of one of `spiked.recon.methods.METHODS`; the next three options replace parts of it."""
     initialisation: Initialisation | None = None
     """How the path begins; None: as in the method."""
+    first_depth: NDArray[np.float64] | None = None
+    """Depth [H, W] of the first view in any unit, for `Initialisation.PROGRESSIVE`; without it all of it is at one
+    depth, from which the path is not found (docs/paper.md). Values that are not positive and finite are not known."""
     pose_step: PoseStepName | None = None
     """What corrects the poses; None: as in the method."""
     loss: LossName | None = None
@@ -56,6 +62,13 @@ class Options:
                 f"the method {self.method} needs a path before its map: the initialisation {self.initialisation} is "
                 "of the method nope-sgs"
             )
+        if self.first_depth is not None:
+            if self.parts.initialisation is not Initialisation.PROGRESSIVE:
+                raise ConfigurationError(
+                    "a depth of the first view is for a path that grows with its map: give it with the method nope-sgs"
+                )
+            if not (np.isfinite(self.first_depth) & (self.first_depth > 0)).any():
+                raise ConfigurationError("the depth of the first view has no value that is positive and finite")
         if self.steps < 0:
             raise ConfigurationError(f"refinement of {self.steps} steps is negative")
         if self.max_views < 20:

@@ -1,6 +1,5 @@
 """The refinement: path and map together, after the last frame."""
 
-import time
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -8,13 +7,12 @@ import numpy as np
 from spiked.pose import Array
 from spiked.recon.mapping.pose_steps import ALIGNED_VIEWS, PoseStep
 from spiked.recon.mapping.trainer import MapTrainer
+from spiked.recon.run_progress import PROGRESS_STEPS, RunProgress
 from spiked.recon.time_left import Part, RefinementPlan, TimeLeft
 from spiked.spline import Path, Spline, Waypoints
 
 GRADIENT_STEPS = 100
 """Steps of a pose step that goes along the gradient, in place of one alignment."""
-PROGRESS_STEPS = 50
-"""Steps between reports of progress."""
 
 
 def plan_of(
@@ -62,9 +60,7 @@ class Refiner:
         self._clock = clock
         self._plan: RefinementPlan | None = None
         """None before the refinement has begun."""
-        self._done = 0
-        self._spent_s = 0.0
-        """Time since the first step, without the time between a kill and the next start."""
+        self._progress = RunProgress()
 
     def run(
         self,
@@ -81,27 +77,20 @@ class Refiner:
         self._clock.start(deadline)
         if self._plan is None:
             self._plan = self._begin(most_steps)
-        plan, steps = self._plan, self._plan.steps
-        begin = time.perf_counter() - self._spent_s
-        available_s = max(deadline - begin, 1e-9)
-        while self._done < steps:
-            self._spent_s = time.perf_counter() - begin
-            share = max(self._done / steps, self._spent_s / available_s)
-            save()
-            if share >= 1 or cancelled():
-                break
+        plan, steps, progress = self._plan, self._plan.steps, self._progress
+        for share in progress.shares(steps, deadline, cancelled, save):
             self._trainer.step(self.path, self._schedule.rate(share), self._schedule.coarseness(share), share)
             self._clock.lap(Part.STEPS, plan.step_s(share * steps, len(self._trainer.mapper.scene)))
             self._align_if_due(share, plan)
             self._prune_if_due(share, plan)
-            self._done += 1
-            if self._done % PROGRESS_STEPS == 0:
-                yield max(share, self._done / steps)
+            progress.done += 1
+            if progress.done % PROGRESS_STEPS == 0:
+                yield max(share, progress.done / steps)
 
     @property
     def left(self) -> dict[Part, float] | None:
         """Work that is left; None before the refinement has begun."""
-        return None if self._plan is None else self._plan.work(self._done, len(self._trainer.mapper.scene))
+        return None if self._plan is None else self._plan.work(self._progress.done, len(self._trainer.mapper.scene))
 
     def _begin(self, most_steps: int) -> RefinementPlan:
         """Seed the map."""

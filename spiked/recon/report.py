@@ -190,9 +190,10 @@ def machine() -> dict[str, object]:
 
 
 def options_section(options: Options) -> dict[str, object]:
-    """All options; of poses and calibration only whether they were given."""
-    given = {"poses": options.poses is not None, "calibration": options.calibration is not None}
-    return asdict(replace(options, poses=None, calibration=None)) | given
+    """All options; of poses, calibration and depth only whether they were given."""
+    names = "poses", "calibration", "first_depth"
+    given = {name: getattr(options, name) is not None for name in names}
+    return asdict(replace(options, poses=None, calibration=None, first_depth=None)) | given
 
 
 def tracking_section(odometry: Odometry, records: list[ViewRecord], frame_rate_hz: float) -> dict[str, object]:

@@ -57,9 +57,10 @@ class UntrackedOdometry(Odometry):
             self._status.explain("too few views for a path")
             return
         still, spacing = np.repeat(np.eye(3)[None], len(times), 0), float(np.median(np.diff(times)))
-        half = 0.5 * self.views[0].length, 0.5 * self.views[-1].length
-        span = times[0] - half[0], times[-1] + half[1]
-        path = Spline.fit(times, still, np.zeros((len(times), 3)), max(spacing, LEAST_KNOT_FRAMES), 1, span)
+        spacing = max(spacing, LEAST_KNOT_FRAMES)
+        # Knots between the views would be free to move to both sides in turn.
+        span = times[0] - spacing, times[-1] + spacing
+        path = Spline.fit(times, still, np.zeros((len(times), 3)), spacing, 1, span)
         self._adjuster.spline = path
         self._status.set(self.views[-1].time, State.TRACK, _REASON)
         self.follow(path)

@@ -16,7 +16,7 @@ import pytest
 from spiked_service.results.recording_feed import reconstruct_recording
 
 from spiked.errors import CheckpointError
-from spiked.recon import Options, Reconstructor, checkpoint, checkpoint_file
+from spiked.recon import MethodName, Options, Reconstructor, checkpoint, checkpoint_file
 from spiked.recon.checkpoint import CheckpointSaver, Interrupted
 from spiked.recording import Recording, RecordingWriter, open_recording
 from spiked.sensor import Intrinsics, Sensor
@@ -66,10 +66,14 @@ def whole(room: Recording) -> Reconstructor:
 
 
 def interrupted(
-    recording: Recording, folder: Path, where: Callable[[Reconstructor], bool], saver: CheckpointSaver | None = None
+    recording: Recording,
+    folder: Path,
+    where: Callable[[Reconstructor], bool],
+    saver: CheckpointSaver | None = None,
+    options: Options | None = None,
 ) -> None:
     """Run to the first place for which `where` is true, leave a checkpoint there, and end."""
-    reconstructor = Reconstructor(recording.sensor, Options(steps=STEPS), recording=recording)
+    reconstructor = Reconstructor(recording.sensor, options or Options(steps=STEPS), recording=recording)
     saver = saver or CheckpointSaver(folder, recording, {"steps": STEPS}, pytest.fail)
 
     def save() -> None:
@@ -127,6 +131,20 @@ def views(reconstructor: Reconstructor) -> list[dict[str, Any]]:
     found = reconstructor.report()["views"]
     assert isinstance(found, list)
     return found
+
+
+@pytest.mark.parametrize("most", [12, 45], ids=["while views are added", "between pose steps and scene steps"])
+def test_the_method_of_the_paper_is_resumed_with_the_same_bits(room: Recording, tmp_path: Path, most: int) -> None:
+    """A checkpoint is a position in its list of actions, with the running means of its pose gradient."""
+    options = Options(steps=30, method=MethodName.NOPE_SGS, window_frames=32)
+    alone = Reconstructor(room.sensor, options, recording=room)
+    run(room, alone)
+    interrupted(room, tmp_path / "checkpoint", lambda one: one.trainer.mapper.steps >= most, options=options)
+    resumed = Interrupted.read(tmp_path / "checkpoint").resume(room)
+    assert most <= resumed.trainer.mapper.steps < alone.trainer.mapper.steps
+    run(room, resumed)
+    for mine, theirs in zip(arrays(resumed), arrays(alone), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
 
 
 @pytest.mark.slow

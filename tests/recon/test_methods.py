@@ -74,13 +74,13 @@ def test_the_pose_gradient_through_the_sub_frames_is_that_of_finite_differences(
     ids = trainer.views.mappable(path)
     step, view_id = PoseGradient(trainer, 0, difference), ids[len(ids) // 2]
     path = path.move(*np.random.default_rng(0).normal(scale=2e-3, size=(2, len(path.centres), 3)))
-    _, gradient = step.gradient(path, view_id)
+    gradient = step.model(path, view_id).slope
     assert (np.abs(gradient).max(1) > 0).sum() >= 3
     for seed in range(3):
         direction = np.random.default_rng(seed).normal(size=gradient.shape) * 1e-4
 
         def moved(sign: int, direction: np.ndarray = direction) -> float:
-            return step.gradient(path.move(sign * direction[:, :3], sign * direction[:, 3:]), view_id)[0]
+            return step.model(path.move(sign * direction[:, :3], sign * direction[:, 3:]), view_id).loss
 
         assert (gradient * direction).sum() == pytest.approx((moved(1) - moved(-1)) / 2, rel=0.03)
 
@@ -100,6 +100,19 @@ def test_its_first_view_is_fitted_before_any_other(room: Room) -> None:
     """Flat, by the interval loss; then one view after the other at constant velocity."""
     made = room.reconstruct(Options(steps=0, method=MethodName.NOPE_SGS))
     assert made.trainer.loss is LossName.INTERVAL and np.allclose(made.scene().means[:, 2], 1)
+
+
+def test_its_first_view_begins_at_the_depth_that_is_given(room: Room) -> None:
+    size = room.sensor.height, room.sensor.width
+    depth = np.where(np.arange(size[1]) < size[1] / 2, 2.0, 6.0) * np.ones(size)
+    depth[:4] = np.nan
+    made = room.reconstruct(Options(steps=0, method=MethodName.NOPE_SGS, first_depth=depth))
+    means = made.scene().means
+    known = np.median(np.where(np.isnan(depth), np.inf, depth)[4:])
+    assert set(np.round(np.unique(means[:, 2]), 4)) <= set(np.round([2 / known, 1, 6 / known], 4))
+    assert means[means[:, 2] < 0.99, 0].max() < means[means[:, 2] > 1.01, 0].min() + 0.2
+    with pytest.raises(ConfigurationError, match=r"is \(2, 2\), expected"):
+        room.reconstruct(Options(steps=0, method=MethodName.NOPE_SGS, first_depth=np.ones((2, 2))))
 
 
 @pytest.mark.parametrize(
@@ -142,6 +155,10 @@ def test_unknown_names_and_impossible_mixtures_are_refused(room: Room, tmp_path:
         Options(method="nerf")  # type: ignore[arg-type]
     with pytest.raises(ConfigurationError, match="needs a path before its map"):
         Options(initialisation=Initialisation.PROGRESSIVE)
+    with pytest.raises(ConfigurationError, match="grows with its map"):
+        Options(first_depth=np.ones((2, 2)))
+    with pytest.raises(ConfigurationError, match="no value that is positive"):
+        Options(method=MethodName.NOPE_SGS, first_depth=np.zeros((2, 2)))
     with pytest.raises(ConfigurationError, match="no tracks to estimate it from: give --fov"):
         Reconstructor(replace(room.sensor, intrinsics=None), Options(method=MethodName.NOPE_SGS))
     done = CliRunner().invoke(app, ["reconstruct", "rec.dat", "-o", str(tmp_path / "out"), "--method", "nerf"])

@@ -76,7 +76,7 @@ def test_a_refinement_ends_settled(
 ) -> None:
     """The last views alone would add their noise. With less time than its steps take it comes to the same end."""
     clock = SimpleNamespace(perf_counter=partial(next, count(0.0, 0.02)))  # each reading is 20 ms after the last
-    monkeypatch.setattr("spiked.recon.refiner.time", clock)
+    monkeypatch.setattr("spiked.recon.run_progress.time", clock)
     monkeypatch.setattr("spiked.recon.reconstructor.time", clock)
     moved: list[float] = []
     step = Mapper.step

@@ -113,15 +113,15 @@ class Mapper:
         self._add(chosen, depth, colours, stride, swept.rotation, swept.centre)
         return len(u)
 
-    def seed_flat(self, view: View, rotation: Array, centre: Array, depth: float) -> None:
-        """Begin the map with one view at one depth, for want of a better one."""
+    def seed_view(self, view: View, rotation: Array, centre: Array, depth: Image) -> None:
+        """Begin the map with one view at a depth for each pixel [H, W]."""
         rate, seeding = view.rate, self.options.seeding
         self.white = float(np.percentile(rate, WHITE_PERCENTILE))
         stride = seeding.stride(rate.size, int(self.cap / self.extent), self.options.stride_px)
         chosen = seeding.pixels(np.ones(rate.shape, bool), stride, self.cap)
         if chosen is not None:
             colours = fill_mosaic(rate, self.channels)[chosen]
-            self._add(chosen, np.full(len(colours), depth, np.float32), colours, stride, rotation, centre)
+            self._add(chosen, depth[chosen], colours, stride, rotation, centre)
 
     def _add(
         self,

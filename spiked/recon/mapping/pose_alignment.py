@@ -150,9 +150,7 @@ def _view_normals(
         image, smooth, seen, certainty = _warped(request, request.warp, mapper, level)
     smooth = smooth / np.float32(mapper.white)
     error = smooth - seen / np.float32(mapper.white)
-    k = level.camera.intrinsics
-    du = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 32)
-    dv = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 32)
+    du, dv = _slopes(smooth)
     strong = np.zeros(error.shape, bool)
     size = np.hypot(du, dv)
     inside = slice(EDGE_PX, -EDGE_PX)
@@ -161,12 +159,27 @@ def _view_normals(
     e = error[strong]
     scale = MAD_SCALE * (median(np.abs(e)) if len(e) else 0.0) + 1e-6
     weight = np.where(strong, certainty / (1 + (error / (ROBUST_SCALES * scale)) ** 2), 0).astype(np.float32)
-    pose, keys, places = np.empty((6, 7)), np.empty(len(e), np.int64), np.empty((len(e), 3, 10))
-    count = _dense.photometric_normals(
+    pose, keys, places = _normals(error, du, dv, image.depth, weight, level, rotation, centre)
+    variance = float((weight * error**2).sum() / max(float(weight.sum()), 1e-12))
+    return ViewNormals(pose, keys, places, variance)
+
+
+def _slopes(image: Image) -> tuple[Image, Image]:
+    """Slopes of an image a pixel to the right and down."""
+    return cv2.Scharr(image, cv2.CV_32F, 1, 0, scale=1 / 32), cv2.Scharr(image, cv2.CV_32F, 0, 1, scale=1 / 32)
+
+
+def _normals(
+    error: Image, du: Image, dv: Image, depth: Image, weight: Image, level: Level, rotation: Array, centre: Array
+) -> tuple[Array, NDArray[np.int64], Array]:
+    """Normal equations of the pixels with weight, see `ViewNormals`."""
+    count, k = int((weight > 0).sum()), level.camera.intrinsics
+    pose, keys, places = np.empty((6, 7)), np.empty(count, np.int64), np.empty((count, 3, 10))
+    found = _dense.photometric_normals(
         error,
         du,
         dv,
-        image.depth,
+        depth,
         weight,
         k.fx,
         k.fy,
@@ -180,8 +193,19 @@ def _view_normals(
         places,
         **k.lens(),
     )
-    variance = float((weight * error**2).sum() / max(float(weight.sum()), 1e-12))
-    return ViewNormals(pose, keys[:count], places[:count].copy(), variance)
+    return pose, keys[:found], places[:found].copy()
+
+
+def pose_curvature(image: RenderedImage, level: Level, white: float, rotation: Array, centre: Array) -> Array:
+    """Gauss-Newton Hessian [6, 6] of the mean squared error of a render, in units of white, by its pose: rotation
+    vector on the left, then centre. Its landmarks stay where they are."""
+    grey_image = level.grey(image.values) / np.float32(white)
+    du, dv = _slopes(grey_image)
+    weight = np.zeros_like(grey_image)
+    inside = slice(EDGE_PX, -EDGE_PX)
+    weight[inside, inside] = image.alpha[inside, inside] > MIN_ALPHA
+    pose, _, _ = _normals(np.zeros_like(weight), du, dv, image.depth, weight, level, rotation, centre)
+    return 2 * pose[:, :6] / weight.size
 
 
 Compared = tuple[RenderedImage, Image, Image, Image]

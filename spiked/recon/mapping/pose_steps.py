@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from spiked.pose import Array
-from spiked.recon.mapping.pose_alignment import TrajectoryPrior, align_spline
+from spiked.recon.mapping.pose_alignment import TrajectoryPrior, align_spline, pose_curvature
 from spiked.recon.mapping.trainer import MapTrainer, ViewRender
 from spiked.sensor import Image
 from spiked.spline import Spline
@@ -16,11 +16,13 @@ ALIGNED_VIEWS = 160
 """Most views of an alignment."""
 APART_FRAMES = 32.0
 """Frames between the two renders whose difference is compared, n of the paper (Eq 6)."""
-STEP_PX = 0.1, 0.005
-"""Image motion of one step of Adam at the begin and at the end of the refinement: the first reaches 0.5 px in the steps
-that a view gets, the last is below the error to be corrected (docs/paper.md)."""
-MOMENTS = 0.9, 0.99
-"""Adam's decay rates, in steps of a knot."""
+STEP_SHARES = 0.3, 0.05
+"""Share of the step to the minimum of the quadratic model of a view, at the begin and at the end of the refinement.
+With 1 and 0.1 a path diverges at first, and ends worse (decision 41)."""
+AVERAGED = 0.8
+"""Decay rate of the running means of gradient and curvature, in steps of a knot; 0.9 is too slow (decision 41)."""
+CURVATURE_DAMPING = 1e-3
+"""Added to the diagonal of the curvature, relative to it."""
 
 
 class PoseStep(Protocol):
@@ -49,49 +51,53 @@ class GaussNewton:
 
 
 class PoseGradient:
-    """Adam on the knots of a path, along the exact gradient by the poses of the sub-frames (Eq 6 to 12).
+    """Descends on the knots of a path along the exact gradient by the poses of the sub-frames (Eq 6 to 12).
 
     A pose is perturbed on the left, R <- Exp(phi) R and c <- c + d (Eq 12 has the same for the inverse pose). The
     gradient by the pose of a sub-frame reaches the knots with their basis weights, which is exact for knots that turn
-    together, and off by the angle between two knots otherwise. The first knot stays.
+    together, and off by the angle between two knots otherwise.
+
+    The gradient is divided by the curvature [6, 6] of each knot, a running mean over its views: a translation hardly
+    differs from a rotation in the image, and steps of the same image motion in all six directions correct each by the
+    other (docs/decisions/0041-curvature-of-the-pose-gradient.md). The knot of the first view stays.
     """
 
-    def __init__(self, trainer: MapTrainer, seed: int, difference: bool = True, step_px: tuple[float, float] = STEP_PX):
-        """With `difference` two renders `APART_FRAMES` apart are compared by their difference (Eq 6 to 8), otherwise
-        each with its own target, by the loss of the map."""
+    def __init__(self, trainer: MapTrainer, seed: int, difference: bool = False):
+        """The loss is the mean squared error of each view; with `difference`, that of the difference of two views
+        `APART_FRAMES` apart (Eq 6 to 8)."""
         self._trainer = trainer
         self._difference = difference
-        self._step_px = step_px
         self._rng = np.random.default_rng(seed)
-        self._moments = np.zeros((2, 0, 6))
-        self._taken = np.zeros(0)
+        self._slope = np.zeros((0, 6))
+        self._curvature = np.zeros((0, 6, 6))
 
     def improve(self, path: Spline, ids: Sequence[int], steps: int, share: float) -> Spline:
         """See `PoseStep.improve`; each step is on one view of a random order."""
         order: list[int] = []
         for _ in range(steps):
             order = order or [int(i) for i in self._rng.permutation(ids)]
-            _, gradient = self.gradient(path, order.pop())
-            path = self._descend(path, gradient, share)
+            path = self._descend(path, self.model(path, order.pop()), share)
         return path
 
-    def gradient(self, path: Spline, view_id: int) -> tuple[float, Array]:
-        """The loss of a view and its gradient by the knots, [knots, 6]: rotation vector on the left, centre."""
-        trainer, knots = self._trainer, np.zeros((len(path.centres), 6))
+    def model(self, path: Spline, view_id: int) -> "PoseModel":
+        """The loss of a view around a path."""
+        trainer, made = self._trainer, PoseModel.of(path)
         level, white = trainer.mapper.alignment_level, trainer.mapper.white
         other = self._apart(path, view_id) if self._difference else None
         here = trainer.render(path, view_id, level)
-        if other is None:
-            made = trainer.mapper.view_loss.compare(here.expected, here.target, white, level.mosaic)
-            _add_by_knots(here, made.slope, path, knots)
-            return made.value, knots
-        there = trainer.render(path, other, level)
-        seen = np.isfinite(here.target.deviation) & np.isfinite(there.target.deviation)
-        error = np.where(seen, (here.expected - there.expected) - (here.target.values - there.target.values), 0)
+        error, seen = here.expected - here.target.values, np.isfinite(here.target.deviation)
+        if other is not None:
+            there = trainer.render(path, other, level)
+            error = error - (there.expected - there.target.values)
+            seen &= np.isfinite(there.target.deviation)
+        error = np.where(seen, error, np.float32(0))
         slope = np.asarray(2 * error / (white**2 * error.size), np.float32)
-        _add_by_knots(there, -slope, path, knots)
-        _add_by_knots(trainer.render(path, view_id, level), slope, path, knots)
-        return float(np.mean(error**2)) / white**2, knots
+        made.loss = float(np.mean(error**2)) / white**2
+        if other is not None:
+            made.add(there, -slope, trainer, path, trainer.views[other].time, 2)
+            here = trainer.render(path, view_id, level)
+        made.add(here, slope, trainer, path, trainer.views[view_id].time, 1 if other is None else 2)
+        return made
 
     def _apart(self, path: Spline, view_id: int) -> int | None:
         """The view about `APART_FRAMES` before this one, or after it at the begin; None without any."""
@@ -100,28 +106,55 @@ class PoseGradient:
         before = [i for i in ids if views[i].time < time - APART_FRAMES / 2] or ids
         return min(before, key=lambda i: abs(abs(views[i].time - time) - APART_FRAMES), default=None)
 
-    def _descend(self, path: Spline, gradient: Array, share: float) -> Spline:
-        if len(self._taken) != len(gradient):
-            self._moments, self._taken = np.zeros((2, *gradient.shape)), np.zeros(len(gradient))
-        gradient[0] = 0
-        moved = np.abs(gradient).max(1) > 0
-        self._taken[moved] += 1
-        first, second = MOMENTS
-        self._moments[0][moved] = first * self._moments[0][moved] + (1 - first) * gradient[moved]
-        self._moments[1][moved] = second * self._moments[1][moved] + (1 - second) * gradient[moved] ** 2
-        taken = np.maximum(self._taken, 1)[:, None]
-        mean, square = self._moments[0] / (1 - first**taken), self._moments[1] / (1 - second**taken)
-        begin_px, end_px = self._step_px
-        angle = begin_px * (end_px / begin_px) ** share / self._trainer.camera.intrinsics.fx
-        rates = angle * np.repeat([1.0, self._trainer.planner.depth], 3)
-        step = np.where(moved[:, None], -rates * mean / (np.sqrt(square) + 1e-30), 0)
+    def _descend(self, path: Spline, model: "PoseModel", share: float) -> Spline:
+        knots = len(path.centres)
+        if len(self._slope) != knots:
+            self._slope, self._curvature = np.zeros((knots, 6)), np.zeros((knots, 6, 6))
+        moved = np.abs(model.slope).max(1) > 0
+        moved[first_view_knot(self._trainer, path)] = False
+        for mean, new in ((self._slope, model.slope), (self._curvature, model.curvature)):
+            mean[moved] = AVERAGED * mean[moved] + (1 - AVERAGED) * new[moved]
+        begin, end = STEP_SHARES
+        step = np.zeros((knots, 6))
+        curved = self._curvature[moved]
+        damping = CURVATURE_DAMPING * np.einsum("kii->ki", curved) + 1e-9 * np.trace(curved, axis1=1, axis2=2)[:, None]
+        curved = curved + (damping + np.finfo(float).tiny)[:, :, None] * np.eye(6)
+        step[moved] = -begin * (end / begin) ** share * np.linalg.solve(curved, self._slope[moved, :, None])[..., 0]
         return path.move(step[:, :3], step[:, 3:])
 
 
-def _add_by_knots(made: ViewRender, slope: Image, path: Spline, knots: Array) -> None:
-    """Add the gradient by the knots, [knots, 6], for one by the image that was rendered last."""
-    gradients = made.level.rasteriser.backward(slope if made.factor is None else slope * made.factor)
-    first, weights = path.locate(np.clip(made.request.times, path.begin, path.end))
-    poses = np.concatenate([gradients.rotation, gradients.centre], 1)
-    at = first[:, None] + np.arange(weights.shape[1])
-    np.add.at(knots, at, weights[..., None] * poses[:, None])
+def first_view_knot(trainer: MapTrainer, path: Spline) -> int:
+    """The knot nearest to the first view on the path: what stays, as the frame of a map is that of its first view."""
+    first, weights = path.locate([trainer.views[trainer.views.mappable(path)[0]].time])
+    return int(first[0] + np.argmax(weights[0]))
+
+
+@dataclass
+class PoseModel:
+    """A quadratic model of the loss of a view by the knots of a path: rotation vector on the left, then centre."""
+
+    slope: Array
+    """Gradient [knots, 6]."""
+    curvature: Array
+    """[knots, 6, 6], Gauss-Newton; what couples two knots is added to both."""
+    loss: float = 0.0
+
+    @classmethod
+    def of(cls, path: Spline) -> "PoseModel":
+        """Without a view."""
+        knots = len(path.centres)
+        return cls(np.zeros((knots, 6)), np.zeros((knots, 6, 6)))
+
+    def add(self, made: ViewRender, slope: Image, trainer: MapTrainer, path: Spline, time: float, factor: int) -> None:
+        """Add the view at `time` that was rendered last, for a `slope` by its image; `factor` multiplies its
+        curvature."""
+        gradients = made.level.rasteriser.backward(slope if made.factor is None else slope * made.factor)
+        first, weights = path.locate(np.clip(made.request.times, path.begin, path.end))
+        poses = np.concatenate([gradients.rotation, gradients.centre], 1)
+        at = first[:, None] + np.arange(weights.shape[1])
+        np.add.at(self.slope, at, weights[..., None] * poses[:, None])
+        shares = np.zeros(len(self.slope))
+        np.add.at(shares, at, weights / len(weights))
+        rotations, centres = path.poses([time])
+        curved = pose_curvature(made.image, made.level, trainer.mapper.white, rotations[0], centres[0])
+        self.curvature += factor * shares[:, None, None] * curved

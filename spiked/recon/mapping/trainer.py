@@ -18,6 +18,7 @@ from spiked.recon.mapping.render_requests import RenderPlanner, RenderRequest
 from spiked.recon.mapping.seeding import SweptView
 from spiked.recon.view_store import ViewStore
 from spiked.render import Camera
+from spiked.render.splats import RenderedImage
 from spiked.sensor import LEAST_DEPTH, Image, Intrinsics, Response, Sensor
 from spiked.spline import Path, Waypoints
 from spiked.undistortion import Undistortion, widest_undistortion
@@ -40,6 +41,7 @@ class ViewRender:
     request: RenderRequest
     """With the times of its sub-frames."""
     target: Target
+    image: RenderedImage
     expected: Image
     """Rates of the size of the level, with the gains of the pixels."""
     factor: Image | None
@@ -226,7 +228,7 @@ class MapTrainer:
         if level.factor == 1 and self.options.nuisances:
             factor = self.mapper.nuisances.factor(view_id)
             image = replace(image, values=image.values * factor)
-        return ViewRender(level, request, target, image.values, factor)
+        return ViewRender(level, request, target, image, image.values, factor)
 
     def compare(self, path: Path, view_id: int) -> Comparison:
         """A view compared with its render, by the loss of the map."""

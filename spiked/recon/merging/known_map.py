@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.evaluate import Similarity
+from spiked.harmonics import rotated_harmonics
 from spiked.pose import Array, quaternion
 from spiked.render import Camera
 from spiked.scene import Scene
@@ -51,7 +52,8 @@ class KnownMap:
 def brightened(scene: Scene, brightness: float) -> Scene:
     """A scene with its radiance multiplied by `brightness`."""
     white = None if scene.white is None else scene.white * brightness
-    return replace(scene, colours=scene.colours * np.float32(brightness), white=white)
+    harmonics = None if scene.harmonics is None else scene.harmonics * np.float32(brightness)
+    return replace(scene, colours=scene.colours * np.float32(brightness), white=white, harmonics=harmonics)
 
 
 def moved_path(path: Trajectory, similarity: Similarity) -> Trajectory:
@@ -69,6 +71,7 @@ def moved_scene(scene: Scene, similarity: Similarity, brightness: float = 1.0) -
         scene.opacity_logits.copy(),
         scene.colours,
         scene.white,
+        None if scene.harmonics is None else rotated_harmonics(scene.harmonics, similarity.rotation),
     )
     return brightened(moved, brightness)
 

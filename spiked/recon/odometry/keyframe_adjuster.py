@@ -6,7 +6,7 @@ run on another thread. The path is interpolated between the views, see `SparseMa
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from spiked.recon.odometry.background import Background
 from spiked.recon.odometry.initialisation import SCALE_PX
 from spiked.recon.odometry.loop_closure import LoopClosure, LoopSearch, find_closures, spread_drift
 from spiked.recon.odometry.pnp import fit_pose
+from spiked.recon.odometry.self_calibration import estimates, find_distortion
 from spiked.recon.odometry.sparse_map import MapBundle, Pose, SparseMap, TrackedView
 from spiked.recon.statistics import evenly
 from spiked.sensor import LEAST_DEPTH
@@ -57,6 +58,10 @@ FINAL_SCALE_PX = 0.1
 where their surroundings lie at several depths (decision 15)."""
 WINDOW_ITERATIONS, LOOP_ITERATIONS, FINAL_ITERATIONS = 4, 4, 12
 """Most iterations of an adjustment in the window, after a loop and at the end."""
+LENS_KEYFRAMES = 120
+"""Newest keyframes in which a distortion is looked for that nobody stated: 480 px of image motion."""
+LENS_GROWTH = 1.5
+"""Factor of the number of keyframes from one look to the next."""
 MOST_LOG_SCALE = 0.3
 """Largest change of a point's depth, as a logarithm, that counts where the change of scale is measured."""
 FINAL_ROUNDS = 3
@@ -95,6 +100,8 @@ class KeyframeAdjuster:
     """Adjustment of all keyframes that runs."""
     _whole_due: float = 0.0
     """Number of keyframes at which its result is taken; without one, from which the next may begin."""
+    _looked: int = 0
+    """Number of keyframes when a distortion was last looked for."""
     _open: bool = False
     """Loops were closed since the last adjustment of all keyframes."""
     _loop_rounds: int = 0
@@ -143,7 +150,35 @@ class KeyframeAdjuster:
         fixed = np.array([view.id < first_free for view in made.views])
         made.bundle.optimise(WINDOW_ITERATIONS, SCALE_PX, fixed, TOLERANCE)
         self._take(made, self.map.views[first:])
+        if len(self.keyframes) >= max(LENS_KEYFRAMES, LENS_GROWTH * self._looked):
+            self._look_for_distortion()
         self._adjust_whole_if_due()
+
+    def _look_for_distortion(self) -> None:
+        """Let the lens be estimated from now on if the newest keyframes show one that nobody stated.
+
+        They and the views after them follow at once, the path before them with the next adjustment of all keyframes.
+        """
+        self._looked = len(self.keyframes)
+        if self.map.lens_known or self.map.lens is not None or self._distorted() is None:
+            return
+        self._take_whole(now=True)
+        if (made := self._distorted()) is None:
+            return
+        _, self.map.lens = estimates(made.bundle)
+        self.map.take_optics(made.bundle)
+        self._take(made, self.map.views[made.views[0].id :])
+        self._open, self._whole_due = True, 0.0
+
+    def _distorted(self) -> MapBundle | None:
+        """The newest keyframes, adjusted with the distortion that they show; None if they show none."""
+        recent = [view for view in self.keyframes[-LENS_KEYFRAMES:] if view.pose is not None]
+        if len(recent) <= FIXED_KEYFRAMES or (made := self.map.bundle(recent)) is None:
+            return None
+        made.bundle.free = self.map.free_optics
+        made.bundle.optimise(WINDOW_ITERATIONS, SCALE_PX, None, TOLERANCE)
+        found = find_distortion(made.bundle)
+        return None if found is None else replace(made, bundle=found)
 
     def close_loops(self, view: TrackedView) -> list[LoopClosure]:
         """Search the newest view, whose image is kept, for places seen before, and close the loops that are certain."""
@@ -215,6 +250,8 @@ class KeyframeAdjuster:
         if self._whole is not None and stop():
             self._whole.stop()
         self._take_whole(now=True)
+        if len(self.keyframes) > self._looked and not stop():
+            self._look_for_distortion()
         while self._loop_rounds < LOOP_ROUNDS and not stop():
             found = find_closures(self.map, self.pictures, self.loops.index)
             closures = spread_drift(self.map, found)

@@ -61,12 +61,13 @@ class PoseTracker:
         self._extend_map(view, fit)
 
     def template_warps(self, time: float) -> NDArray[np.float32]:
-        """See `template_warps`, for a view at `time` frames on a long path.
+        """See `template_warps`, for a view at `time` frames on a long path, or through a lens that bends.
 
-        None on a short one, and where the pose cannot be predicted: while lost, and after a gap.
+        None elsewhere, where they do harm, and where the pose cannot be predicted: while lost, and after a gap.
         """
         newest = self.map.views[-1] if self.map.views else None
-        if self.adjuster.newest_keyframe is None or newest is None or newest.pose is None:
+        wanted = self.adjuster.newest_keyframe is not None or self.map.intrinsics.distortion is not None
+        if not wanted or newest is None or newest.pose is None:
             return NO_WARPS
         if time - newest.time > PREDICTED_LENGTHS * newest.length:
             return NO_WARPS

@@ -1,6 +1,6 @@
 """A camera's per-pixel gain, dark rate and defects, from a recording in the dark and one of an even light."""
 
-import zipfile
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from spiked.blocks import aligned_window
 from spiked.errors import CalibrationError
+from spiked.numpy_files import UNREADABLE, read_npz
 from spiked.recording import Recording
 from spiked.sensor import Image, Response, Sensor
 
@@ -29,6 +30,9 @@ BRIGHTEST = {Response.INTEGRATE_AND_FIRE: 0.95, Response.BERNOULLI: 3.0}
 """Largest median rate of an even light: above it pixels fire in nearly every frame."""
 GAIN_LIMITS = (0.2, 4.0)
 """Pixels whose gain relative to the median lies outside are dead, or stuck."""
+
+_MOST_BYTES = 1 << 28
+"""Of an array in a file: float32 of 8192x8192 pixels."""
 
 
 @dataclass(frozen=True)
@@ -89,10 +93,20 @@ class Calibration:
         return light.astype(np.float32), spread.astype(np.float32)
 
     def write(self, path: Path) -> None:
-        """As a NumPy archive (.npz) with `gain`, `dark` (float32) and `dead` (bool). Raises CalibrationError."""
+        """As a NumPy archive (.npz) with `gain`, `dark` (float32) and `dead` (bool).
+
+        After an error the file before is whole. Raises CalibrationError.
+        """
+        part = path.with_name(f".{path.name}.part")
         try:
-            with path.open("wb") as file:
-                np.savez_compressed(file, gain=self.gain, dark=self.dark, dead=self.dead)
+            try:
+                with part.open("wb") as file:
+                    np.savez_compressed(file, gain=self.gain, dark=self.dark, dead=self.dead)
+                    file.flush()
+                    os.fsync(file.fileno())
+                part.replace(path)
+            finally:
+                part.unlink(missing_ok=True)
         except OSError as error:
             raise CalibrationError(f"cannot write {path}: {error.strerror}; choose another place") from error
 
@@ -100,15 +114,14 @@ class Calibration:
     def read(cls, path: Path) -> "Calibration":
         """Raises CalibrationError if the file is missing or not a calibration."""
         try:
-            with np.load(path, allow_pickle=False) as archive:
-                gain, dark, dead = (archive[name] for name in ("gain", "dark", "dead"))
+            gain, dark, dead = read_npz(path, ("gain", "dark", "dead"), _MOST_BYTES)
+            return cls(gain.astype(np.float32), dark.astype(np.float32), dead.astype(bool))
         except OSError as error:
             raise CalibrationError(f"cannot read the calibration {path}: {error.strerror or error}") from error
-        except (KeyError, ValueError, AttributeError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        except UNREADABLE as error:
             raise CalibrationError(
                 f"{path} is not a calibration: it must be an .npz of `spiked calibrate` with gain, dark and dead"
             ) from error
-        return cls(gain.astype(np.float32), dark.astype(np.float32), dead.astype(bool))
 
     @classmethod
     def measure(

@@ -1,20 +1,29 @@
 """A scene of Gaussians, and the PLY file with the fields that 3D Gaussian splatting tools expect."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.errors import SceneError
+from spiked.errors import ConfigurationError, SceneError
+from spiked.harmonics import COEFFICIENTS, degree_of, harmonic_basis
+from spiked.ply_header import ply_header
 
-__all__ = ["Scene"]
+if TYPE_CHECKING:
+    from torch import Tensor
+
+__all__ = ["Scene", "unit_quats"]
 
 Array = NDArray[np.float32]
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+
+_ARRAYS = "means", "quats", "log_scales", "opacity_logits", "colours"
+"""Names of `Scene.arrays`."""
 
 _KINDS = {
     "char": "i1", "uchar": "u1", "int8": "i1", "uint8": "u1", "short": "<i2", "ushort": "<u2", "int16": "<i2",
@@ -40,6 +49,10 @@ class Scene:
     white: float | None = None
     """Radiance that is shown as white. None: the colours are those of a display, 1 is white, and their radiance is not
     known; so it is in a PLY that other programs wrote."""
+    harmonics: Array | None = None
+    """Radiance by direction, in the unit of `colours`: coefficients of spherical harmonics beyond the constant one,
+    [N, K, C] with K = 3, 8 or 15 (`spiked.harmonics`). Scenes of other programs have them; rasterisers ignore them, see
+    `seen_from`."""
 
     def __len__(self) -> int:
         return len(self.means)
@@ -59,14 +72,81 @@ class Scene:
         """The five arrays in the order of the fields."""
         return self.means, self.quats, self.log_scales, self.opacity_logits, self.colours
 
+    @property
+    def opacities(self) -> NDArray[np.float64]:
+        """From 0 to 1, [N]."""
+        return np.asarray(1 / (1 + np.exp(-self.opacity_logits.astype(np.float64))))
+
+    @property
+    def well_formed(self) -> bool:
+        """Whether the arrays have the shapes of the fields."""
+        means, quats, log_scales, opacity_logits, colours = (array.shape for array in self.arrays())
+        n = len(self)
+        return (means, quats, log_scales, opacity_logits) == ((n, 3), (n, 4), (n, 3), (n,)) and colours in (
+            (n, 1),
+            (n, 3),
+        )
+
+    def to_torch(self) -> "dict[str, Tensor]":
+        """Copies of the five arrays as float32 tensors on the CPU, by the names of the fields, for
+        `spiked.render.torch.render`. Raises ConfigurationError without torch (extra `spiked[torch]`)."""
+        try:
+            import torch
+        except ImportError as error:
+            raise ConfigurationError("torch is not installed: pip install 'spiked[torch]'") from error
+        return {name: torch.tensor(array) for name, array in zip(_ARRAYS, self.arrays(), strict=True)}
+
+    @classmethod
+    def from_torch(cls, tensors: "Mapping[str, Tensor]", white: float | None = None) -> "Scene":
+        """The scene of tensors as `to_torch` gives them, of any type and device. Raises SceneError for others."""
+        missing = [name for name in _ARRAYS if name not in tensors]
+        if missing:
+            raise SceneError(f"a scene needs the tensors {', '.join(_ARRAYS)}: {', '.join(missing)} not given")
+        scene = _scene(
+            (np.array(tensors[name].detach().cpu().numpy(), np.float32, order="C") for name in _ARRAYS), white
+        )
+        if not scene.well_formed:
+            shapes = ", ".join(str(array.shape) for array in scene.arrays())
+            raise SceneError(f"tensors of shapes {shapes} are no scene: see spiked.scene.Scene")
+        if not all(np.isfinite(array).all() for array in scene.arrays()):
+            raise SceneError("the tensors hold values that are not finite")
+        return scene
+
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "Scene":
         """The Gaussians at `rows`, copied."""
-        return _scene((np.ascontiguousarray(array[rows]) for array in self.arrays()), self.white)
+        some = _scene((np.ascontiguousarray(array[rows]) for array in self.arrays()), self.white)
+        return some if self.harmonics is None else replace(some, harmonics=self.harmonics[rows])
 
     def join(self, other: "Scene") -> "Scene":
-        """These Gaussians followed by those of `other`."""
+        """These Gaussians followed by those of `other`; where one scene has harmonics, the other's are 0."""
         pairs = zip(self.arrays(), other.arrays(), strict=True)
-        return _scene((np.concatenate(pair) for pair in pairs), self.white)
+        both = _scene((np.concatenate(pair) for pair in pairs), self.white)
+        count = COEFFICIENTS[max(self.degree, other.degree)]
+        if not count:
+            return both
+        return replace(both, harmonics=np.concatenate([one.filled_harmonics(count) for one in (self, other)]))
+
+    @property
+    def degree(self) -> int:
+        """Degree of the harmonics, 0 to 3."""
+        return degree_of(self.harmonics)
+
+    def filled_harmonics(self, count: int) -> Array:
+        """The first `count` coefficients, [N, count, C]; 0 where there are fewer."""
+        filled = np.zeros((len(self), count, self.colours.shape[1]), np.float32)
+        if self.harmonics is not None:
+            filled[:, : self.harmonics.shape[1]] = self.harmonics[:, :count]
+        return filled
+
+    def seen_from(self, centre: NDArray[np.float64]) -> "Scene":
+        """The scene with the colours that a camera at `centre` [3] sees, without harmonics; itself if it has none."""
+        if self.harmonics is None:
+            return self
+        directions = self.means.astype(np.float64) - centre
+        directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+        basis = harmonic_basis(directions)[:, : self.harmonics.shape[1]].astype(np.float32)
+        colours = self.colours + np.einsum("nk,nkc->nc", basis, self.harmonics)
+        return replace(self, colours=np.maximum(colours, 0).astype(np.float32), harmonics=None)
 
     def write_ply(self, path: Path | str, white: float | None = None) -> None:
         """Write a binary PLY with the standard 3DGS fields; see `ply`."""
@@ -76,15 +156,17 @@ class Scene:
         """The bytes of the PLY file; radiance `white`, the scene's own if None, becomes colour 1 and is noted in it."""
         white = self.white if white is None else white
         rgb = np.broadcast_to(self.colours, (len(self), 3)) / (white or 1)
-        names = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+        rest = self.filled_harmonics(COEFFICIENTS[self.degree]) / (white or 1)
+        rest = np.broadcast_to(rest, (*rest.shape[:2], 3)).swapaxes(1, 2).reshape(len(self), 3 * rest.shape[1])
+        names = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+        names += [*(f"f_rest_{number}" for number in range(rest.shape[1])), "opacity"]
         names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-        head = ["ply", "format binary_little_endian 1.0"]
-        head += [] if white is None else [f"comment radiance {white!r} spikes per frame is colour 1"]
-        head += [f"element vertex {len(self)}", *(f"property float {name}" for name in names), "end_header\n"]
+        comments = [] if white is None else [f"radiance {white!r} spikes per frame is colour 1"]
+        head = ply_header([("vertex", len(self), [f"float {name}" for name in names])], comments)
         quats = self.quats / np.maximum(np.linalg.norm(self.quats, axis=1, keepdims=True), 1e-12)
-        columns = [self.means, np.zeros_like(self.means), (rgb - 0.5) / SH_C0, self.opacity_logits[:, None]]
+        columns = [self.means, np.zeros_like(self.means), (rgb - 0.5) / SH_C0, rest, self.opacity_logits[:, None]]
         body = np.concatenate([*columns, self.log_scales, quats], 1).astype("<f4")
-        return "\n".join(head).encode() + body.tobytes()
+        return head + body.tobytes()
 
     def sample(self, count: int) -> "Scene":
         """At most `count` Gaussians in their order: a fixed sample, which stays much the same while the scene grows."""
@@ -96,8 +178,8 @@ class Scene:
 
     @classmethod
     def read_ply(cls, path: Path | str) -> "Scene":
-        """Read a 3DGS PLY. View-dependent colour (f_rest) is left out; a `radiance` comment written by us is undone and
-        kept as `white`; equal red, green and blue read as one channel.
+        """Read a 3DGS PLY. View-dependent colour (f_rest) becomes `harmonics`; a `radiance` comment written by us is
+        undone and kept as `white`; equal red, green and blue read as one channel.
 
         Raises SceneError for anything that is not such a file.
         """
@@ -115,7 +197,12 @@ class Scene:
             return np.stack([table[field] for field in fields], 1).astype(np.float32)
 
         rgb = (0.5 + SH_C0 * pick("f_dc_0", "f_dc_1", "f_dc_2")) * np.float32(white or 1)
-        grey = len(rgb) == 0 or bool(np.all(rgb == rgb[:, :1]))
+        harmonics = None
+        if rest := _rest_fields([name for name, _ in names], path):
+            harmonics = pick(*rest).reshape(count, 3, -1).swapaxes(1, 2) * np.float32(white or 1)
+        grey = bool(np.all(rgb == rgb[:, :1])) and (harmonics is None or bool(np.all(harmonics == harmonics[..., :1])))
+        if grey and harmonics is not None:
+            harmonics = harmonics[..., :1]
         scene = cls(
             pick("x", "y", "z"),
             pick("rot_0", "rot_1", "rot_2", "rot_3"),
@@ -123,10 +210,20 @@ class Scene:
             pick("opacity")[:, 0].copy(),
             np.ascontiguousarray(rgb[:, :1] if grey else rgb),
             white,
+            None if harmonics is None else np.ascontiguousarray(harmonics),
         )
-        if not all(np.isfinite(array).all() for array in scene.arrays()):
+        if not all(
+            np.isfinite(array).all()
+            for array in (*scene.arrays(), scene.harmonics if scene.harmonics is not None else scene.means)
+        ):
             raise SceneError(f"{path} holds values that are not finite")
         return scene
+
+
+def unit_quats(quats: Array) -> NDArray[np.float64]:
+    """Quaternions [N, 4] of length 1; zero ones count as no rotation, 1, 0, 0, 0."""
+    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+    return np.where(lengths > 0, quats / np.maximum(lengths, 1e-30), [1.0, 0.0, 0.0, 0.0]).astype(np.float64)
 
 
 def _scene(arrays: Iterable[Array], white: float | None) -> Scene:
@@ -163,6 +260,14 @@ def _parse_header(raw: bytes, path: Path | str) -> tuple[list[tuple[str, str]], 
     if len(raw) - start < need:
         raise SceneError(f"{path} is cut short: {count} Gaussians need {need} bytes, {len(raw) - start} are there")
     return names, count, white, start
+
+
+def _rest_fields(names: list[str], path: Path | str) -> list[str]:
+    """The fields of view-dependent colour in their order, channel by channel. Raises SceneError for another number."""
+    count = sum(name.startswith("f_rest_") for name in names)
+    if count % 3 or count // 3 not in COEFFICIENTS:
+        raise SceneError(f"{path} has {count} fields f_rest_*, and 9, 24 or 45 make degrees 1, 2 and 3")
+    return [f"f_rest_{number}" for number in range(count)]
 
 
 def _radiance(text: str, path: Path | str) -> float:

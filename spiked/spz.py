@@ -7,8 +7,8 @@ forward): positions and rotations are turned by 180 degrees about x, which is it
 What is stored is rounded, and no further from the scene than these bounds (`tests/test_spz.py` holds them):
 positions `position_step(scene) / 2`; opacities 1/510; logarithms of scales 1/32, and only -10 to 5.94 can be stored;
 colours 0.5 / 255 / 0.15 * C0 = 0.0037 of white, and only -0.44 to 1.44 of white can be stored; rotations 0.3 degrees
-(version 3), or 0.8 degrees divided by the cosine of half their angle (version 2). View-dependent colour is left out on
-reading; we write none.
+(version 3), or 0.8 degrees divided by the cosine of half their angle (version 2); coefficients of view-dependent colour
+1/256 of white, and only -1 to 0.99 of white can be stored.
 """
 
 import gzip
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.errors import SceneError
+from spiked.harmonics import COEFFICIENTS, rotated_harmonics
 from spiked.scene import SH_C0, Array, Scene
 
 __all__ = ["SpzVersion", "decode", "encode", "fractional_bits", "position_step"]
@@ -41,6 +42,10 @@ _SQRT_HALF = np.float32(np.sqrt(0.5))
 _TO_RUB = np.array([1, -1, -1], np.float32)
 _SH_COEFFICIENTS = (0, 3, 8, 15, 24)
 """Beyond the constant one, by degree."""
+_HARMONIC_STEPS = 128
+"""Steps of a byte for a coefficient of 1."""
+_HALF_TURN = np.diag([1.0, -1.0, -1.0])
+"""Between RDF and RUB axes."""
 MAX_POINTS = 10_000_000
 """As in Niantic's own reader."""
 
@@ -73,18 +78,18 @@ def encode(scene: Scene, white: float = 1.0, version: SpzVersion = SpzVersion.V3
     if len(scene) > MAX_POINTS:
         raise SceneError(f"{len(scene)} Gaussians are more than the {MAX_POINTS} of an SPZ file; use PLY")
     bits = fractional_bits(scene.means)
-    header = _HEADER.pack(_MAGIC, version, len(scene), 0, bits, 0, 0)
+    header = _HEADER.pack(_MAGIC, version, len(scene), scene.degree, bits, 0, 0)
     coordinates = np.round((scene.means * _TO_RUB).astype(np.float64) * 2.0**bits).astype("<i4")
     positions = coordinates.reshape(-1, 1).view(np.uint8)[:, :3]
-    opacity = 1 / (1 + np.exp(-scene.opacity_logits.astype(np.float64)))
     dc = (np.broadcast_to(scene.colours, (len(scene), 3)) / white - 0.5) / SH_C0
     quats = _turned(scene.quats / np.maximum(np.linalg.norm(scene.quats, axis=1, keepdims=True), 1e-12))
     parts = [
         positions,
-        _bytes(opacity * 255),
+        _bytes(scene.opacities * 255),
         _bytes((dc * _COLOUR_SCALE + 0.5) * 255),
         _bytes((scene.log_scales + 10) * 16),
         _first_three(quats) if version is SpzVersion.V2 else _smallest_three(quats),
+        _bytes(_harmonics(scene) / white * _HARMONIC_STEPS + _HARMONIC_STEPS),
     ]
     # Level 6 of zlib is within 1 % of the size of level 9 for these bytes, and several times as fast.
     return gzip.compress(header + b"".join(part.tobytes() for part in parts), compresslevel=6, mtime=0)
@@ -97,14 +102,14 @@ def decode(raw: bytes, white: float = 1.0) -> Scene:
     Raises SceneError for anything that is no such file, one cut short, and one that grows beyond what its header says.
     """
     header, body = _inflate(raw)
-    magic, version, count, _, bits, _, _ = header
+    magic, version, count, degree, bits, _, _ = header
     if magic != _MAGIC:
         raise SceneError("this is a gzip file, but not an SPZ scene: its first bytes are not NGSP")
     if version not in tuple(SpzVersion):
         raise SceneError(f"this SPZ is of version {version}; versions 2 and 3 are read")
-    widths = (9, 1, 3, 3, 3 if version == SpzVersion.V2 else 4)
+    widths = (9, 1, 3, 3, 3 if version == SpzVersion.V2 else 4, 3 * _SH_COEFFICIENTS[degree])
     ends = np.cumsum([0, *(count * width for width in widths)])
-    means, alphas, colours, scales, rotations = (
+    means, alphas, colours, scales, rotations, rest = (
         np.frombuffer(body, np.uint8, count * width, int(start)).reshape(count, width)
         for width, start in zip(widths, ends[:-1], strict=True)
     )
@@ -114,13 +119,18 @@ def decode(raw: bytes, white: float = 1.0) -> Scene:
     opacity = np.clip(alphas[:, 0] / 255, 1 / 510, 1 - 1 / 510)  # 0 and 1 have no finite logit: half a step inside
     rgb = (0.5 + SH_C0 * (colours / np.float32(255) - 0.5) / _COLOUR_SCALE) * white
     quats = _from_first_three(rotations) if version == SpzVersion.V2 else _from_smallest_three(rotations)
-    grey = count == 0 or bool(np.all(rgb == rgb[:, :1]))
+    kept = COEFFICIENTS[min(degree, len(COEFFICIENTS) - 1)]  # a fourth degree is left out
+    steps = rest.reshape(count, _SH_COEFFICIENTS[degree], 3)[:, :kept]
+    harmonics = np.asarray((steps / np.float32(_HARMONIC_STEPS) - 1) * white, np.float32)
+    grey = bool(np.all(rgb == rgb[:, :1])) and bool(np.all(steps == steps[..., :1]))
+    harmonics = rotated_harmonics(harmonics[..., :1] if grey else harmonics, _HALF_TURN)
     return Scene(
         (coordinates.reshape(count, 3) * 2.0**-bits).astype(np.float32) * _TO_RUB,
         _turned(quats),
         (scales / np.float32(16) - np.float32(10)).astype(np.float32),
         np.log(opacity / (1 - opacity)).astype(np.float32),
         np.ascontiguousarray(rgb[:, :1] if grey else rgb, np.float32),
+        harmonics=harmonics if kept else None,
     )
 
 
@@ -144,6 +154,14 @@ def _inflate(raw: bytes) -> tuple[tuple[int, ...], bytes]:
     if len(body) < need:
         raise SceneError(f"this SPZ is cut short: {count} Gaussians need {need} bytes, {len(body)} are there")
     return header, body
+
+
+def _harmonics(scene: Scene) -> NDArray[np.floating]:
+    """Coefficients in RUB axes, of three channels, [N, 3 K]."""
+    if scene.harmonics is None:
+        return np.zeros((len(scene), 0), np.float32)
+    turned = rotated_harmonics(scene.harmonics, _HALF_TURN)
+    return np.broadcast_to(turned, (*turned.shape[:2], 3)).reshape(len(scene), -1)
 
 
 def _bytes(values: NDArray[np.floating]) -> Bytes:

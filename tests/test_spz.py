@@ -123,7 +123,7 @@ def test_a_sample_is_fixed_and_spread_evenly() -> None:
     assert scene.sample(20_000) is scene
 
 
-def _splat_transform() -> list[str]:
+def splat_transform() -> list[str]:
     """@playcanvas/splat-transform: as named in SPIKED_SPLAT_TRANSFORM, installed in web/, or on the path."""
     named = os.environ.get("SPIKED_SPLAT_TRANSFORM")
     local = Path(__file__).parents[1] / "web" / "node_modules" / ".bin" / "splat-transform"
@@ -135,7 +135,7 @@ def _splat_transform() -> list[str]:
 
 @pytest.mark.parametrize("version", list(SpzVersion))
 def test_splat_transform_reads_the_same_scene_from_our_spz_as_from_our_ply(version: SpzVersion, tmp_path: Path) -> None:
-    command = _splat_transform()
+    command = splat_transform()
     scene = random_scene(300)
     (tmp_path / "ours.spz").write_bytes(encode(scene, WHITE, version))
     subprocess.run([*command, str(tmp_path / "ours.spz"), str(tmp_path / "theirs.ply")], check=True, timeout=60)

@@ -38,6 +38,8 @@ class ColmapTask(BaseModel):
     parameters: list[float]
     threads: int
     seed: int
+    parent: int
+    """Process that asks; the one that is asked ends with it."""
 
 
 class ColmapPoses(BaseModel):
@@ -86,7 +88,9 @@ def run_colmap(
     model, lens = colmap_lens(intrinsics.distortion)
     parameters = [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, *lens.values()]
     threads = threads or len(os.sched_getaffinity(0))
-    task = ColmapTask(folder=folder.absolute(), model=model, parameters=parameters, threads=threads, seed=seed)
+    task = ColmapTask(
+        folder=folder.absolute(), model=model, parameters=parameters, threads=threads, seed=seed, parent=os.getpid()
+    )
     found = _in_a_process(task)
     if not found.names:
         raise SceneError(

@@ -11,6 +11,7 @@ from typing import Any
 import pycolmap
 
 from spiked.baselines.colmap import ColmapPoses, ColmapTask
+from spiked.lifetime import end_with
 
 EXHAUSTIVE_PICTURES = 80
 """Up to this many pictures every pair is matched; of more, each with its neighbours."""
@@ -23,6 +24,7 @@ TRIANGULATION_DEG = (16.0, 8.0, 4.0, 2.0)
 def main() -> None:
     """Carry out the task of the command line."""
     task = ColmapTask.model_validate_json(sys.argv[1])
+    end_with(task.parent)
     pycolmap.logging.minloglevel = 2  # errors
     pycolmap.set_random_seed(task.seed)
     database = task.folder / "database.db"

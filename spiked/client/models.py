@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, Any, Literal
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, StringConstraints
 
 
 class ArmRequest(BaseModel):
@@ -29,6 +29,18 @@ class BitOrder(StrEnum):
 
     lsb = "lsb"
     msb = "msb"
+
+
+class BoxModel(BaseModel):
+    """
+    A box along the axes of the scene, in its unit.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    low: list[float]
+    high: list[float]
 
 
 class CalibrationOut(BaseModel):
@@ -116,6 +128,8 @@ class CaptureChange(BaseModel):
     name: str | None = None
     notes: str | None = None
     keep: Annotated[bool | None, Field(description="Retention leaves it alone.")] = None
+    tags: list[str] | None = None
+    metadata: dict[Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.:/-]{1,64}$")], str] | None = None
 
 
 class CaptureState(StrEnum):
@@ -129,6 +143,26 @@ class CaptureState(StrEnum):
     finishing = "finishing"
     complete = "complete"
     failed = "failed"
+
+
+class CleanRequest(BaseModel):
+    """
+    What is removed.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    version: Annotated[
+        int,
+        Field(description="The newest version, which is edited; 409 if there is another."),
+    ]
+    box: Annotated[BoxModel | None, Field(description="Splats outside are removed.")] = None
+    floaters: Annotated[bool, Field(description="Remove splats that few views see.")] = True
+    shrink: Annotated[
+        bool,
+        Field(description="With floaters: also make splats smaller that are larger than a quarter of the scene."),
+    ] = False
 
 
 class ClockPair(BaseModel):
@@ -186,6 +220,51 @@ class DiskOut(BaseModel):
     recording_of: Annotated[str, Field(description="That camera.")]
 
 
+class EditedOut(BaseModel):
+    """
+    The version that was published, and what was done.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    version: int
+    splats: int
+    outside: Annotated[int, Field(description="Splats that lay outside the box.")]
+    floaters: Annotated[int, Field(description="Splats that were removed as floaters.")]
+    shrunk: Annotated[int, Field(description="Splats that were made smaller.")]
+
+
+class ExportFormatOut(BaseModel):
+    """
+    A format that results are exported in.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    name: str
+    title: Annotated[str, Field(description="What is written.")]
+    readers: Annotated[str, Field(description="Programs that read it.")]
+    loses: Annotated[str, Field(description="What of the reconstruction is not in it.")]
+    suffix: Annotated[str, Field(description="Of the file that is sent.")]
+    missing: Annotated[
+        str,
+        Field(description="How to install what the format needs; empty if nothing is missing."),
+    ]
+
+
+class ExportFormatsOut(BaseModel):
+    """
+    All formats, in the order in which they are listed.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    formats: list[ExportFormatOut]
+
+
 class FisheyeLens(BaseModel):
     """
     Distortion by OpenCV's fisheye model.
@@ -212,6 +291,21 @@ class Form(StrEnum):
     pcie = "pcie"
     array = "array"
     bits = "bits"
+
+
+class FoundTagOut(BaseModel):
+    """
+    A tag in the scene.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    tag: int
+    views: int
+    side: Annotated[float, Field(description="In the unit of the scene.")]
+    sigma: Annotated[float, Field(description="Relative standard deviation.")]
+    corners: Annotated[list[list[float]], Field(description="In the scene, [4, 3].")]
 
 
 class FrameRangeOut(BaseModel):
@@ -685,6 +779,44 @@ class Response(StrEnum):
     bernoulli = "bernoulli"
 
 
+class RevertRequest(BaseModel):
+    """
+    An earlier version to go back to.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    version: Annotated[
+        int,
+        Field(description="The newest version, which is edited; 409 if there is another."),
+    ]
+    to: Annotated[int, Field(description="A version that is kept; `GET versions` lists them.")]
+
+
+class ScaleRequest(BaseModel):
+    """
+    What is measured; what is left out stays as it is.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    revision: Annotated[int, Field(description="The one that this replaces; 409 if it is not.")]
+    metres_per_unit: float | None = None
+    sigma: Annotated[float | None, Field(description="Relative standard deviation, if known.")] = None
+    up: Annotated[list[float] | None, Field(description="Of any length but zero.")] = None
+
+
+class ScaleSource(StrEnum):
+    """
+    What a scale rests on.
+    """
+
+    length = "length"
+    tag = "tag"
+
+
 class SceneFormat(StrEnum):
     """
     How a scene is written.
@@ -838,6 +970,19 @@ class Status(StrEnum):
     ok = "ok"
     warning = "warning"
     problem = "problem"
+
+
+class TagScaleRequest(BaseModel):
+    """
+    AprilTags of known size.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    revision: Annotated[int, Field(description="The one that this replaces; 409 if it is not.")]
+    side_m: Annotated[float, Field(description="Side of the black square.")]
+    family: Annotated[str, Field(description="16h5, 25h9, 36h10 or 36h11.")] = "36h11"
 
 
 class Task(StrEnum):
@@ -1540,6 +1685,34 @@ class RestartRequest(BaseModel):
     options: ReconstructionOptions | None = None
 
 
+class ScaleOut(BaseModel):
+    """
+    Metres for the unit of length of a scene, and the direction of up; null where it is not known.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    revision: Annotated[
+        int,
+        Field(description="Counts the changes; 0: nothing is known. A change names the one it replaces."),
+    ]
+    metres_per_unit: float | None
+    sigma: Annotated[
+        float | None,
+        Field(description="Relative standard deviation of metres_per_unit; null: not known."),
+    ]
+    source: Annotated[
+        ScaleSource | None,
+        Field(description="What the scale rests on: a known length, or AprilTags."),
+    ]
+    up: Annotated[
+        list[float] | None,
+        Field(description="Direction in the scene, of length 1; null: -y is taken for up."),
+    ]
+    version: Annotated[int | None, Field(description="Version of the scene that it was measured in.")]
+
+
 class SensorOut(BaseModel):
     """
     The camera of a capture.
@@ -1623,6 +1796,18 @@ class SystemOut(BaseModel):
         Scope,
         Field(description="Scope of the token of this request; admin where no token is required."),
     ]
+
+
+class TagScaleOut(BaseModel):
+    """
+    The scale by tags.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    scale: ScaleOut
+    tags: list[FoundTagOut]
 
 
 class UploadProfile(BaseModel):
@@ -1735,6 +1920,8 @@ class CaptureOut(BaseModel):
     name: str
     notes: str
     keep: Annotated[bool, Field(description="Retention leaves it alone.")]
+    tags: Annotated[list[str], Field(description="Words to find it by.")]
+    metadata: Annotated[dict[str, str], Field(description="Values of other programs by key.")]
     origin: Annotated[
         Origin,
         Field(

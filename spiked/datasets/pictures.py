@@ -8,8 +8,9 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from spiked.datasets.clip import PictureScene
-from spiked.datasets.spikes import checked_picture, natural
+from spiked.datasets.spikes import checked_picture
 from spiked.errors import DatasetError
+from spiked.natural_order import natural
 from spiked.sensor import Intrinsics
 
 SCALE_TOLERANCE_PX = 2.0

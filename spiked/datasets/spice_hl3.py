@@ -16,8 +16,9 @@ from spiked.camera import MOST_SIDE
 from spiked.datasets.clip import Clip
 from spiked.datasets.kind import DatasetKind
 from spiked.datasets.pictures import picture_size
-from spiked.datasets.spikes import CHUNK_FRAMES, files_in, natural, truth_beside
+from spiked.datasets.spikes import CHUNK_FRAMES, files_in, truth_beside
 from spiked.errors import DatasetError
+from spiked.natural_order import natural
 from spiked.recording.geometry import DEFAULT_RATE_HZ
 from spiked.sensor import Response, Sensor
 
@@ -103,7 +104,7 @@ def _frames(path: Path) -> NDArray[np.uint8]:
 
 def _of_pictures(name: str, files: list[Path]) -> Clip:
     found = {path: match for path in files if (match := _PNG.fullmatch(path.stem))}
-    ordered = sorted(found, key=lambda path: (natural(Path(found[path][1])), int(found[path][2])))
+    ordered = sorted(found, key=lambda path: (natural(found[path][1]), int(found[path][2])))
     size = picture_size(ordered[0])
     if size[0] % 8 or max(size) > MOST_SIDE:
         raise DatasetError(f"{ordered[0]}: {size[0]}x{size[1]} pixels are no frame of the SPAD512S")

@@ -14,8 +14,9 @@ from spiked.datasets import colmap, transforms
 from spiked.datasets.clip import Clip, PictureScene, TrueView, Truth
 from spiked.datasets.colmap_model import find_model
 from spiked.datasets.kind import UNKNOWN, DatasetKind
-from spiked.datasets.spikes import files_in, natural, recorded_clip
+from spiked.datasets.spikes import files_in, recorded_clip
 from spiked.errors import DatasetError
+from spiked.natural_order import natural
 from spiked.recording import RecordingGeometry
 from spiked.recording.geometry import DEFAULT_RATE_HZ
 from spiked.sensor import Mosaic

@@ -1,7 +1,6 @@
 """Clips of the containers that several data sets share: `.dat` recordings, arrays, and runs of such files."""
 
 import os
-import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from spiked.datasets.clip import Clip, Truth
 from spiked.errors import DatasetError, RecordingError
+from spiked.natural_order import natural
 from spiked.recording import Recording, RecordingGeometry, open_recording
 from spiked.recording.arrays import open_array
 from spiked.recording.geometry import Assumable
@@ -21,12 +21,6 @@ CHUNK_FRAMES = 64
 """Frames read at a time."""
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 """Names of pictures end so, in lower case."""
-
-
-def natural(path: Path) -> tuple[tuple[int, int, str], ...]:
-    """A key that sorts names as people do: `frame2` before `frame10`."""
-    parts = re.findall(r"\d+|\D+", str(path))
-    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts)
 
 
 def files_in(folder: Path, *suffixes: str, deep: bool = False) -> list[Path]:

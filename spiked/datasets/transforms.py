@@ -9,8 +9,9 @@ import numpy as np
 from spiked.datasets.clip import PictureScene
 from spiked.datasets.kind import DatasetKind
 from spiked.datasets.pictures import make_scene, picture_size
-from spiked.datasets.spikes import PICTURE_SUFFIXES, inside, natural
+from spiked.datasets.spikes import PICTURE_SUFFIXES, inside
 from spiked.errors import DatasetError, SceneError
+from spiked.natural_order import natural
 from spiked.sensor import Intrinsics
 from spiked.transforms import Transforms
 

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from spiked.datasets.clip import Clip
 from spiked.datasets.kind import UNKNOWN, DatasetKind
 from spiked.datasets.pictures import picture_size
-from spiked.datasets.spikes import CHUNK_FRAMES, array_clip, files_in, natural, unreadable
+from spiked.datasets.spikes import CHUNK_FRAMES, array_clip, files_in, unreadable
 from spiked.errors import DatasetError
+from spiked.natural_order import natural
+from spiked.numpy_files import UNREADABLE
 from spiked.sensor import Response, Sensor
 
 RATE_HZ = 97_700.0
@@ -55,7 +57,7 @@ def _packed_width(path: Path) -> int | None:
     """Pixels of a row of a packed cube, so that a dark one is not taken for an array of 0 and 1."""
     try:
         stored = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except UNREADABLE as error:
         raise unreadable(path, error) from error
     if stored.ndim == 4:
         raise DatasetError(f"{path}: this cube has colours in a fourth axis, which is not read; save one of them")
@@ -134,7 +136,7 @@ def _read_mask(path: Path) -> NDArray[np.bool_]:
         return np.asarray(picture > 0)
     try:
         mask = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except UNREADABLE as error:
         raise unreadable(path, error) from error
     if mask.ndim != 2:
         raise DatasetError(f"{path}: this mask has the shape {list(mask.shape)}: masks are [rows, columns]")

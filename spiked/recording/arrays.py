@@ -5,10 +5,8 @@ Vidar files of widths that are no multiple of 8 have the bits of a frame one aft
 SpikeCV and Spike-Zoo).
 """
 
-import lzma
 import math
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -20,6 +18,7 @@ from numpy.typing import NDArray
 
 from spiked.camera import MOST_SIDE
 from spiked.errors import RecordingError
+from spiked.numpy_files import UNREADABLE, array_header
 from spiked.sensor import BitOrder
 
 __all__ = ["SpikeArray", "is_array", "open_array", "open_bits"]
@@ -32,17 +31,10 @@ BLOCK_FRAMES = 64
 """Frames that are converted at a time, at most."""
 BLOCK_BYTES = 16 << 20
 """Bytes of the container that are converted at a time, at most, but a frame."""
-_UNREADABLE = (
-    OSError,
-    ValueError,
-    EOFError,
-    OverflowError,
-    RuntimeError,
-    zipfile.BadZipFile,
-    zlib.error,
-    lzma.LZMAError,
-)
-"""Errors of the libraries for files that are damaged, encrypted, or compressed in a way that they do not know."""
+MOST_ARRAYS = 1000
+"""Arrays in an `.npz` file, at most."""
+MOST_CHUNK_BYTES = 1 << 30
+"""Of an HDF5 file, which unpacks a chunk as a whole."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +73,7 @@ class SpikeArray:
         """uint8 [n, height, columns] of 0 and 1."""
         try:
             block = np.asarray(self.stored[begin:end])
-        except _UNREADABLE as error:
+        except UNREADABLE as error:
             message = f"{self.path}: frames {begin} to {end - 1} cannot be read, the file is damaged: {error}"
             raise RecordingError(message) from error
         if self.packed is not None:
@@ -174,7 +166,7 @@ def _largest(path: Path, stored: Any) -> float:
     """The largest value of the first frames. Raises RecordingError."""
     try:
         return float(np.max(stored[: min(LOOKED_AT, _block_frames(stored))]))
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         raise RecordingError(f"{path}: its first frames cannot be read, the file is damaged: {error}") from error
 
 
@@ -195,7 +187,7 @@ def _array(path: Path, name: str | None) -> Any:
             return np.load(path, mmap_mode="r", allow_pickle=False)
         if head.startswith(ZIP_MAGIC):
             return _of_npz(path, name)
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         raise RecordingError(f"{path}: this is no readable array of NumPy: {error}") from error
     if head.startswith(HDF5_MAGIC):
         return _of_hdf5(path, name)
@@ -205,7 +197,7 @@ def _array(path: Path, name: str | None) -> Any:
 class _NpzArray:
     """An array of an `.npz` file, read in slices of frames from its beginning to its end, without unpacking it whole.
 
-    Raises what `_UNREADABLE` lists.
+    Raises what `UNREADABLE` lists.
     """
 
     def __init__(self, path: Path, member: str) -> None:
@@ -224,7 +216,7 @@ class _NpzArray:
         self._opened.close()
         archive = self._opened.enter_context(zipfile.ZipFile(self._path))
         self._file = self._opened.enter_context(archive.open(self._member))
-        self._header = _npy_header(self._file)
+        self._header = array_header(self._file)
         self._next = 0
 
     def __getitem__(self, frames: slice) -> NDArray[Any]:
@@ -242,23 +234,17 @@ class _NpzArray:
         return np.frombuffer(data, self.dtype).reshape(end - begin, *self.shape[1:])
 
 
-def _npy_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether it is in Fortran order, and type of an array in the `.npy` format. Raises ValueError."""
-    version = np.lib.format.read_magic(file)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, fortran, dtype = read(file)
-    if dtype.hasobject:
-        raise ValueError("it holds Python objects")
-    return shape, fortran, dtype
-
-
 def _of_npz(path: Path, name: str | None) -> _NpzArray:
     axes = {}
     with zipfile.ZipFile(path) as file:
-        for member in file.namelist():
-            if member.endswith(".npy"):
-                with file.open(member) as opened:
-                    axes[member.removesuffix(".npy")] = len(_npy_header(opened)[0])
+        members = [member for member in file.namelist() if member.endswith(".npy")]
+        if len(members) > MOST_ARRAYS:
+            raise RecordingError(
+                f"{path}: it has {len(members)} arrays, more than {MOST_ARRAYS}: save the spikes alone"
+            )
+        for member in members:
+            with file.open(member) as opened:
+                axes[member.removesuffix(".npy")] = len(array_header(opened)[0])
     return _NpzArray(path, f"{_choose(path, axes, name)}.npy")
 
 
@@ -274,8 +260,13 @@ def _of_hdf5(path: Path, name: str | None) -> Any:
         found = file[_choose(path, axes, name)]
         if found.is_virtual or found.external:
             raise RecordingError(f"{path}: {found.name} is stored in other files: copy it into one file (h5repack)")
+        if found.chunks is not None and math.prod(found.chunks) * found.dtype.itemsize > MOST_CHUNK_BYTES:
+            raise RecordingError(
+                f"{path}: {found.name} has chunks of {list(found.chunks)}, which are more than "
+                f"{MOST_CHUNK_BYTES >> 20} MiB and unpacked as a whole: give it smaller ones (h5repack -l)"
+            )
         return found
-    except (*_UNREADABLE, KeyError) as error:
+    except UNREADABLE as error:
         raise RecordingError(f"{path}: this is no readable HDF5 file: {error}") from error
 
 

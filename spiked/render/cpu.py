@@ -197,15 +197,7 @@ class Rasteriser:
 def _checked_splats(splats: Scene) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     arrays = tuple(np.ascontiguousarray(array, np.float32) for array in splats.arrays())
     means, quats, log_scales, opacity_logits, colours = arrays
-    n = len(means)
-    if (
-        means.shape != (n, 3)
-        or quats.shape != (n, 4)
-        or log_scales.shape != (n, 3)
-        or opacity_logits.shape != (n,)
-        or colours.ndim != 2
-        or colours.shape not in ((n, 1), (n, 3))
-    ):
+    if not Scene(means, quats, log_scales, opacity_logits, colours).well_formed:
         raise ConfigurationError(
             "splats are means [N, 3], quats [N, 4], log_scales [N, 3], opacity_logits [N] and colours [N, 1 or 3], not "
             + ", ".join(str(array.shape) for array in arrays)

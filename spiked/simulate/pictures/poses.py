@@ -3,8 +3,9 @@
 from pathlib import Path
 
 from spiked.errors import SceneError
+from spiked.natural_order import natural
 from spiked.sensor import Intrinsics
-from spiked.simulate.pictures.reading import Pictures, natural
+from spiked.simulate.pictures.reading import Pictures
 from spiked.trajectory import Trajectory
 from spiked.transforms import Transforms
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.errors import RecordingError
+from spiked.natural_order import natural
 
 Array = NDArray[np.float64]
 Stored = NDArray[Any]
@@ -239,11 +240,6 @@ def _quiet() -> Iterator[None]:
         yield
     finally:
         cv2.utils.logging.setLogLevel(before)
-
-
-def natural(name: str) -> list[tuple[int, str]]:
-    """A key of names by which frame2 comes before frame10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def _counted(number: int) -> str:

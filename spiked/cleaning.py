@@ -1,0 +1,137 @@
+"""Cleaning of a scene: what lies outside a box, and floaters, which few views see or which stick out."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from spiked.errors import ConfigurationError
+from spiked.recon.statistics import evenly
+from spiked.render import Camera
+from spiked.render.cpu import Rasteriser
+from spiked.scene import Scene
+from spiked.trajectory import Trajectory
+
+__all__ = ["Box", "Cleaned", "FloaterRemoval", "clean"]
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box along the axes of a scene."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+            raise ConfigurationError(
+                f"the box from {self.low} to {self.high} is empty: each low side is below its high"
+            )
+
+    def contains(self, scene: Scene) -> Mask:
+        """Splats [N] whose means are inside."""
+        low, high = np.array(self.low, np.float32), np.array(self.high, np.float32)
+        return np.asarray(((scene.means >= low) & (scene.means <= high)).all(axis=1))
+
+
+@dataclass(frozen=True)
+class FloaterRemoval:
+    """Which splats are floaters."""
+
+    views: int = 64
+    """Views along the path that are rendered."""
+    least_px: float = 0.05
+    """Pixels that a splat has to fill in a view to be seen in it, all that hide it counted."""
+    least_views: int = 2
+    """Views that have to see a splat."""
+    neighbours: int = 8
+    """Neighbours of a splat that say how lonely it is: by the distance to the last of them ..."""
+    lonely: float = 6.0
+    """... over the median of that distance in the scene."""
+    lonely_views: float = 0.15
+    """Share of the views that has to see a splat that lonely; it stays then."""
+    span_percentiles: tuple[float, float] = (1, 99)
+    """Percentiles of the means along each axis that give the size of the scene."""
+    span_share: float = 1 / 12
+    """Largest standard deviation of a splat over the size of the scene: three of them are a quarter of it."""
+    shrink: bool = False
+    """Make larger splats smaller. Where the background is a few huge splats this costs quality."""
+
+    def largest(self, scene: Scene) -> float:
+        """Largest standard deviation of a splat, in the scene's unit."""
+        low, high = np.percentile(scene.means, self.span_percentiles, axis=0)
+        return self.span_share * float(np.linalg.norm(high - low))
+
+    def floaters(self, scene: Scene, seen: NDArray[np.int64], views: int) -> Mask:
+        """Splats [N] to be removed; `seen` [N] is the number of views that see each."""
+        count = min(self.neighbours + 1, len(scene))
+        found = np.asarray(cKDTree(scene.means).query(scene.means, count)[0])
+        distances = found.reshape(len(scene), -1)[:, -1]
+        lonely = distances > self.lonely * max(float(np.median(distances)), 1e-12)
+        return np.asarray((seen < self.least_views) | (lonely & (seen < self.lonely_views * views)))
+
+
+@dataclass(frozen=True)
+class Cleaned:
+    """A cleaned scene, and what was done."""
+
+    scene: Scene
+    outside: int
+    """Splats that lay outside the box."""
+    floaters: int
+    """Splats that were removed as floaters."""
+    shrunk: int
+    """Splats that were made smaller: they were larger than a quarter of the scene."""
+
+
+def clean(
+    scene: Scene,
+    path: Trajectory,
+    camera: Camera,
+    box: Box | None = None,
+    removal: FloaterRemoval | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Cleaned:
+    """The scene without what is outside of `box`, and without floaters if `removal` is given.
+
+    Raises ConfigurationError if nothing would be left.
+    """
+    kept = scene if box is None else scene.select(box.contains(scene))
+    outside, floaters, shrunk = len(scene) - len(kept), 0, 0
+    if removal is not None and len(kept):
+        rows = evenly(len(path), removal.views)
+        chosen = removal.floaters(kept, _seen(kept, path, camera, rows, removal.least_px, progress), len(rows))
+        floaters = int(chosen.sum())
+        kept = kept.select(~chosen)
+    if not len(kept):
+        raise ConfigurationError("nothing of the scene would be left: choose a larger box")
+    if removal is not None and removal.shrink:
+        most = np.float32(np.log(removal.largest(kept)))
+        shrunk = int((kept.log_scales > most).any(axis=1).sum())
+        kept = replace(kept, log_scales=np.minimum(kept.log_scales, most))
+    return Cleaned(kept, outside, floaters, shrunk)
+
+
+def _seen(
+    scene: Scene,
+    path: Trajectory,
+    camera: Camera,
+    rows: list[int],
+    least_px: float,
+    progress: Callable[[float], None] | None,
+) -> NDArray[np.int64]:
+    """Number of views [N] that see each splat."""
+    rasteriser = Rasteriser(camera)
+    seen = np.zeros(len(scene), np.int64)
+    for done, row in enumerate(rows, 1):
+        image = rasteriser.forward(scene, path.rotations[row][None], path.centres[row][None])
+        # Each colour enters the image with the weight of its splat.
+        weights = rasteriser.backward(np.ones_like(image.values)).colours
+        seen += weights.reshape(len(scene), -1).mean(axis=1) >= least_px
+        if progress is not None:
+            progress(done / len(rows))
+    return seen

@@ -1,0 +1,62 @@
+"""What an export format is."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+
+from spiked.errors import ConfigurationError
+from spiked.export.source import ExportOptions, ExportSource
+
+__all__ = ["ExportKind"]
+
+
+@dataclass(frozen=True)
+class ExportKind:
+    """A format that results are written in."""
+
+    name: str
+    """On the command line and in requests."""
+    title: str
+    """What is written, in a few words."""
+    readers: str
+    """Programs that read it."""
+    loses: str
+    """What of the reconstruction is not in it."""
+    suffix: str
+    """Of the file that is written, with its dot; empty for a folder."""
+    write: Callable[[ExportSource, Path, ExportOptions], str]
+    """Writes the file, or fills a folder that exists, and says in a few words what is in it.
+
+    Raises SpikedError for a source that lacks what the format needs."""
+    packages: tuple[str, ...] = ()
+    """Modules that only this format needs."""
+    extra: str = "export"
+    """That installs them: `pip install 'spiked[EXTRA]'`."""
+    media_type: str = "application/octet-stream"
+
+    @property
+    def folder(self) -> bool:
+        """Whether it is a folder of files."""
+        return not self.suffix
+
+    @property
+    def sent_as(self) -> str:
+        """Media type over HTTP: of the file, or of the ZIP of a folder."""
+        return "application/zip" if self.folder else self.media_type
+
+    def check(self) -> None:
+        """Raises ConfigurationError if one of `packages` is not installed."""
+        for package in self.packages:
+            optional(package, self.extra)
+
+
+def optional(module: str, extra: str = "export") -> ModuleType:
+    """A module of an extra. Raises ConfigurationError if it is not installed."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise ConfigurationError(
+            f"this format needs the Python package of {module.split('.', maxsplit=1)[0]}: pip install 'spiked[{extra}]'"
+        ) from error

@@ -1,0 +1,111 @@
+"""What an export is made of: a reconstruction, its camera, and the recording if it is at hand."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+from spiked.errors import ConfigurationError, SceneError
+from spiked.frame_of_reference import FrameOfReference
+from spiked.recon.statistics import evenly
+from spiked.recording import Recording
+from spiked.render import Camera
+from spiked.scene import Scene
+from spiked.sensor import Intrinsics, Sensor
+from spiked.trajectory import Trajectory
+
+__all__ = ["ExportOptions", "ExportSource"]
+
+KEY_VIEWS = 40
+"""Views of an export unless their number is chosen: neighbours overlap by more than half on a path across a room."""
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """How an export is made. Formats that have no use for an option ignore it."""
+
+    views: int = KEY_VIEWS
+    """Poses that depth maps, pictures, points and meshes are made from, evenly spaced along the path."""
+    undistorted: bool = False
+    """Pictures, depth maps and cameras without the distortion of the lens, with the same focal length and size."""
+    depth: Literal["median", "expected"] = "median"
+    """Depth of a pixel: see `spiked.export.views`."""
+    resolution: int = 256
+    """Voxels along the longest side of the volume that a mesh is made in; points are at least half a voxel apart."""
+
+
+@dataclass(frozen=True)
+class ExportSource:
+    """A reconstruction."""
+
+    path: Trajectory
+    """Camera-to-world poses, times in seconds since frame 0 of the capture."""
+    sensor: Sensor | None
+    """With the optics that the reconstruction found or was given."""
+    scene: Scene | None = None
+    recording: Recording | None = None
+    first_frame: int = 0
+    """Index in the capture of the recording's first frame."""
+    name: str = "spiked"
+    unit: str = "scene"
+    """Of lengths: `m` once it is in metres."""
+
+    def in_frame(self, frame: FrameOfReference) -> "ExportSource":
+        """The same in metres and upright axes."""
+        scene = None if self.scene is None else frame.scene(self.scene)
+        return replace(self, path=frame.trajectory(self.path), scene=scene, unit="m")
+
+    def need_scene(self) -> Scene:
+        """Raises SceneError without splats."""
+        if self.scene is None or not len(self.scene):
+            raise SceneError(f"{self.name} has no splats, and this format is made of them; reconstruct a scene first")
+        return self.scene
+
+    def need_sensor(self) -> Sensor:
+        """Raises ConfigurationError without a sensor whose optics are known."""
+        if self.sensor is None or self.sensor.intrinsics is None:
+            raise ConfigurationError(
+                f"the optics of {self.name} are not known, and this format needs them; name its recording"
+            )
+        return self.sensor
+
+    def need_recording(self) -> Recording:
+        """Raises ConfigurationError without a recording."""
+        if self.recording is None:
+            raise ConfigurationError(
+                f"this format has pictures of the recording of {self.name}; name it with --recording FILE"
+            )
+        return self.recording
+
+    def need_path(self) -> Trajectory:
+        """Raises SceneError without poses."""
+        if not len(self.path):
+            raise SceneError(f"{self.name} has no poses, and this format needs them")
+        return self.path
+
+    def seen_by(self, options: ExportOptions) -> Sensor:
+        """The sensor of the exported pictures: without distortion if that is asked for."""
+        sensor = self.need_sensor()
+        if not options.undistorted or sensor.intrinsics is None:
+            return sensor
+        return replace(sensor, intrinsics=sensor.intrinsics.pinhole)
+
+    def key_rows(self, options: ExportOptions) -> list[int]:
+        """Rows of the path that the views are taken at."""
+        return evenly(len(self.need_path()), options.views)
+
+    @cached_property
+    def white(self) -> float:
+        """Radiance that is shown as white."""
+        return 1.0 if self.scene is None else self.scene.colour_of_white
+
+
+def camera_of(sensor: Sensor) -> Camera:
+    """The camera of a sensor whose optics are known."""
+    assert sensor.intrinsics is not None
+    return Camera(sensor.intrinsics, sensor.width, sensor.height)
+
+
+def optics_of(sensor: Sensor) -> Intrinsics:
+    """The optics of a sensor whose optics are known."""
+    assert sensor.intrinsics is not None
+    return sensor.intrinsics

@@ -30,6 +30,7 @@ from spiked_service.api.sources import Sources
 from spiked_service.api.zmq import Endpoints, ZmqServer
 from spiked_service.base.health import EventLoopHeartbeat, Health, failed
 from spiked_service.base.limits import ConcurrencyLimit
+from spiked_service.base.signals import handling
 from spiked_service.base.version import installed_version
 from spiked_service.captures.archive import DataStore
 from spiked_service.captures.captures import Captures
@@ -42,6 +43,7 @@ from spiked_service.operations.metrics import Metrics
 from spiked_service.operations.metrics_sources import metrics_source_of
 from spiked_service.operations.runtime_folder import RuntimeFolder
 from spiked_service.operations.systemd import SystemdNotifier
+from spiked_service.operations.webhooks import Webhooks
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue import Reconstructions
 from spiked_service.reconstructions.queue_policy import QueuePolicy
@@ -89,6 +91,7 @@ class Daemon:
                 health.add("zmq", zmq.check, life=True)
                 endpoints = zmq.endpoints
             self.services = build_services(settings, tokens, data_store, bus, health, endpoints)
+            ends.callback(Webhooks(bus, lambda: settings.now.webhooks).close)
             self._config = server_config(create_app(self.services), settings)
             self._ends = ends.pop_all()
 
@@ -161,7 +164,7 @@ def build_services(
     """The parts that the application uses, with the limits of the settings, now and after each reload."""
     captures, reconstructions, folder = data_store.captures, data_store.reconstructions, data_store.folder
     renders = ConcurrencyLimit("renders", 1)
-    trajectories = ConcurrencyLimit("trajectories", 1)
+    trajectories = ConcurrencyLimit("trajectories or bundles", 1)
     event_clients = ConcurrencyLimit("event clients", 1)
     limits = {"renders": renders, "trajectories": trajectories, "event_clients": event_clients}
     settings.on_change(lambda now: setattr(renders, "limit", now.limit_renders))
@@ -241,12 +244,8 @@ class _Server(uvicorn.Server):
             signal.SIGTERM: self.handle_exit,
             signal.SIGHUP: self.handle_reload,
         }
-        before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
-        try:
+        with handling(handlers):
             yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
 
 
 def check_access(settings: Settings, tokens: Tokens) -> None:

@@ -285,7 +285,7 @@ def test_command_line_http_and_library_have_one_table_of_options() -> None:
         assert declared[name].default == described[name]["default"] == library[name], name
         assert option.help == described[name]["description"]
         assert (option.min, option.max) == (limits.get("minimum"), limits.get("maximum")), name
-    assert set(library) - set(described) == {"poses", "calibration", "mapping"}
+    assert set(library) - set(described) == {"poses", "calibration", "first_depth", "mapping"}
 
 
 def shown(status: Status) -> list[str]:

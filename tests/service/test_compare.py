@@ -4,15 +4,17 @@ import csv
 import io
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from spiked_service.cli.comparison.cells import RECORD, Outcome
+from spiked_service.cli.comparison.cells import RECORD, Cell, Outcome, stored
 from spiked_service.cli.comparison.page import page
 from spiked_service.cli.comparison.rows import GROUPS, Row, chosen, rows
 from spiked_service.cli.comparison.tables import COLUMNS, csv_text, markdown
@@ -86,6 +88,31 @@ def test_a_killed_comparison_goes_on(room: Path, tmp_path: Path) -> None:
     assert second["cells/room/light/seed-0"] == first["cells/room/light/seed-0"] and len(second) == 2
     assert not list(out.rglob("*.making-*"))
     assert re.search(r"\| light \|.*\(\d+\.\d+-\d+\.\d+\)", (out / "comparison.md").read_text())
+
+
+def test_cells_of_other_recordings_and_torn_cells_are_not_kept(room: Path, tmp_path: Path) -> None:
+    beside = tmp_path / "beside"
+    shutil.copytree(room.parent, beside)
+    recording, out = beside / room.name, tmp_path / "out"
+    compare(recording, "-o", out, "--methods", "", *QUICK[2:])
+    cell = Cell(recording, "room", Row.parsed(QUICK[3]), 0)
+    first, record = stored(cell, out), out / cell.place / RECORD
+    assert first is not None and first.reason is not None
+    assert stored(replace(cell, recording=room), out) == first, "the same content elsewhere"
+    for changed in (recording, beside / "groundtruth.tum", beside / "views" / "00.png"):
+        before = changed.read_bytes()
+        changed.write_bytes(bytes(64) + before[64:])
+        assert stored(cell, out) is None
+        changed.write_bytes(before)
+        assert stored(cell, out) == first
+    whole = record.read_text()
+    for torn in (whole[:-9], "", "null", whole.replace('"recording": "room"', '"recording": "other"')):
+        record.write_text(torn)
+        assert stored(cell, out) is None
+    assert "failed (kept)" not in compare(recording, "-o", out, "--methods", "", *QUICK[2:])[1]
+    assert not list(out.rglob("*.making-*"))
+    again = stored(cell, out)
+    assert again is not None and again.inputs == first.inputs
 
 
 def test_a_cell_that_takes_too_long_and_a_recording_without_truth_are_told(tmp_path: Path) -> None:

@@ -125,6 +125,30 @@ def test_the_path_is_drawn_and_poses_come_over_zmq(daemon: Callable[..., Any], t
         wait_for((tmp_path / "trajectory.png").is_file, "the picture is there")
 
 
+@pytest.mark.slow
+def test_the_bridge_writes_a_bag_that_rosbags_reads(daemon: Callable[..., Any], tmp_path: Path) -> None:
+    from rosbags.highlevel import AnyReader
+
+    one = daemon()
+    command = [sys.executable, str(EXAMPLES / "ros2_bridge.py"), websocket(one), "--bag", str(tmp_path / "bag")]
+    with running(*command, "--captures", "1") as lines:
+        assert lines.get(timeout=DEADLINE_S) == "connected\n"
+        body = {"source": "sim:?width=240&height=160&motion=arc", "frames": 1280, "options": {"steps": 10}}
+        assert one.http.post("captures", json=body).status_code == 201
+        wait_for((tmp_path / "bag" / "metadata.yaml").is_file, "the bag is complete")
+    job = one.http.get("reconstructions").json()["items"][0]["id"]
+    found: dict[str, list[Any]] = {}
+    with AnyReader([tmp_path / "bag"]) as reader:
+        for connection, _, raw in reader.messages():
+            found.setdefault(connection.topic, []).append(reader.deserialize(raw, connection.msgtype))
+    assert {"/tf", "/pose", "/camera/image_raw"} <= set(found)
+    image, pose = found["/camera/image_raw"][0], found["/pose"][-1]
+    assert (image.encoding, image.width, image.height) == ("rgb8", 240, 160)  # WebP is never grey
+    frames = one.http.get(f"reconstructions/{job}/trajectory?format=json").json()["frames"]
+    assert len(found["/pose"]) == len(found["/tf"]) <= len(frames)
+    assert pose.header.frame_id == "world" and abs(pose.pose.orientation.w) <= 1
+
+
 def test_the_trajectory_example_has_twenty_lines() -> None:
     text = (EXAMPLES / "live_trajectory.py").read_text()
     code = [line for line in text.split('"""')[2].splitlines() if line.strip()]

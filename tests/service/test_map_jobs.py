@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from spiked_service.base.errors import BusyError
 from spiked_service.base.ids import new_id
 from spiked_service.captures.archive import DataStore
 from spiked_service.results.map_reports import LOCALISATION, REGISTRATION
+from spiked_service.results.report.job import JobReport
+from spiked_service.results.report.page import report_html
 from spiked_service.results.versions import Publisher, newest, pose_file, versions
 from spiked_service.settings.reconstruction_options import IntrinsicsOption, ReconstructionOptions
 from spiked_service.store.catalogue import UnknownIdError
@@ -64,6 +67,24 @@ class Place:
     def report(self, row: ReconstructionRow, name: str) -> dict[str, object]:
         return dict(json.loads((self.folder(row) / name).read_text()))
 
+    def document(self, row: ReconstructionRow) -> dict[str, Any]:
+        """The figures of the report of a job, once its page can be made."""
+        folder, published = self.folder(row), newest(self.folder(row))
+        assert published is not None
+        source = JobReport(
+            row=row,
+            capture=self.data_store.captures.get(row.capture_id).row,
+            folder=folder,
+            published=published,
+            poses=PoseFile(pose_file(folder, published)),
+            sensor=SENSOR,
+            timeline=self.data_store.reconstructions.rows.timeline(row.id),
+            recording=self.data_store.folder.recording(row.capture_id),
+            render=None,
+        ).read()
+        assert row.id in report_html(source)
+        return dict(source.document)
+
 
 def recorded(data_store: DataStore, folder: Path, seed: int, frames: int = FRAMES, flow_px: float = 0.05) -> str:
     """The id of a capture of a visit to a room."""
@@ -111,6 +132,8 @@ def test_a_recording_is_localised_in_a_map(place: Place) -> None:
     assert np.linalg.norm(path.centres - centres, axis=1).max() < 0.03
     found = place.report(row, LOCALISATION)
     assert found["recognised"] and len(found["views"]) == len(path) == row.poses > 5  # type: ignore[arg-type]
+    document = place.document(row)
+    assert document["localisation"]["recognised"] and document["job"]["task"] == "localise"
     assert row.splats == len(room_map(2).scene) and not list(place.folder(row).glob("map-*"))
 
 
@@ -137,6 +160,8 @@ def test_two_maps_are_merged_into_one_of_the_first_capture(place: Place) -> None
     assert np.allclose(place.path(row).centres, room_map(2, LEFT).path.centres)
     published = newest(place.folder(row))
     assert published is not None and [one.capture_id for one in published.paths] == [place.other]
+    document = place.document(row)
+    assert document["merged"] and [one["name"] for one in document["paths"]] == [place.other]
     file = PoseFile(place.folder(row) / published.paths[0].trajectory)
     moved = file.trajectory(range(len(file)))
     assert np.linalg.norm(moved.centres - room_map(2, RIGHT).path.centres, axis=1).max() < 0.03

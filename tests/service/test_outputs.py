@@ -21,6 +21,7 @@ WRITERS: dict[tuple[str, str], list[str]] = {
     ("calibrate", "--out"): [MISSING],
     ("calibrate", "--write-profile"): [MISSING, "--out", "calibration.npz"],
     ("convert", "OUT"): [MISSING],
+    ("cut", "--out"): [MISSING, "--frames", "0:1"],
     ("evaluate", "--json"): [MISSING, "--recording", MISSING],
     ("evaluate", "--pictures"): [MISSING, "--recording", MISSING],
     ("baseline", "--out"): [MISSING],
@@ -30,6 +31,8 @@ WRITERS: dict[tuple[str, str], list[str]] = {
     ("localise", "--out"): [MISSING, MISSING],
     ("localise", "--json"): [MISSING, MISSING],
     ("merge", "--out"): [MISSING, MISSING],
+    ("clean", "--out"): [MISSING],
+    ("export", "--out"): [MISSING, "ply"],
     ("noise-report", "--json"): [MISSING],
     ("bench", "--json"): ["--stream", MISSING],
     ("bench", "--folder"): ["--stream", MISSING],
@@ -47,6 +50,7 @@ FOLDERS = {
     ("record", "--out"),
     ("localise", "--out"),
     ("merge", "--out"),
+    ("clean", "--out"),
     ("bench", "--folder"),
 }
 READS = {
@@ -57,6 +61,7 @@ READS = {
     "source",
     "scene",
     "poses",
+    "first_depth",
     "result",
     "recording",
     "calibration",

@@ -3,20 +3,22 @@
 import os
 import re
 import signal
+import threading
 from pathlib import Path
 
 import pytest
 from spiked_service.base.errors import BusyError
 from spiked_service.captures.archive import DataStore
+from spiked_service.results.scene_scale import SceneScale, read_scale, write_scale
 from spiked_service.results.timeline import Timeline
-from spiked_service.results.versions import at, newest
+from spiked_service.results.versions import Published, Publisher, at, newest
 from spiked_service.settings.reconstruction_options import IntrinsicsOption, ReconstructionOptions
 from spiked_service.store.catalogue import UnknownIdError
 from spiked_service.store.rows import CaptureState, JobState, Plan, ReconstructionRow, Stage
 
 from spiked.errors import ConfigurationError
 
-from .survival import SMALL, ended, over, random_recording, still_recording, wait_for
+from .survival import PATIENCE_S, SMALL, ended, over, random_recording, still_recording, wait_for
 
 SHORT = ReconstructionOptions(steps=5)
 LONG = ReconstructionOptions(steps=200_000)
@@ -26,6 +28,32 @@ def running(data_store: DataStore, job: ReconstructionRow) -> int:
     """Process id of its worker, once it works."""
     wait_for(lambda: data_store.reconstructions.rows.get(job.id).frames > 0, f"{job.id} runs")
     return data_store.reconstructions.processes()[job.id]
+
+
+def edited(data_store: DataStore, job: ReconstructionRow) -> ReconstructionRow:
+    """The reconstruction with another version, whose files take long to write."""
+    rows = data_store.reconstructions.rows
+    writes, go_on = threading.Event(), threading.Event()
+
+    def slow(publisher: Publisher) -> Published:
+        writes.set()
+        assert go_on.wait(PATIENCE_S)
+        return publisher.again(publisher.versions[-1])
+
+    thread = threading.Thread(target=rows.publish_edit, args=(job.id, job.version, slow))
+    thread.start()
+    assert writes.wait(PATIENCE_S)
+    assert rows.get(job.id).version == job.version and rows.page().items, "others read meanwhile"
+    for refused in (data_store.reconstructions.restart, data_store.reconstructions.remove):
+        with pytest.raises(BusyError, match="is being written"):
+            refused(job.id)
+    with pytest.raises(BusyError, match="is being written"):
+        rows.publish_edit(job.id, job.version, slow)
+    assert thread.is_alive()
+    go_on.set()
+    thread.join()
+    assert rows.get(job.id).version == job.version + 1
+    return rows.get(job.id)
 
 
 def test_a_recording_is_reconstructed_with_versions_and_timeline(house: tuple[DataStore, str]) -> None:
@@ -40,11 +68,16 @@ def test_a_recording_is_reconstructed_with_versions_and_timeline(house: tuple[Da
     listed = data_store.reconstructions.rows.versions(done.id)
     assert published is not None and published.version == done.version == listed[-1].version
     assert done.white == published.white and done.poses == published.poses > 400
+    done = edited(data_store, done)
+    folder = data_store.reconstructions.rows.folder(done.id)
+    write_scale(folder, SceneScale(metres_per_unit=2.0, version=done.version))
     again = data_store.reconstructions.restart(done.id, ReconstructionOptions(steps=0))
     assert again.id == done.id and again.state is JobState.QUEUED
     finished = ended(data_store, again)
     assert finished.options.steps == 0
-    assert finished.version >= done.version
+    assert finished.version > done.version
+    scale = read_scale(folder)
+    assert (scale.revision, scale.metres_per_unit, scale.since) == (2, None, done.version), "the unit is another one"
     data_store.reconstructions.remove(done.id)
     with pytest.raises(UnknownIdError):
         data_store.reconstructions.rows.get(done.id)

@@ -1,6 +1,9 @@
 """`spiked record`: devices of a running service, started together, with the offsets of their clocks."""
 
 import re
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -34,6 +37,15 @@ def test_devices_are_recorded_together(daemon: Callable[..., Any], tmp_path: Pat
     alone = run(both[0], "--frames", "100", "--address", one.address)
     assert alone.exit_code == 0 and "complete, 100 frames, 0 lost" in alone.output
     assert "begins" not in alone.output
+
+    words = ["-m", "spiked_service", "record", *both, "--address", one.address]
+    with subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, text=True) as unlimited:
+        while len(one.http.get("captures?state=streaming").json()["items"]) < 2:
+            assert unlimited.poll() is None
+            time.sleep(0.1)
+        unlimited.terminate()
+        said, _ = unlimited.communicate()
+    assert unlimited.returncode == 0 and said.count("complete") == 2
 
     refused = run("sim:", "replay:nothing.dat", "--seconds", "1", "--address", one.address)
     assert isinstance(refused.exception, ApiError) and "nothing.dat" in str(refused.exception)

@@ -2,11 +2,15 @@
 
 import os
 import signal
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
+from spiked_service.base.ids import new_id
 from spiked_service.captures.archive import DataStore
+from spiked_service.reconstructions.job_runner import queued_again
 from spiked_service.results.recording_feed import reconstruct_recording
 from spiked_service.results.timeline import Timeline
 from spiked_service.results.versions import newest, pose_file
@@ -148,3 +152,11 @@ def test_jobs_of_a_killed_service_go_on(tmp_path: Path, end: str) -> None:
         data_store.reconstructions.cancel(job.id)
         assert ended(data_store, job).state is JobState.CANCELLED
         assert not data_store.folder.checkpoint(job.id).exists()
+
+
+def test_a_job_that_ended_or_waits_has_no_time_left_of_its_run(tmp_path: Path) -> None:
+    left = ReconstructionRow(new_id(), new_id(), False, JobState.RUNNING, datetime.now(UTC), eta_s=99.0)
+    assert queued_again(left, "").eta_s is None
+    with kept(tmp_path / "data") as data_store:
+        assert data_store.reconstructions.rows.save(replace(left, state=JobState.FAILED)).eta_s is None
+        assert data_store.catalogue.reconstructions.get(left.id).eta_s is None

@@ -9,6 +9,7 @@ from fastapi.concurrency import run_in_threadpool
 from spiked_service.api.access_log import AccessLogMiddleware
 from spiked_service.api.auth.scopes import authorise
 from spiked_service.api.auth.security import Security
+from spiked_service.api.exports import Exports
 from spiked_service.api.head import Head
 from spiked_service.api.idempotency import idempotent
 from spiked_service.api.openapi import describe
@@ -16,12 +17,15 @@ from spiked_service.api.paths import register_path_kinds
 from spiked_service.api.problems import install
 from spiked_service.api.reports import Reports
 from spiked_service.api.routes.captures import capture_routes
+from spiked_service.api.routes.cleaning import cleaning_routes
 from spiked_service.api.routes.configuration import configuration_routes
 from spiked_service.api.routes.devices import device_routes
 from spiked_service.api.routes.docs import mount_docs
 from spiked_service.api.routes.doctor import doctor_routes
 from spiked_service.api.routes.events import event_routes
+from spiked_service.api.routes.exports import export_routes
 from spiked_service.api.routes.groups import group_routes
+from spiked_service.api.routes.guide import mount_guide
 from spiked_service.api.routes.health import health_routes, metrics_routes
 from spiked_service.api.routes.maps import map_routes
 from spiked_service.api.routes.options import option_routes
@@ -31,6 +35,7 @@ from spiked_service.api.routes.reconstructions import reconstruction_record_rout
 from spiked_service.api.routes.recordings import recording_routes
 from spiked_service.api.routes.reports import report_routes
 from spiked_service.api.routes.results import capture_result_routes, reconstruction_result_routes
+from spiked_service.api.routes.scale import scale_routes
 from spiked_service.api.routes.system import system_routes
 from spiked_service.api.routes.uploads import upload_routes
 from spiked_service.api.services import Services
@@ -58,6 +63,7 @@ def create_app(services: Services) -> FastAPI:
     app.add_middleware(Security, settings=services.settings, tokens=services.tokens)
     app.add_middleware(AccessLogMiddleware, metrics=services.metrics)  # the last one added is the outermost
     mount_docs(app)
+    mount_guide(app)
     mount_page(app)
     return app
 
@@ -79,6 +85,9 @@ def _api(services: Services) -> APIRouter:
     api.include_router(map_routes(reconstructions, results, once))
     api.include_router(reconstruction_result_routes(reconstructions.rows, results, views, once))
     api.include_router(report_routes(reconstructions.rows, Reports(results, captures, folder, views), once))
+    api.include_router(export_routes(reconstructions.rows, results, Exports(results, captures, folder), once))
+    api.include_router(cleaning_routes(reconstructions.rows, results, once))
+    api.include_router(scale_routes(reconstructions.rows, results, once))
     api.include_router(reconstruction_record_routes(reconstructions.rows, once))
     api.include_router(doctor_routes(folder.path))
     api.include_router(option_routes())

@@ -8,6 +8,7 @@ from fastapi.openapi.utils import get_openapi
 
 from spiked_service.api.auth.scopes import scope_of, security
 from spiked_service.api.problems import Problem
+from spiked_service.api.routes.guide import PATH as GUIDE_PATH
 from spiked_service.settings.tokens import Scope
 
 DESCRIPTION = """Captures from spike cameras, recorded and reconstructed while they run.
@@ -68,6 +69,7 @@ def _described(app: FastAPI) -> dict[str, Any]:
         license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
         separate_input_output_schemas=True,
     )
+    schema["externalDocs"] = {"description": "Documentation, with search", "url": GUIDE_PATH}
     components = schema.setdefault("components", {})
     problem = Problem.model_json_schema(mode="serialization", ref_template="#/components/schemas/{model}")
     components.setdefault("schemas", {})["Problem"] = problem

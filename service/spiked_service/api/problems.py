@@ -1,5 +1,6 @@
 """Errors as RFC 9457 problem details, with `what_to_do`."""
 
+import errno
 from difflib import get_close_matches
 from http import HTTPStatus
 from typing import Any
@@ -21,6 +22,8 @@ from spiked_service.store.catalogue import StoreError, UnknownIdError
 MEDIA_TYPE = "application/problem+json"
 _RETRY_S = 1
 """`Retry-After` of a busy service, seconds."""
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Of a full disk, and of a quota."""
 
 
 class Problem(BaseModel):
@@ -178,6 +181,12 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(SpikedError)
     async def _spiked(request: Request, error: SpikedError) -> JSONResponse:
         return problem_of(error, request)
+
+    @app.exception_handler(OSError)
+    async def _system(request: Request, error: OSError) -> JSONResponse:
+        if error.errno not in _FULL:
+            raise error  # unexpected
+        return problem_of(StoreError("the disk is full, and nothing was changed: free disk space"), request)
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:

@@ -6,7 +6,6 @@ import numpy as np
 from fastapi import Request, Response
 from numpy.typing import NDArray
 
-from spiked.render import Camera
 from spiked_service.api import files
 from spiked_service.api.problems import ConflictError, NotReadyError
 from spiked_service.api.results import Result, Results
@@ -59,7 +58,10 @@ class Reports:
         downloads = self._results.downloads
         downloads.acquire()
         try:
-            pieces = bundle_pieces(self._job(row, result, with_recording).read())
+            source = self._job(row, result, with_recording).read()
+            if with_recording and source.recording is None:
+                raise NotReadyError(f"the recording of capture {row.capture_id} cannot be read; leave it out")
+            pieces = bundle_pieces(source)
         except BaseException:
             downloads.release()
             raise
@@ -91,10 +93,9 @@ class Reports:
         )
 
     def _render(self, result: Result) -> Render | None:
-        sensor = result.sensor
-        if sensor is None or sensor.intrinsics is None or not result.published.splats:
+        camera = result.camera
+        if camera is None or not result.published.splats:
             return None
-        camera = Camera(sensor.intrinsics, sensor.width, sensor.height)
 
         def render(pose: Pose) -> NDArray[np.float32]:
             return self._views.render(result.scene, camera, pose).values

@@ -12,16 +12,20 @@ from fastapi import Request, Response
 
 from spiked import spz
 from spiked.errors import SceneError
+from spiked.frame_of_reference import FrameOfReference
 from spiked.poses import PoseFile
+from spiked.render import Camera
 from spiked.scene import Scene
 from spiked.scene_changes import SceneChanges
 from spiked.sensor import Sensor
+from spiked.trajectory import Trajectory
 from spiked_service.api import files
 from spiked_service.api.problems import GoneError, NothingError, NotReadyError
 from spiked_service.api.trajectories import Range, TrajectoryFormat, open_poses, trajectory_response
 from spiked_service.base.limits import ConcurrencyLimit
 from spiked_service.captures.captures import Captures
 from spiked_service.reconstructions.repository import ReconstructionRepository
+from spiked_service.results.scene_scale import MetricPoses, read_scale
 from spiked_service.results.shown_scene import ShownScene
 from spiked_service.results.versions import Published, at
 from spiked_service.store.catalogue import UnknownIdError
@@ -46,6 +50,8 @@ class Result:
     published: Published
     sensor: Sensor | None
     timeline: Path
+    frame: FrameOfReference | None = None
+    """That of the answers; None: the scene's own."""
 
     @property
     def scene(self) -> Path:
@@ -54,7 +60,27 @@ class Result:
 
     def poses(self) -> PoseFile:
         """Its trajectory. Raises GoneError if the version has just been removed, SceneError."""
-        return open_poses(self.folder, self.published, self.sensor, self.timeline)
+        own = open_poses(self.folder, self.published, self.sensor, self.timeline)
+        return own if self.frame is None else MetricPoses(own.path, self.frame)
+
+    def path(self, poses: int) -> Trajectory:
+        """Its trajectory, or every n-th pose of it: `poses` of them or somewhat more. Raises as `poses` does."""
+        found = self.poses()
+        return found.trajectory(range(0, len(found), max(1, len(found) // poses)))
+
+    @property
+    def camera(self) -> Camera | None:
+        """What it was seen with; None if its optics are not known."""
+        if self.sensor is None or self.sensor.intrinsics is None:
+            return None
+        return Camera(self.sensor.intrinsics, self.sensor.width, self.sensor.height)
+
+    def metric(self) -> "Result":
+        """The same in metres, with up along -y. Raises NothingError while the scale is not known."""
+        frame = read_scale(self.folder).frame_of(self.published.version)
+        if frame is None:
+            raise NothingError("the scale of this scene is not known; PUT its scale, or give its tags to scale:tag")
+        return replace(self, frame=frame)
 
 
 class SceneFiles:
@@ -68,13 +94,13 @@ class SceneFiles:
         """The scene of a version, or a fixed sample of `max_splats`. Raises NotReadyError, SceneError."""
         version = {"X-Scene-Version": str(result.published.version), "X-White": repr(result.published.white)}
         name = f"scene-{result.published.version:06d}.{kind}"
-        if kind is SceneFormat.PLY and max_splats is None:
+        if kind is SceneFormat.PLY and max_splats is None and result.frame is None:
             return files.ranged(request, result.scene, name, **version)
         stamp = files.stamp(result.scene)
-        tag = files.etag(result.published.version, kind, stamp, max_splats)
+        tag = files.etag(result.published.version, kind, stamp, max_splats, result.frame)
         if files.unchanged(request, tag):
             return files.not_modified(tag)
-        key = (result.scene, stamp, kind, max_splats)
+        key = (result.scene, stamp, kind, max_splats, result.frame)
         with self._lock:
             body = self._encoded.get(key) or _encoded(result, kind, max_splats)
             self._encoded[key] = body
@@ -126,6 +152,8 @@ def _slots(result: Result) -> ShownScene:
 
 def _encoded(result: Result, kind: SceneFormat, max_splats: int | None) -> bytes:
     scene, white = Scene.read_ply(result.scene), result.published.white
+    if result.frame is not None:
+        scene = result.frame.scene(scene)
     if max_splats is not None:
         scene = scene.sample(max_splats)
     return spz.encode(scene, white) if kind is SceneFormat.SPZ else scene.ply(white)
@@ -195,4 +223,5 @@ class Results:
         except UnknownIdError:  # it was removed, but not its path
             rate_hz = other.frame_rate_hz
             sensor = result.sensor and replace(result.sensor, frame_rate_hz=rate_hz, intrinsics=None)
-        return lambda: PoseFile(result.folder / other.trajectory), sensor
+        name, frame = result.folder / other.trajectory, result.frame
+        return (lambda: PoseFile(name) if frame is None else MetricPoses(name, frame)), sensor

@@ -29,6 +29,7 @@ from spiked_service.api.problems import GoneError, NoPoseError
 from spiked_service.api.streams import GuardedStream
 from spiked_service.base.limits import ConcurrencyLimit
 from spiked_service.results.report.zip_stream import Part, zip_pieces
+from spiked_service.results.scene_scale import MetricPoses
 from spiked_service.results.timeline import Timeline, frames_at
 from spiked_service.results.versions import Published, pose_file
 
@@ -123,7 +124,8 @@ def trajectory_response(
 
     Raises NoPoseError, ConfigurationError, OverloadedError.
     """
-    tag = files.etag(version, kind, files.stamp(poses.path), part.from_s, part.to_s, part.step)
+    frame = poses.frame if isinstance(poses, MetricPoses) else None
+    tag = files.etag(version, kind, files.stamp(poses.path), part.from_s, part.to_s, part.step, frame)
     if files.unchanged(request, tag):
         return files.not_modified(tag)
     rows = part.of(poses)

@@ -11,7 +11,7 @@ from spiked.camera import Pinhole
 from spiked.errors import ConfigurationError
 from spiked.pose import quaternion
 from spiked.poses import PoseFile
-from spiked.recon.reconstructor import BRIDGED_S
+from spiked.recon.view_tracking import BRIDGED_S
 from spiked.render import Camera
 from spiked.sensor import Intrinsics, Sensor
 from spiked.spline import Waypoints

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Unpack
 
 from spiked_driver import open_camera
 
@@ -19,7 +20,7 @@ from spiked_service.reconstructions.queue import Reconstructions
 from spiked_service.store.catalogue import Catalogue, Page, StoreError, UnknownIdError
 from spiked_service.store.disk_space import DiskSpace, recording_bytes
 from spiked_service.store.folder import DataFolder
-from spiked_service.store.rows import CaptureRow, CaptureState, Origin, Plan
+from spiked_service.store.rows import CaptureEdit, CaptureRow, CaptureState, Origin, Plan
 from spiked_service.store.snapshot import Snapshot
 from spiked_service.workers.messages import PreviewTaken
 
@@ -222,9 +223,10 @@ class Captures:
         state: CaptureState | None = None,
         deleted: bool = False,
         group: str | None = None,
+        tag: str | None = None,
     ) -> Page[CaptureRow]:
         """Newest first."""
-        return self._catalogue.capture_page(limit, cursor, query, state, deleted, group)
+        return self._catalogue.capture_page(limit, cursor, query, state, deleted, group, tag)
 
     def live(self) -> Sequence[Snapshot]:
         """Captures that have not ended, oldest first."""
@@ -261,12 +263,9 @@ class Captures:
             live.stop()
         return self.get(capture_id)
 
-    def update(
-        self, capture_id: str, *, name: str | None = None, notes: str | None = None, keep: bool | None = None
-    ) -> Snapshot:
+    def update(self, capture_id: str, **edit: Unpack[CaptureEdit]) -> Snapshot:
         """Change what a user may change; None leaves it. Raises UnknownIdError."""
-        fields = {"name": name, "notes": notes, "keep": keep}
-        return self._change(capture_id, **{key: value for key, value in fields.items() if value is not None})
+        return self._change(capture_id, **{key: value for key, value in edit.items() if value is not None})
 
     def remove(self, capture_id: str) -> Snapshot:
         """Mark a capture as deleted, until `restore` or retention. Raises UnknownIdError, BusyError."""

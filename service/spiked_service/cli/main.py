@@ -12,12 +12,17 @@ from spiked_service.cli.commands.backup import backup, restore
 from spiked_service.cli.commands.baseline import baseline
 from spiked_service.cli.commands.bench import bench
 from spiked_service.cli.commands.calibrate import calibrate
+from spiked_service.cli.commands.clean import clean
 from spiked_service.cli.commands.compare import compare
 from spiked_service.cli.commands.config import config
 from spiked_service.cli.commands.convert import convert
+from spiked_service.cli.commands.cut import cut
 from spiked_service.cli.commands.datasets import datasets
 from spiked_service.cli.commands.devices import devices
+from spiked_service.cli.commands.doctor import doctor
 from spiked_service.cli.commands.evaluate import evaluate
+from spiked_service.cli.commands.export import export
+from spiked_service.cli.commands.health import health
 from spiked_service.cli.commands.info import info
 from spiked_service.cli.commands.localise import localise
 from spiked_service.cli.commands.merge import merge
@@ -28,6 +33,7 @@ from spiked_service.cli.commands.reconstruct import reconstruct
 from spiked_service.cli.commands.record import record
 from spiked_service.cli.commands.render import render
 from spiked_service.cli.commands.report import report
+from spiked_service.cli.commands.scale import scale
 from spiked_service.cli.commands.serve import serve
 from spiked_service.cli.commands.simulate import simulate
 from spiked_service.cli.commands.token import token
@@ -61,10 +67,10 @@ def _options(
 
 
 for _group, _commands in {
-    "Live": (serve, record, devices, backup, restore),
-    "Files": (info, verify, convert, offset, simulate, calibrate, noise_report),
-    "Scenes": (reconstruct, localise, merge, render, evaluate, report, baseline, compare),
-    "This program": (bench, openapi, version),
+    "Live": (serve, record, devices, health, backup, restore),
+    "Files": (info, verify, cut, convert, offset, simulate, calibrate, noise_report),
+    "Scenes": (reconstruct, localise, merge, scale, clean, render, evaluate, report, export, baseline, compare),
+    "This program": (doctor, bench, openapi, version),
 }.items():
     for _command in _commands:
         app.command(rich_help_panel=_group)(_command)

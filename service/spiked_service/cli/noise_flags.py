@@ -1,5 +1,6 @@
 """Flags of the simulated sensor's noise; names, bounds and help are those of `NoiseOptions`."""
 
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import typer
@@ -38,12 +39,31 @@ Flicker = Annotated[float, _flag("flicker", _LIGHT)]
 FlickerHz = Annotated[float, _flag("flicker_hz", _LIGHT)]
 
 
-def noise_of(values: dict[str, Any]) -> NoiseOptions:
-    """The options among the parameters of a command. Raises ConfigurationError."""
-    try:
-        return NoiseOptions.model_validate({name: values[name] for name in NoiseOptions.model_fields})
-    except ValidationError as error:
-        first = error.errors()[0]
-        flag = str(first["loc"][0]).replace("_", "-")
-        problem = first["msg"].replace("Input should be", "it must be")
-        raise ConfigurationError(f"--{flag} {first['input']}: {problem}") from error
+@dataclass(frozen=True)
+class NoiseFlags:
+    """One flag for each field of `NoiseOptions`."""
+
+    electrons_a_spike: ElectronsASpike = DEFAULT.electrons_a_spike
+    temperature_k: TemperatureK = DEFAULT.temperature_k
+    swing_v: SwingV = DEFAULT.swing_v
+    reset_noise: ResetNoise = DEFAULT.reset_noise
+    threshold_jitter: ThresholdJitter = DEFAULT.threshold_jitter
+    dark: Dark = DEFAULT.dark
+    dark_spread: DarkSpread = DEFAULT.dark_spread
+    capacitance_mismatch: CapacitanceMismatch = DEFAULT.capacitance_mismatch
+    reset_bias: ResetBias = DEFAULT.reset_bias
+    hot_share: HotShare = DEFAULT.hot_share
+    hot_rate: HotRate = DEFAULT.hot_rate
+    dead_share: DeadShare = DEFAULT.dead_share
+    flicker: Flicker = DEFAULT.flicker
+    flicker_hz: FlickerHz = DEFAULT.flicker_hz
+
+    def options(self) -> NoiseOptions:
+        """Raises ConfigurationError."""
+        try:
+            return NoiseOptions.model_validate(vars(self))
+        except ValidationError as error:
+            first = error.errors()[0]
+            flag = str(first["loc"][0]).replace("_", "-")
+            problem = first["msg"].replace("Input should be", "it must be")
+            raise ConfigurationError(f"--{flag} {first['input']}: {problem}") from error

@@ -1,5 +1,6 @@
 """Checks of output paths before the work begins, so that a mistyped path does not lose hours of work."""
 
+import fcntl
 import os
 import tempfile
 from collections.abc import Iterator
@@ -7,6 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from spiked.errors import ConfigurationError
+
+_LOCK = ".lock"
+"""In a folder that one command at a time may work in."""
 
 
 def try_folder(option: str, folder: Path, files: tuple[str, ...] = ()) -> None:
@@ -44,6 +48,20 @@ def try_file(option: str, file: Path) -> None:
 
 
 @contextmanager
+def alone(option: str, folder: Path, what: str) -> Iterator[None]:
+    """Make a folder and keep other commands out of it. Raises ConfigurationError if one works there, and OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / _LOCK).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ConfigurationError(
+                f"{option} {folder}: another {what} works there; wait for it, or name another folder"
+            ) from error
+        yield
+
+
+@contextmanager
 def writing(option: str, place: Path) -> Iterator[None]:
     """Turn an error of writing to `place` into one that names the option and the place.
 
@@ -52,6 +70,7 @@ def writing(option: str, place: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        why = error.strerror or error
         raise ConfigurationError(
-            f"{option} {place} cannot be written: {error.strerror}; name another place, or make this one writable"
+            f"{option} {place} cannot be written: {why}; name another place, or make this one writable"
         ) from error

@@ -90,6 +90,65 @@ DistortionText = Annotated[
 
 
 @dataclass(frozen=True)
+class OpticsFlags:
+    """Optics, for `with_optics`."""
+
+    fov: Fov = None
+    intrinsics: IntrinsicsText = None
+    distortion: DistortionText = None
+
+    def of(self, sensor: Sensor) -> Sensor:
+        """The sensor with these optics, or its own if none are given. Raises ConfigurationError."""
+        return with_optics(sensor, self.fov, self.intrinsics, self.distortion)
+
+
+@dataclass(frozen=True)
+class _LayoutFlags:
+    width: Width = None
+    height: Height = None
+    rate: Rate = None
+    layout: FrameLayout = None
+    bit_order: Bits = None
+    flipped: Flipped = None
+
+
+@dataclass(frozen=True)
+class GeometryFlags(_LayoutFlags):
+    """Geometry of a recording without a sidecar."""
+
+    mosaic: Colours = None
+    response: SensorResponse = None
+
+    def stated(self) -> RecordingGeometry:
+        """What is given."""
+        return _geometry(self, self.mosaic, self.response)
+
+
+@dataclass(frozen=True)
+class DetectableGeometryFlags(_LayoutFlags):
+    """`GeometryFlags` with a mosaic that can be detected."""
+
+    mosaic: ColoursOrAuto = None
+    response: SensorResponse = None
+
+    @property
+    def detects(self) -> bool:
+        """Whether the mosaic is to be detected."""
+        return self.mosaic is MosaicChoice.AUTO
+
+    def stated(self) -> RecordingGeometry:
+        """What is given."""
+        mosaic = None if self.mosaic is None or self.detects else Mosaic(self.mosaic)
+        return _geometry(self, mosaic, self.response)
+
+
+def _geometry(of: _LayoutFlags, mosaic: Mosaic | None, response: Response | None) -> RecordingGeometry:
+    return RecordingGeometry(
+        of.width, of.height, of.rate, of.layout, of.bit_order, of.flipped, mosaic, response=response
+    )
+
+
+@dataclass(frozen=True)
 class DescribedRecording:
     """A recording with what options and profile say of its camera."""
 

@@ -23,7 +23,7 @@ from spiked.render.choice import chosen
 from spiked.ring.segment import FOLDER as RING_FOLDER
 from spiked.ring.writer import DEFAULT_BYTES, MOST_BACKLOG_BYTES
 from spiked.sensor import Sensor
-from spiked_service.store.folder import space_at
+from spiked_service.store.folder import nearest_folder, space_at
 
 UDEV_FOLDERS = tuple(Path(folder) for folder in ("/etc", "/run", "/usr/lib", "/lib", "/usr/local/lib"))
 CPU = Path("/sys/devices/system/cpu")
@@ -77,6 +77,11 @@ def examine(data: Path) -> list[Diagnosis]:
         *disk_findings(data),
         _renderer(),
     ]
+
+
+def memory_findings() -> list[Diagnosis]:
+    """Shared memory and renderer, which every service uses, with or without a camera."""
+    return [_shared_memory(), _renderer()]
 
 
 def _cameras(cameras: list[UsbCamera]) -> Diagnosis:
@@ -211,6 +216,9 @@ def _memory() -> Diagnosis:
 
 def _shared_memory() -> Diagnosis:
     name = "shared memory"
+    if not os.access(RING_FOLDER, os.W_OK | os.X_OK):
+        todo = f"sudo mount -t tmpfs -o mode=1777,size=1G tmpfs {RING_FOLDER}; in a chroot, bind the host's"
+        return Diagnosis(name, DiagnosisStatus.PROBLEM, f"{RING_FOLDER} cannot be written by this user", todo)
     free = shutil.disk_usage(RING_FOLDER).free
     takes = f"{DEFAULT_BYTES >> 20} MiB, and up to {MOST_BACKLOG_BYTES >> 20} to reconstruct meanwhile"
     found = f"{free >> 20} MiB free in {RING_FOLDER}, a capture takes {takes}"
@@ -235,8 +243,7 @@ def _renderer() -> Diagnosis:
 
 def disk_findings(data: Path) -> Iterator[Diagnosis]:
     """Free space and measured write speed of the disk below the data folder."""
-    """Room and speed where recordings go."""
-    folder = next(each for each in (data.absolute(), *data.absolute().parents) if each.is_dir())
+    folder = nearest_folder(data)
     space = space_at(folder)
     free, seconds = space.free_bytes, space.recording_s(USB_CAMERA)
     of = f"{USB_CAMERA.width}x{USB_CAMERA.height} at {USB_CAMERA.frame_rate_hz / 1e3:g} kHz"

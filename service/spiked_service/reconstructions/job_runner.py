@@ -216,6 +216,7 @@ def queued_again(row: ReconstructionRow, reason: str) -> ReconstructionRow:
         state=JobState.QUEUED,
         stage=Stage.WAITING,
         progress=0.0,
+        eta_s=None,
         reason=reason,
         ended_at=None,
     )

@@ -164,11 +164,12 @@ class Reconstructions:
             row = self.rows.get(reconstruction_id)
             if not row.state.over:
                 raise BusyError(f"reconstruction {row.id} is {row.state}: cancel it, or wait for its end")
+            self.rows.check_not_edited(row.id)
             check(row, self._catalogue, self.rows)
             begun = self.rows.pin_maps(begun_anew(row, options or row.options))
             self.policy.reset_retries(row.id)
             self.rows.drop_checkpoint(row.id)
-            self.rows.save(begun)
+            self.rows.requeue(begun)
             self._wake.notify_all()
             return begun
 
@@ -254,6 +255,8 @@ class Reconstructions:
                 self._begin_queued(row, capture)
 
     def _begin_queued(self, row: ReconstructionRow, capture: CaptureRow) -> None:
+        if not self.rows.has_checkpoint(row.id):
+            self.rows.forget_scale(row)
         command = command_of(row, capture, self._folder, self._least_poses.pop(row.id, 0))
         now = datetime.now(UTC)
         begun = replace(

@@ -2,7 +2,7 @@
 
 import shutil
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,12 +10,14 @@ from spiked.errors import ConfigurationError
 from spiked.recon.checkpoint import exists
 from spiked.render import Camera
 from spiked.sensor import Sensor
+from spiked_service.base.errors import BusyError
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue_estimates import NEXT, QueueEstimates
 from spiked_service.reconstructions.queue_policy import QueuePolicy
 from spiked_service.results.pinned_map import pin
+from spiked_service.results.scene_scale import forget_scale
 from spiked_service.results.timeline_writer import NAME as TIMELINE
-from spiked_service.results.versions import Published, newest, version_row
+from spiked_service.results.versions import Published, Publisher, newest, version_row
 from spiked_service.store.catalogue import Catalogue, Page, StoreError
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import JobState, MapRef, ReconstructionRow, VersionRow
@@ -37,6 +39,8 @@ class ReconstructionRepository:
         self._lock = threading.RLock()
         self._running: dict[str, ReconstructionRow] = {}
         self._unsaved: dict[str, ReconstructionRow] = {}
+        self._edited: set[str] = set()
+        """Reconstructions of which `publish_edit` writes a version."""
 
     def get(self, reconstruction_id: str) -> ReconstructionRow:
         """The reconstruction as it is now. Raises UnknownIdError."""
@@ -97,7 +101,7 @@ class ReconstructionRepository:
 
     def save(self, row: ReconstructionRow) -> ReconstructionRow:
         """Save and publish a row. A row that cannot be saved is kept in memory and retried."""
-        row = replace(row, queue_place=None)
+        row = replace(row, queue_place=None, eta_s=None if row.state.over else row.eta_s)
         if row.state.over:  # the maps that it used may go
             for folder in self._folder.maps(row.id, len(row.maps)):
                 shutil.rmtree(folder, ignore_errors=True)
@@ -116,6 +120,53 @@ class ReconstructionRepository:
                 self._notifier.job(row)
             self._publish_queue()
         return row
+
+    def publish_edit(self, reconstruction_id: str, version: int, edit: Callable[[Publisher], Published]) -> Published:
+        """Publish another version of a reconstruction that has ended, made of its newest, `version`.
+
+        Others read and save rows meanwhile: the files of a large scene take seconds. Raises UnknownIdError, OSError,
+        and BusyError if it has not ended, is being edited, or has another newest version.
+        """
+        with self._lock:
+            row = self.get(reconstruction_id)
+            self.check_not_edited(row.id)
+            if not row.state.over:
+                raise BusyError(f"reconstruction {row.id} is {row.state}: wait for its end, or cancel it")
+            if row.version != version:
+                raise BusyError(f"version {row.version} is the newest now, not {version}: look at that one first")
+            self._edited.add(row.id)
+        try:
+            publisher = Publisher(self.folder(row.id))
+            published = edit(publisher)
+            with self._lock:
+                self.add_version(row, published, set(publisher.kept))
+                now = self.get(row.id)
+                self.save(replace(now, version=published.version, splats=published.splats, psnr_db=published.psnr_db))
+        finally:
+            with self._lock:
+                self._edited.discard(row.id)
+        return published
+
+    def check_not_edited(self, reconstruction_id: str) -> None:
+        """Raises BusyError while a version is made by hand."""
+        with self._lock:
+            if reconstruction_id in self._edited:
+                raise BusyError(f"a version of reconstruction {reconstruction_id} is being written: try again")
+
+    def requeue(self, row: ReconstructionRow) -> None:
+        """Save the row of an ended reconstruction that is queued again. Raises BusyError while it is edited."""
+        with self._lock:
+            self.check_not_edited(row.id)
+            self.save(row)
+
+    def forget_scale(self, row: ReconstructionRow) -> None:
+        """Forget the scale of a reconstruction that begins anew, since its unit of length will be another one.
+
+        Raises OSError.
+        """
+        if forget_scale(self._folder.reconstruction(row.id), row.version):
+            said = "its scale is forgotten: it begins anew, in another unit of length; measure it again"
+            self._notifier.log("warning", said, row.capture_id, row.id)
 
     def update(self, row: ReconstructionRow) -> None:
         """Publish the row of a running reconstruction without saving it."""
@@ -175,8 +226,9 @@ class ReconstructionRepository:
             self._notifier.log("error", str(error), row.capture_id, row.id)
 
     def remove(self, reconstruction_id: str) -> None:
-        """Delete a reconstruction with its versions and files."""
+        """Delete a reconstruction with its versions and files. Raises BusyError while it is edited."""
         with self._lock:
+            self.check_not_edited(reconstruction_id)
             self._folder.remove(self._folder.reconstruction(reconstruction_id))
             with self._catalogue.transaction():
                 self._catalogue.forget_versions(reconstruction_id)

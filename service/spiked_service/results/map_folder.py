@@ -1,8 +1,11 @@
 """Output folders of `spiked reconstruct` and `spiked merge`, read back as maps, and those of several recordings."""
 
 import json
+import os
 import re
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import chain, count
 from pathlib import Path
@@ -17,11 +20,15 @@ from spiked.render import Camera
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
 from spiked.trajectory import Trajectory
+from spiked_service.results.scene_scale import remove_scale
 
 MAP_FILES = ("report.json", "scene.ply", "trajectory.tum")
 """Files of a map."""
 PATHS = "paths"
 """Folder with the path of each recording, in the folder of a map of several."""
+_REPORT = "report.json"
+_MAKING = ".making-"
+"""Names of folders with files that are not whole yet begin so."""
 
 
 @dataclass(frozen=True)
@@ -103,17 +110,39 @@ def camera_in(sensor: Sensor, known: Camera) -> Camera:
 def write_map(
     folder: Path, scene: Scene, trajectory: Trajectory, paths: Mapping[str, Trajectory], report: Mapping[str, object]
 ) -> None:
-    """Write a map of several recordings; the report comes last, so that half a map is none. Raises OSError."""
-    (folder / PATHS).mkdir(parents=True, exist_ok=True)
-    (folder / "report.json").unlink(missing_ok=True)
-    scene.write_ply(folder / "scene.ply")
-    trajectory.write_tum(folder / "trajectory.tum")
-    for name, path in paths.items():
-        path.write_tum(folder / PATHS / f"{name}.tum")
+    """Write a map of several recordings, as `replacing` says. Raises OSError."""
     listed = {"paths": [{"name": name, "poses": len(path)} for name, path in paths.items()]}
-    part = folder / "report.json.part"
-    part.write_text(json.dumps({**report, **listed}, indent=1), encoding="utf-8")
-    part.replace(folder / "report.json")
+    with replacing(folder) as making:
+        scene.write_ply(making / "scene.ply")
+        trajectory.write_tum(making / "trajectory.tum")
+        (making / PATHS).mkdir()
+        for name, path in paths.items():
+            path.write_tum(making / PATHS / f"{name}.tum")
+        (making / _REPORT).write_text(json.dumps({**report, **listed}, indent=1), encoding="utf-8")
+
+
+@contextmanager
+def replacing(folder: Path) -> Iterator[Path]:
+    """A folder for the files of a new result, which take the place of those in `folder` when all are written.
+
+    After an error the result before is whole; after a kill there is no report, and half a map is none. The scale and
+    the paths of the result before are removed. Raises OSError.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for left in folder.glob(f"{_MAKING}*"):
+        shutil.rmtree(left, ignore_errors=True)  # of a command that was killed
+    making = folder / f"{_MAKING}{os.getpid()}"
+    making.mkdir()
+    try:
+        yield making
+        (folder / _REPORT).unlink(missing_ok=True)
+        remove_scale(folder)
+        if (folder / PATHS).is_dir():
+            shutil.rmtree(folder / PATHS)
+        for file in sorted(making.iterdir(), key=lambda path: path.name == _REPORT):
+            file.replace(folder / file.name)
+    finally:
+        shutil.rmtree(making, ignore_errors=True)
 
 
 def joint_paths(

@@ -85,11 +85,15 @@ class _Index(BaseModel):
 def write_atomically(path: Path, content: bytes) -> None:
     """Replace a file in one step: readers see the old or the new content, also after a power cut. Raises OSError."""
     part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fdatasync(file.fileno())
-    part.replace(path)
+    try:
+        with part.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fdatasync(file.fileno())
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)  # of a full disk: what is left of it is not taken, too
+        raise
 
 
 @dataclass(frozen=True)
@@ -156,14 +160,29 @@ class Publisher:
         if self._versions:
             self._protected.add(self.version)
 
-    def again(self, earlier: Published) -> Published:
-        """Publish the files of an earlier version under the next number. Raises OSError as `publish` does."""
+    def again(self, earlier: Published, scene: Scene | None = None) -> Published:
+        """Publish an earlier version under the next number, with another scene if one is given.
+
+        Raises OSError as `publish` does.
+        """
         version = self.version + 1
         names = {"scene": f"scene-{version:06d}.ply", "trajectory": f"trajectory-{version:06d}.poses"}
-        scene = Scene.read_ply(self._folder / earlier.scene)
-        slots = self._write_slots(scene, earlier.white, version, tolerance=0.0)
-        published = earlier.model_copy(update={"version": version, "at": datetime.now(UTC), **names, **slots})
-        write_atomically(self._folder / published.scene, (self._folder / earlier.scene).read_bytes())
+        edited: dict[str, Any] = {}
+        content = (self._folder / earlier.scene).read_bytes() if scene is None else scene.ply(earlier.white)
+        if scene is not None:
+            edited = {"splats": len(scene), "scene_bytes": len(content), "psnr_db": None}
+        shown = scene or Scene.read_ply(self._folder / earlier.scene)
+        slots = self._write_slots(shown, earlier.white, version, tolerance=0.0)
+        paths = [
+            one.model_copy(update={"trajectory": f"path-{version:06d}-{number}.poses"})
+            for number, one in enumerate(earlier.paths, 1)
+        ]
+        published = earlier.model_copy(
+            update={"version": version, "at": datetime.now(UTC), "paths": paths, **names, **slots, **edited}
+        )
+        write_atomically(self._folder / published.scene, content)
+        for old, new in zip(earlier.paths, paths, strict=True):
+            write_atomically(self._folder / new.trajectory, (self._folder / old.trajectory).read_bytes())
         write_atomically(self._folder / published.trajectory, pose_file(self._folder, earlier).read_bytes())
         self._list(published)
         return published

@@ -8,8 +8,9 @@ from difflib import get_close_matches
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, get_args
+from urllib.parse import urlsplit
 
-from pydantic import BeforeValidator, Field, SecretStr, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field, SecretStr, ValidationError
 from pydantic.config import JsonDict
 from pydantic.fields import FieldInfo
 from pydantic_settings import (
@@ -87,6 +88,17 @@ def _parts(value: object) -> object:
 
 Words = Annotated[list[str], NoDecode, BeforeValidator(_parts)]
 """In the environment and after --set: separated by commas, or a JSON list."""
+
+
+def _addresses(values: list[str]) -> list[str]:
+    """Addresses of web servers. Raises ValueError for anything else."""
+    for value in values:
+        parts = urlsplit(value)
+        if parts.scheme not in ("http", "https") or not parts.hostname:
+            raise ValueError(f"{value!r} is no address: write http://HOST/PATH or https://HOST/PATH")
+    return values
+
+
 _OWN_FLAGS = {
     "devices": "device",
     "log_level": "log-level",
@@ -114,6 +126,11 @@ class Settings(BaseSettings):
         [],
         description="Folders whose files requests may name as replay: or pcie: sources; where the service was started, "
         "if none.",
+        json_schema_extra=_LIVE,
+    )
+    webhooks: Annotated[Words, AfterValidator(_addresses)] = Field(
+        [],
+        description="Addresses that get a POST with the job when a reconstruction has ended.",
         json_schema_extra=_LIVE,
     )
     zmq: bool = Field(True, description="Whether events also go out over ZeroMQ, on loopback only.")
@@ -313,7 +330,7 @@ def _place(name: str, origin: SettingOrigin, path: Path | None) -> str:
         case SettingOrigin.ENVIRONMENT:
             return f"{_PREFIX}{name.upper()}"
         case SettingOrigin.FLAG:
-            return f"--{_OWN_FLAGS[name]}" if name in _OWN_FLAGS else f"--set {name}"
+            return flag_of(name).partition("=")[0]
         case SettingOrigin.DEFAULT:
             return name
 
@@ -344,6 +361,11 @@ def _members(kind: Any) -> list[str]:
     if isinstance(kind, type) and issubclass(kind, StrEnum):
         return [str(member) for member in kind]
     return [member for part in get_args(kind) for member in _members(part)]
+
+
+def flag_of(name: str) -> str:
+    """How `spiked serve` takes a setting: an option of its own, or `--set NAME=VALUE`."""
+    return f"--{_OWN_FLAGS[name]}" if name in _OWN_FLAGS else f"--set {name}=VALUE"
 
 
 def field(name: str) -> FieldInfo:

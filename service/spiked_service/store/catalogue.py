@@ -12,37 +12,13 @@ from pydantic import TypeAdapter, ValidationError
 
 from spiked.errors import SpikedError
 from spiked_service.store.folder import DataFolder
+from spiked_service.store.migrations import MIGRATIONS, copy_before_migration, migrate, schema_of, written_by
 from spiked_service.store.rows import CaptureRow, CaptureState, JobState, ReconstructionRow, UploadRow, VersionRow
 
 _WAIT_S = 5.0
 """Longest wait for another process that writes the catalogue, seconds."""
 _CopyOf = Callable[[str], Path]
 _DAMAGED = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-
-_MIGRATIONS = (
-    """
-    CREATE TABLE captures (
-        id TEXT PRIMARY KEY, document TEXT NOT NULL,
-        state TEXT GENERATED ALWAYS AS (json_extract(document, '$.state')) VIRTUAL,
-        deleted_at TEXT GENERATED ALWAYS AS (json_extract(document, '$.deleted_at')) VIRTUAL
-    ) WITHOUT ROWID;
-    CREATE INDEX captures_by_state ON captures (state);
-    CREATE TABLE reconstructions (
-        id TEXT PRIMARY KEY, document TEXT NOT NULL,
-        capture_id TEXT GENERATED ALWAYS AS (json_extract(document, '$.capture_id')) VIRTUAL,
-        state TEXT GENERATED ALWAYS AS (json_extract(document, '$.state')) VIRTUAL,
-        priority INTEGER GENERATED ALWAYS AS (json_extract(document, '$.priority')) VIRTUAL
-    ) WITHOUT ROWID;
-    CREATE INDEX reconstructions_by_capture ON reconstructions (capture_id);
-    CREATE INDEX reconstructions_by_state ON reconstructions (state, priority);
-    CREATE TABLE uploads (id TEXT PRIMARY KEY, document TEXT NOT NULL) WITHOUT ROWID;
-    CREATE TABLE versions (
-        reconstruction_id TEXT NOT NULL, version INTEGER NOT NULL, document TEXT NOT NULL,
-        PRIMARY KEY (reconstruction_id, version)
-    ) WITHOUT ROWID;
-    """,
-)
-"""Script n migrates a catalogue from version n to n + 1; the version is the file's user_version."""
 
 
 class StoreError(SpikedError):
@@ -98,7 +74,7 @@ class Catalogue:
             with _as_store_error(path):
                 self._writer.execute("PRAGMA journal_mode = WAL")
                 self._writer.execute("PRAGMA synchronous = NORMAL")
-            self._migrate()
+            self._migrate(keep_copy=folder is not None)
         except StoreError:
             self._writer.close()
             raise
@@ -155,8 +131,10 @@ class Catalogue:
         state: CaptureState | None = None,
         deleted: bool = False,
         group: str | None = None,
+        tag: str | None = None,
     ) -> Page[CaptureRow]:
-        """Captures, newest first; `query` is looked for in name, notes and source; deleted ones only if asked for."""
+        """Captures, newest first; `query` is looked for in name, notes, source, tags and metadata; deleted ones only if
+        asked for."""
         where, values = ["deleted_at IS NOT NULL" if deleted else "deleted_at IS NULL"], list[Any]()
         if state is not None:
             where.append("state = ?")
@@ -164,8 +142,11 @@ class Catalogue:
         if group is not None:
             where.append("json_extract(document, '$.group') = ?")
             values.append(group)
+        if tag is not None:
+            where.append("EXISTS (SELECT 1 FROM json_each(document, '$.tags') WHERE value = ?)")
+            values.append(tag)
         if query:
-            fields = ("$.name", "$.notes", "$.plan.source")
+            fields = ("$.name", "$.notes", "$.plan.source", "$.tags", "$.metadata")
             where.append("(" + " OR ".join(f"instr(lower(json_extract(document, '{f}')), ?)" for f in fields) + ")")
             values += [query.lower()] * len(fields)
         return self.captures.page(where, values, limit, cursor)
@@ -243,18 +224,20 @@ class Catalogue:
                 self._writer.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             self._writer.close()
 
-    def _migrate(self) -> None:
-        with self.transaction() as connection:
-            (version,) = connection.execute("PRAGMA user_version").fetchone()
-            if version > len(_MIGRATIONS):
+    def _migrate(self, keep_copy: bool) -> None:
+        with _as_store_error(self._path):
+            schema = schema_of(self._writer)
+            if schema > len(MIGRATIONS):
+                writer = written_by(self._writer)
                 raise StoreError(
-                    f"{self._path} was written by a newer spiked (version {version} of the catalogue, this one knows "
-                    f"{len(_MIGRATIONS)}): use that one, or another data folder"
+                    f"{self._path} was written by a newer spiked{f' ({writer})' if writer else ''}, "
+                    f"with schema {schema} of the catalogue; this one knows {len(MIGRATIONS)}: use that "
+                    "release or a later one, or another data folder"
                 )
-            for number in range(version, len(_MIGRATIONS)):
-                for statement in _MIGRATIONS[number].split(";"):
-                    connection.execute(statement)
-                connection.execute(f"PRAGMA user_version = {number + 1}")
+            if keep_copy:
+                copy_before_migration(self._writer, self._path)
+        with self.transaction() as connection:
+            migrate(connection)
 
 
 class Table(Generic[_Row]):

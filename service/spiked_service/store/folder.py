@@ -30,6 +30,11 @@ class Space:
         return self.free_bytes / (sensor.compact().frame_bytes * sensor.frame_rate_hz)
 
 
+def nearest_folder(path: Path) -> Path:
+    """The folder itself, or where it is missing the nearest one above that exists."""
+    return next(each for each in (path.absolute(), *path.absolute().parents) if each.is_dir())
+
+
 def space_at(path: Path) -> Space:
     """Space on the disk of a folder."""
     stat = os.statvfs(path)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, TypedDict
 
 from pydantic import AliasChoices, Field
 
@@ -231,11 +231,25 @@ class CaptureRow:
     """Can be restored until retention purges it."""
     group: str | None = None
     """Id of the group of captures that were started together."""
+    tags: tuple[str, ...] = ()
+    """Words to find it by, in the order in which they were given."""
+    metadata: dict[str, str] = field(default_factory=dict)
+    """What other programs note of it, by key."""
 
     @property
     def source(self) -> str:
         """Source of the capture."""
         return self.plan.source
+
+
+class CaptureEdit(TypedDict, total=False):
+    """What a user changes of a capture; None leaves it."""
+
+    name: str | None
+    notes: str | None
+    keep: bool | None
+    tags: tuple[str, ...] | None
+    metadata: dict[str, str] | None
 
 
 @dataclass(frozen=True)

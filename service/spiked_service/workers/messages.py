@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, Field, TypeAdapter
 
 from spiked.camera import StoredCameraOptions
+from spiked.export import ExportOptions
 from spiked.profile import CameraProfile
 from spiked.recon import State
 from spiked.recording.geometry import Assumable
@@ -29,6 +30,7 @@ class Role(StrEnum):
     UPLOAD = "upload"
     LOCALISATION = "localisation"
     MERGE = "merge"
+    EXPORT = "export"
 
 
 class _Command(BaseModel):
@@ -169,6 +171,27 @@ class UploadCommand(_Command):
         return self.path.with_suffix(".dat")
 
 
+class ExportCommand(_Command):
+    """Write a published version in the format of another program."""
+
+    role: Literal[Role.EXPORT] = Role.EXPORT
+    kind: str
+    out: Path
+    """The file; a folder becomes a ZIP."""
+    options: ExportOptions
+    name: str
+    scene: Path
+    poses: Path
+    white: float
+    sensor: Sensor | None
+    recording: Path | None
+    first_frame: int
+    """Index in the capture of the recording's first frame."""
+    metres_per_unit: float | None
+    """None: in the scene's own unit and axes."""
+    up: tuple[float, float, float] | None
+
+
 Command = Annotated[
     AcquisitionCommand
     | RecorderCommand
@@ -176,7 +199,8 @@ Command = Annotated[
     | LocalisationCommand
     | MergeCommand
     | PreviewCommand
-    | UploadCommand,
+    | UploadCommand
+    | ExportCommand,
     Field(discriminator="role"),
 ]
 JobCommand = ReconstructionCommand | LocalisationCommand | MergeCommand

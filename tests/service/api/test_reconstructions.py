@@ -294,7 +294,7 @@ def test_head_wherever_get_is(service: Any, done: CaptureOut, job: str) -> None:
     """The same status and headers, no body; ranges are for GET alone."""
     described = service.http.get(f"{service.daemon.address}openapi.json").json()
     known = {"{capture_id}": done.id, "{reconstruction_id}": job, "{device_id}": "sim:", "{upload_id}": "none"}
-    known["{group_id}"] = "none"
+    known |= {"{group_id}": "none", "{format}": "spz"}
     paths = [path for path, operations in described["paths"].items() if "get" in operations]
     assert len(paths) > 25
     for path in [*paths, "/api/v1/events", "/", "/docs/", "/openapi.json", "/nowhere"]:

@@ -82,3 +82,14 @@ def test_jobs_without_results_are_told(service: Service, job: str) -> None:
         assert answer.status_code == 404 and "has published nothing" in answer.json()["detail"]
     with pytest.raises(ApiError, match="version 99"):
         service.client.report(job, version=99)
+
+
+def test_a_recording_that_cannot_be_read_is_not_left_out_silently(service: Service, done: CaptureOut, job: str) -> None:
+    command = service.daemon.process.args
+    path = Path(command[command.index("--data") + 1], "captures", done.id, "recording.dat")
+    away = path.rename(path.with_suffix(".away"))
+    try:
+        answer = service.http.get(f"reconstructions/{job}/bundle?recording=true")
+    finally:
+        away.rename(path)
+    assert answer.is_client_error and "cannot be read; leave it out" in answer.json()["detail"]

@@ -1,9 +1,11 @@
 """Published versions of a reconstruction: which are kept, and what a reader of an older index finds."""
 
+import resource
 from pathlib import Path
 
 import numpy as np
-from spiked_service.results.versions import Publisher, RecordedPath, at, newest, versions
+import pytest
+from spiked_service.results.versions import Publisher, RecordedPath, at, newest, versions, write_atomically
 
 from spiked.scene import Scene
 from spiked.trajectory import Trajectory
@@ -60,3 +62,15 @@ def test_a_held_version_outlasts_many_and_can_be_made_the_newest_again(tmp_path:
     assert best.version in publisher.kept and len(publisher.kept) <= 36
     assert (tmp_path / again.scene).read_bytes() == (tmp_path / best.scene).read_bytes()
     assert (tmp_path / again.trajectory).read_bytes() == (tmp_path / best.trajectory).read_bytes()
+
+
+def test_of_a_file_that_cannot_be_written_nothing_is_left(tmp_path: Path) -> None:
+    write_atomically(tmp_path / "a", b"old")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))  # as a full disk
+    try:
+        with pytest.raises(OSError, match="large"):
+            write_atomically(tmp_path / "a", bytes(1000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a", b"old")]

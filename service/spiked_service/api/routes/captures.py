@@ -33,16 +33,18 @@ def capture_routes(captures: Captures, sources: Sources, route_class: type[APIRo
         limit: Limit = 50,
         cursor: Cursor = None,
         q: Annotated[
-            str | None, Query(max_length=200, description="Text to search for in name, notes and source.")
+            str | None,
+            Query(max_length=200, description="Text to look for in name, notes, source, tags and metadata."),
         ] = None,
         state: CaptureState | None = None,
         deleted: Annotated[bool, Query(description="List removed captures instead.")] = False,
         group: Annotated[
             str | None, Query(max_length=64, description="Captures that were started together, by their group's id.")
         ] = None,
+        tag: Annotated[str | None, Query(max_length=64, description="Captures with this tag.")] = None,
     ) -> CapturePage:
         """Captures, newest first."""
-        page = captures.list(limit, cursor, q, state, deleted, group)
+        page = captures.list(limit, cursor, q, state, deleted, group, tag)
         items = [CaptureOut.of(captures.snapshot(row)) for row in page.items]
         return CapturePage(items=items, next_cursor=page.next_cursor)
 
@@ -53,8 +55,9 @@ def capture_routes(captures: Captures, sources: Sources, route_class: type[APIRo
 
     @router.patch("/{capture_id:id}", responses=problems(404))
     def change_capture(capture_id: str, body: CaptureChange) -> CaptureOut:
-        """Change its name or notes, or exclude it from retention."""
-        captures.update(capture_id, name=body.name, notes=body.notes, keep=body.keep)
+        """Change its name, notes, tags or metadata, or exclude it from retention."""
+        tags = None if body.tags is None else tuple(dict.fromkeys(body.tags))
+        captures.update(capture_id, name=body.name, notes=body.notes, keep=body.keep, tags=tags, metadata=body.metadata)
         return CaptureOut.of(captures.get(capture_id))
 
     _add_end_routes(router, captures)

@@ -42,6 +42,10 @@ MaxSplats = Annotated[
     Query(ge=1, le=10_000_000, description="Most splats: a fixed sample is returned. Default: all."),
     IN_DIGITS,
 ]
+Metric = Annotated[
+    bool,
+    Query(description="In metres, with up along -y, by the scale that is stored; 404 while there is none."),
+]
 Since = Annotated[
     str | None,
     Query(
@@ -104,6 +108,16 @@ class _Operation:
     description: str
 
 
+@dataclass(frozen=True)
+class _Operations:
+    """Those of the results of a reconstruction."""
+
+    trajectory: _Operation
+    scene: _Operation
+    changes: _Operation
+    render: _Operation
+
+
 def capture_result_routes(results: Results, views: ViewRenderer, route_class: type[APIRoute]) -> APIRouter:
     """Results of the newest reconstruction of a capture."""
 
@@ -115,12 +129,14 @@ def capture_result_routes(results: Results, views: ViewRenderer, route_class: ty
         newest,
         results,
         views,
-        trajectory=_Operation("get_trajectory", "The trajectory of its newest reconstruction."),
-        scene=_Operation("get_scene", "The scene of its newest reconstruction; its ETag changes with the version."),
-        changes=_Operation("get_scene_changes", _CHANGES_SAID),
-        render=_Operation(
-            "render_views",
-            "Images of its newest reconstruction: from one camera, from several, or along the path.",
+        _Operations(
+            trajectory=_Operation("get_trajectory", "The trajectory of its newest reconstruction."),
+            scene=_Operation("get_scene", "The scene of its newest reconstruction; its ETag changes with the version."),
+            changes=_Operation("get_scene_changes", _CHANGES_SAID),
+            render=_Operation(
+                "render_views",
+                "Images of its newest reconstruction: from one camera, from several, or along the path.",
+            ),
         ),
     )
 
@@ -138,18 +154,20 @@ def reconstruction_result_routes(
         named,
         results,
         views,
-        trajectory=_Operation(
-            "get_reconstruction_trajectory",
-            "The trajectory of a version, or a part of it: JSON, TUM, KITTI, COLMAP or nerfstudio.",
-        ),
-        scene=_Operation(
-            "get_reconstruction_scene",
-            "The scene of a version as 3DGS PLY (RDF axes) or SPZ (RUB axes); X-White is the radiance of colour 1.",
-        ),
-        changes=_Operation("get_reconstruction_scene_changes", _CHANGES_SAID),
-        render=_Operation(
-            "render_reconstruction_views",
-            "Images of a version: from one camera, from several, or along the path; colour, depth or alpha.",
+        _Operations(
+            trajectory=_Operation(
+                "get_reconstruction_trajectory",
+                "The trajectory of a version, or a part of it: JSON, TUM, KITTI, COLMAP or nerfstudio.",
+            ),
+            scene=_Operation(
+                "get_reconstruction_scene",
+                "The scene of a version as 3DGS PLY (RDF axes) or SPZ (RUB axes); X-White is the radiance of colour 1.",
+            ),
+            changes=_Operation("get_reconstruction_scene_changes", _CHANGES_SAID),
+            render=_Operation(
+                "render_reconstruction_views",
+                "Images of a version: from one camera, from several, or along the path; colour, depth or alpha.",
+            ),
         ),
     )
 
@@ -159,18 +177,22 @@ def _result_routes(
     find: Callable[..., ReconstructionRow],
     results: Results,
     views: ViewRenderer,
-    *,
-    trajectory: _Operation,
-    scene: _Operation,
-    changes: _Operation,
-    render: _Operation,
+    operations: _Operations,
 ) -> APIRouter:
     """Add the routes to `router`; `find` takes the id in its path and returns the reconstruction."""
+    _add_trajectory_route(router, find, results, operations.trajectory)
+    _add_scene_routes(router, find, results, operations.scene, operations.changes)
+    _add_view_route(router, find, results, views, operations.render)
+    return router
 
+
+def _add_trajectory_route(
+    router: APIRouter, find: Callable[..., ReconstructionRow], results: Results, operation: _Operation
+) -> None:
     @router.get(
         "/trajectory",
-        name=trajectory.name,
-        description=trajectory.description,
+        name=operation.name,
+        description=operation.description,
         responses=_TRAJECTORY,
         response_model=TrajectoryOut,
         response_class=Response,
@@ -184,9 +206,20 @@ def _result_routes(
         to_s: ToS = None,
         step: Step = 1,
         path: PathNumber = 0,
+        metric: Metric = False,
     ) -> Response:
-        return results.trajectory(request, results.of(row, version), format, Range(from_s, to_s, step), path)
+        result = results.of(row, version)
+        result = result.metric() if metric else result
+        return results.trajectory(request, result, format, Range(from_s, to_s, step), path)
 
+
+def _add_scene_routes(
+    router: APIRouter,
+    find: Callable[..., ReconstructionRow],
+    results: Results,
+    scene: _Operation,
+    changes: _Operation,
+) -> None:
     @router.get(
         "/scene",
         name=scene.name,
@@ -200,8 +233,10 @@ def _result_routes(
         format: SceneFormat = SceneFormat.PLY,
         version: Version = None,
         max_splats: MaxSplats = None,
+        metric: Metric = False,
     ) -> Response:
-        return results.scenes.response(request, results.of(row, version), format, max_splats)
+        result = results.of(row, version)
+        return results.scenes.response(request, result.metric() if metric else result, format, max_splats)
 
     @router.get(
         "/scene/changes",
@@ -219,10 +254,18 @@ def _result_routes(
     ) -> Response:
         return results.scenes.changes(request, results.of(row, version), since, level)
 
+
+def _add_view_route(
+    router: APIRouter,
+    find: Callable[..., ReconstructionRow],
+    results: Results,
+    views: ViewRenderer,
+    operation: _Operation,
+) -> None:
     @router.post(
         "/views",
-        name=render.name,
-        description=render.description,
+        name=operation.name,
+        description=operation.description,
         responses=_VIEWS,
         response_class=Response,
         openapi_extra=needs(Scope.READ),
@@ -235,5 +278,3 @@ def _result_routes(
         accept: Annotated[str, Header(include_in_schema=False)] = "",
     ) -> Response:
         return views_response(results.of(row, version), body, image_format(format, accept), views)
-
-    return router

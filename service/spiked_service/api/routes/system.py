@@ -38,7 +38,7 @@ class ZmqOut(BaseModel):
 class SystemOut(BaseModel):
     """The running service."""
 
-    version: str = Field(examples=["0.1.0"])
+    version: str = Field(examples=["0.2.0"])
     started_at: datetime
     uptime_s: float
     data_folder: str

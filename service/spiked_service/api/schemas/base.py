@@ -5,7 +5,16 @@ from itertools import combinations, permutations
 from typing import Annotated, Any, Generic, TypeVar
 
 from fastapi import Query
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, StrictFloat, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StrictFloat,
+    StringConstraints,
+    model_validator,
+)
 
 from spiked.camera import Pinhole
 
@@ -109,6 +118,12 @@ def _one_line(text: str) -> str:
     return _printable(text)
 
 
+def _word(text: str) -> str:
+    if "," in text:
+        raise ValueError("commas separate tags and are in none")
+    return _one_line(text)
+
+
 Name = Annotated[
     str,
     Field(max_length=200, json_schema_extra={"pattern": r"^[^\x00-\x1f]*$"}),
@@ -118,6 +133,27 @@ Notes = Annotated[
     str,
     Field(max_length=20_000, json_schema_extra={"pattern": r"^[^\x00-\x08\x0b-\x1f]*$"}),
     AfterValidator(_printable),
+]
+Tag = Annotated[
+    str,
+    Field(min_length=1, max_length=64, json_schema_extra={"pattern": r"^[^\x00-\x1f,]*$"}),
+    AfterValidator(_word),
+]
+Tags = Annotated[list[Tag], Field(max_length=32, description="Words to find it by; each once.")]
+Metadata = Annotated[
+    dict[
+        Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.:/-]{1,64}$")],
+        Annotated[
+            str,
+            Field(max_length=500, json_schema_extra={"pattern": r"^[^\x00-\x1f]*$"}),
+            AfterValidator(_one_line),
+        ],
+    ],
+    Field(
+        max_length=64,
+        description="Values of other programs by key: letters, digits and `_.:/-`.",
+        json_schema_extra={"additionalProperties": False},
+    ),
 ]
 Id = Annotated[str, Field(description="UUID version 7: ids sort by time.", examples=[ID_EXAMPLE])]
 Finite = Annotated[StrictFloat, Field(allow_inf_nan=False)]

@@ -16,10 +16,12 @@ from spiked_service.api.schemas.base import (
     Id,
     In,
     IntrinsicsModel,
+    Metadata,
     Name,
     Notes,
     Out,
     PageOut,
+    Tags,
     at_least_one_of,
     at_most_one_of,
     camera_example,
@@ -260,11 +262,13 @@ class CaptureRequest(In):
 class CaptureChange(In):
     """What can be changed of a capture; fields that are not given stay."""
 
-    model_config = example(name="desk, second try", keep=True)
+    model_config = example(name="desk, second try", keep=True, tags=["desk"], metadata={"robot.run": "17"})
 
     name: Name | None = None
     notes: Notes | None = None
     keep: StrictBool | None = Field(None, description="Retention leaves it alone.")
+    tags: Tags | None = None
+    metadata: Metadata | None = None
 
 
 class SensorOut(Out):
@@ -332,6 +336,8 @@ class CaptureOut(Out):
                     "name": "desk, by hand",
                     "notes": "",
                     "keep": False,
+                    "tags": ["desk"],
+                    "metadata": {"robot.run": "17"},
                     "origin": "live",
                     "source": "sim:?seed=1&pace=0",
                     "state": "complete",
@@ -368,6 +374,8 @@ class CaptureOut(Out):
     name: str
     notes: str
     keep: bool = Field(description="Retention leaves it alone.")
+    tags: list[str] = Field(description="Words to find it by.")
+    metadata: dict[str, str] = Field(description="Values of other programs by key.")
     origin: Origin = Field(
         description="live: captured here; upload: a recording from elsewhere; recovered: found in the data folder, its "
         "row rebuilt from its files."
@@ -398,6 +406,8 @@ class CaptureOut(Out):
             name=row.name,
             notes=row.notes,
             keep=row.keep,
+            tags=list(row.tags),
+            metadata=row.metadata,
             origin=row.origin,
             source=row.source,
             state=row.state,

@@ -13,18 +13,21 @@ from spiked.baselines import ImageKind, PictureOptions, SpikePicture, interpolat
 from spiked.baselines.pictures import bin_pixels, picture_intrinsics
 from spiked.errors import SpikedError
 from spiked.recon import LossName, MapOptions, Options, Reconstructor
-from spiked.recording import Recording, RecordingGeometry
+from spiked.recording import Recording
 from spiked.trajectory import Trajectory
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.commands.reconstruct import MapOptionTexts, ProgressDisplay
 from spiked_service.cli.console import messages, output, report_error, report_warning
+from spiked_service.cli.flag_groups import with_groups
 from spiked_service.results.recording_feed import reconstruct_recording
+from spiked_service.results.scene_scale import remove_scale
 from spiked_service.settings.map_options import changed
 
 RESULTS = "trajectory.tum", "report.json"
 """Files in OUT; with a map also scene.ply."""
 TRUTH = "groundtruth.tum"
+_STEPS = Options().steps
 _LOSSES = {
     ImageKind.TFP: LossName.ACCUMULATION,
     ImageKind.TFI: LossName.INTERVAL,
@@ -53,17 +56,55 @@ class _Posed:
     report: dict[str, Any]
 
 
-# Longer than 60 lines, because each option is a parameter.
-def baseline(
-    file: Annotated[Path, typer.Argument(help="A recording without gaps.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; created if missing.")],
+@dataclass(frozen=True)
+class PictureFlags:
+    """Which pictures are made of the spikes."""
+
     images: Annotated[
         ImageKind,
         typer.Option(
             help="Pictures made of spikes. tfp: mean of a window; tfi: reciprocal of the interval between the two "
             "spikes about its middle; charge: charge between the spikes nearest to its edges."
         ),
-    ] = ImageKind.TFP,
+    ] = ImageKind.TFP
+    window_frames: Annotated[
+        int | None,
+        typer.Option(help="Frames of a picture; by default the longest of 32, 16, 8, 4 that FILE has 35 of.", min=1),
+    ] = None
+    pictures: Annotated[
+        int | None, typer.Option(help="Number of pictures for COLMAP, evenly spaced; by default 60.", min=2)
+    ] = None
+
+    def options(self) -> PictureOptions:
+        """Raises ConfigurationError."""
+        return PictureOptions(self.images, self.window_frames, self.pictures)
+
+
+@dataclass(frozen=True)
+class MapFlags:
+    """How a map is fitted to them."""
+
+    steps: Annotated[int, typer.Option(help="Gradient steps of the map.", min=0)] = _STEPS
+    seed: Annotated[int, typer.Option(help="Of COLMAP and of the map.", min=0)] = 0
+    threads: Annotated[int | None, typer.Option(help="All cores if not given.", min=1)] = None
+    map_option: MapOptionTexts = None
+
+    def options(self, pictures: PictureOptions, recording: Recording, poses: Trajectory) -> Options:
+        """For a map of these pictures at these poses. Raises ConfigurationError."""
+        return Options(
+            window_frames=_window(pictures, recording),
+            steps=self.steps,
+            seed=self.seed,
+            threads=self.threads,
+            poses=poses,
+            mapping=changed(MapOptions(sub_frames=0, loss=_LOSSES[pictures.kind]), self.map_option or []),
+        )
+
+
+@with_groups
+def baseline(
+    file: Annotated[Path, typer.Argument(help="A recording without gaps.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; created if missing.")],
     poses: Annotated[
         PoseSource, typer.Option(help="colmap: structure from motion on the pictures; given: those of --given.")
     ] = PoseSource.COLMAP,
@@ -73,13 +114,6 @@ def baseline(
     given: Annotated[
         Path | None, typer.Option(help="TUM file of camera-to-world poses; by default groundtruth.tum beside FILE.")
     ] = None,
-    window_frames: Annotated[
-        int | None,
-        typer.Option(help="Frames of a picture; by default the longest of 32, 16, 8, 4 that FILE has 35 of.", min=1),
-    ] = None,
-    pictures: Annotated[
-        int | None, typer.Option(help="Number of pictures for COLMAP, evenly spaced; by default 60.", min=2)
-    ] = None,
     all_frames: Annotated[
         bool,
         typer.Option(
@@ -87,21 +121,11 @@ def baseline(
             help="Interpolate poses of the frames between COLMAP's pictures, or write those of the pictures alone.",
         ),
     ] = True,
-    steps: Annotated[int, typer.Option(help="Gradient steps of the map.", min=0)] = Options().steps,
-    seed: Annotated[int, typer.Option(help="Of COLMAP and of the map.", min=0)] = 0,
-    threads: Annotated[int | None, typer.Option(help="All cores if not given.", min=1)] = None,
-    map_option: MapOptionTexts = None,
-    fov: g.Fov = None,
-    intrinsics: g.IntrinsicsText = None,
-    distortion: g.DistortionText = None,
-    width: g.Width = None,
-    height: g.Height = None,
-    rate: g.Rate = None,
-    layout: g.FrameLayout = None,
-    bit_order: g.Bits = None,
-    flipped: g.Flipped = None,
-    mosaic: g.Colours = None,
-    response: g.SensorResponse = None,
+    *,
+    fit: MapFlags,
+    made: PictureFlags,
+    optics: g.OpticsFlags,
+    geometry: g.GeometryFlags,
     profile: g.Profile = None,
 ) -> None:
     """Reconstruct a recording as one would without this program: COLMAP on pictures made of spikes.
@@ -121,32 +145,23 @@ def baseline(
     - `spiked baseline rec.dat -o out --images tfi --poses given --given known.tum`
     """
     outputs.try_folder("--out", out, RESULTS)
-    stated = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic, response=response)
-    recording = g.open_described(file, stated, profile).recording
+    recording = g.open_described(file, geometry.stated(), profile).recording
     for warning in recording.warnings:
         report_warning(warning)
-    sensor = g.with_optics(recording.sensor, fov, intrinsics, distortion)
-    recording = replace(recording, sensor=sensor)
-    options = PictureOptions(images, window_frames, pictures)
+    recording = replace(recording, sensor=optics.of(recording.sensor))
+    options = made.options()
     if poses is PoseSource.GIVEN:
         posed = _Posed(Trajectory.read_tum(given or file.parent / TRUTH), {})
     else:
-        posed = _by_colmap(recording, options, out, (threads, seed), all_frames=all_frames)
-    report: dict[str, Any] = {"images": images, "poses": poses, "map": map, **posed.report}
+        posed = _by_colmap(recording, options, out, (fit.threads, fit.seed), all_frames=all_frames)
+    report: dict[str, Any] = {"images": made.images, "poses": poses, "map": map, **posed.report}
     if map is MapSource.NONE:
         (out / "scene.ply").unlink(missing_ok=True)
         _write(out, posed.trajectory, {"frames": recording.frames, "baseline": report})
         output.print(f"{out}: {len(posed.trajectory)} poses for {recording.frames} frames, no map", markup=False)
         return
-    chosen = Options(
-        window_frames=_window(options, recording),
-        steps=steps,
-        seed=seed,
-        threads=threads,
-        poses=posed.trajectory,
-        mapping=changed(MapOptions(sub_frames=0, loss=_LOSSES[images]), map_option or []),
-    )
-    _map(recording, Reconstructor(sensor, chosen, recording=recording), out, report)
+    chosen = fit.options(options, recording, posed.trajectory)
+    _map(recording, Reconstructor(recording.sensor, chosen, recording=recording), out, report)
 
 
 def _window(options: PictureOptions, recording: Recording) -> int:
@@ -215,5 +230,6 @@ def _map(recording: Recording, reconstructor: Reconstructor, out: Path, report: 
 def _write(out: Path, trajectory: Trajectory, report: dict[str, Any]) -> None:
     with outputs.writing("--out", out):
         out.mkdir(parents=True, exist_ok=True)
+        remove_scale(out)
         trajectory.write_tum(out / "trajectory.tum")
         (out / "report.json").write_text(json.dumps(report, indent=1), encoding="utf-8")

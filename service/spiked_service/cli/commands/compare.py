@@ -1,6 +1,5 @@
 """`spiked compare`: methods x recordings x seeds x metrics, as tables and a page with pictures."""
 
-import fcntl
 import os
 import platform
 import signal
@@ -14,6 +13,7 @@ import typer
 
 from spiked.errors import ConfigurationError, SpikedError
 from spiked.recording import open_recording
+from spiked_service.base.signals import handling
 from spiked_service.base.version import installed_version
 from spiked_service.cli import outputs
 from spiked_service.cli.commands.reconstruct import INTERRUPTED
@@ -23,10 +23,10 @@ from spiked_service.cli.comparison.pictures import Strip, strips
 from spiked_service.cli.comparison.rows import GROUPS, chosen, rows
 from spiked_service.cli.comparison.tables import csv_text, markdown
 from spiked_service.cli.console import messages, output, report_warning
+from spiked_service.results.versions import write_atomically
 
 TABLE, FIGURES, PAGE = "comparison.md", "comparison.csv", "comparison.html"
 """Files in OUT."""
-_LOCK = ".lock"
 
 
 def compare(
@@ -52,8 +52,9 @@ def compare(
     A cell is one method on one recording with one seed, in a process of its own, scored by `spiked evaluate` if the
     truth lies beside the recording; without truth the tables have times and memory, and the page its pictures. Finished
     cells are kept in OUT/cells: a command that was interrupted or killed goes on where it was when it is given again,
-    and one with more rows, recordings or seeds runs only these. A cell that failed is a row that says why; the command
-    then ends with exit code 1. The page shows what was observed, what each method renders, and the truth.
+    and one with more rows, recordings or seeds runs only these. Cells of a recording whose file, calibration or truth
+    has changed are run again. A cell that failed is a row that says why; the command then ends with exit code 1. The
+    page shows what was observed, what each method renders, and the truth.
 
     Examples:
 
@@ -77,28 +78,30 @@ def compare(
         Cell(file.absolute(), names[file], one, seed, steps)
         for file in files for one in wanted for seed in range(seeds)
     ]  # fmt: skip
-    with outputs.writing("--out", out), _alone(out), _interruptible():
+    with outputs.writing("--out", out), outputs.alone("--out", out, "comparison"), _interruptible():
         outcomes = _run(cells, out, limit, retry)
-        _write(cells, outcomes, out)
-    failed = sum(outcome.reason is not None for outcome in outcomes)
+        _write_page(cells, outcomes, out)
+    failed = sum(outcome.reason is not None for outcome in outcomes.values())
     output.print(f"{out / PAGE}: {len(cells)} cells, {failed} failed", markup=False)
     if failed:
         raise typer.Exit(1)
 
 
-def _run(cells: list[Cell], out: Path, limit_s: float | None, retry: bool) -> list[Outcome]:
+def _run(cells: list[Cell], out: Path, limit_s: float | None, retry: bool) -> dict[Cell, Outcome]:
     """The outcome of each cell, from an earlier run where there is one. Tables are written after each new one."""
-    outcomes: list[Outcome] = []
+    outcomes = {cell: outcome for cell in cells if (outcome := stored(cell, out)) is not None}
+    if (out / PAGE).exists() and len(outcomes) < len(cells):
+        _write_page(cells, outcomes, out)  # the one that is there may be of other recordings
     for number, cell in enumerate(cells, 1):
-        outcome = stored(cell, out)
+        outcome = outcomes.get(cell)
         kept = outcome is not None and not (retry and outcome.reason is not None)
         what = f"{number}/{len(cells)} {cell.name}, {cell.row.name}, seed {cell.seed}"
         if outcome is None or not kept:
             messages.print(what, markup=False)
-            outcome = run_cell(cell, out, limit_s)
-        outcomes.append(outcome)
-        (out / TABLE).write_text(markdown(outcomes), encoding="utf-8")
-        (out / FIGURES).write_text(csv_text(outcomes), encoding="utf-8")
+            outcome = outcomes[cell] = run_cell(cell, out, limit_s)
+        shown = _in_order(cells, outcomes)
+        write_atomically(out / TABLE, markdown(shown).encode())
+        write_atomically(out / FIGURES, csv_text(shown).encode())
         said = "kept" if kept else f"{outcome.seconds:.0f} s"
         if outcome.reason is not None:
             report_warning(f"{what}: failed ({said}): {outcome.reason}")
@@ -107,20 +110,24 @@ def _run(cells: list[Cell], out: Path, limit_s: float | None, retry: bool) -> li
     return outcomes
 
 
-def _write(cells: list[Cell], outcomes: list[Outcome], out: Path) -> None:
+def _in_order(cells: list[Cell], outcomes: dict[Cell, Outcome]) -> list[Outcome]:
+    return [outcomes[cell] for cell in cells if cell in outcomes]
+
+
+def _write_page(cells: list[Cell], outcomes: dict[Cell, Outcome], out: Path) -> None:
     """The page, from the cells of the first seed that did not fail."""
     found: dict[str, list[Strip]] = {}
     for recording in dict.fromkeys(cell.recording for cell in cells):
         folders: dict[str, Path] = {}
-        of_it = [pair for pair in zip(cells, outcomes, strict=True) if pair[0].recording == recording]
-        for cell, outcome in of_it:
-            if outcome.reason is None:
+        of_it = [cell for cell in cells if cell.recording == recording]
+        for cell in of_it:
+            if cell in outcomes and outcomes[cell].reason is None:
                 folders.setdefault(cell.row.name, out / cell.place)
         try:
-            found[of_it[0][0].name] = strips(open_recording(recording), folders)
+            found[of_it[0].name] = strips(open_recording(recording), folders)
         except SpikedError as error:
             report_warning(f"no pictures of {recording.name}: {error}")
-    (out / PAGE).write_text(page(outcomes, found, _summary()), encoding="utf-8")
+    write_atomically(out / PAGE, page(_in_order(cells, outcomes), found, _summary()).encode())
 
 
 def _summary() -> list[str]:
@@ -150,30 +157,14 @@ def _names(files: list[Path]) -> dict[Path, str]:
 
 
 @contextmanager
-def _alone(out: Path) -> Iterator[None]:
-    """Raises ConfigurationError where another comparison works in the folder."""
-    out.mkdir(parents=True, exist_ok=True)
-    with (out / _LOCK).open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ConfigurationError(f"--out {out}: another comparison works there; wait, or name another") from error
-        yield
-
-
-@contextmanager
 def _interruptible() -> Iterator[None]:
     """Ctrl-C and SIGTERM end the method that runs, and the command with exit code 130."""
-    numbers = signal.SIGINT, signal.SIGTERM
-    before = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
-    try:
-        yield
-    except KeyboardInterrupt as error:
-        messages.print("interrupted; the same command goes on where it was")
-        raise typer.Exit(INTERRUPTED) from error
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with handling(dict.fromkeys((signal.SIGINT, signal.SIGTERM), signal.default_int_handler)):
+        try:
+            yield
+        except KeyboardInterrupt as error:
+            messages.print("interrupted; the same command goes on where it was")
+            raise typer.Exit(INTERRUPTED) from error
 
 
 def _list() -> None:

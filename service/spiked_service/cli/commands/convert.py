@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
-from spiked.recording import RecordingGeometry
 from spiked.recording.geometry import orientation_questions
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import output, report_warning
+from spiked_service.cli.flag_groups import with_groups
 from spiked_service.conversion.reading import READ_ONLY, Form, read_content
 from spiked_service.conversion.writing import write_content
 
@@ -33,6 +33,7 @@ _FORMS = f"<{'|'.join(Form)}>"
 _WRITTEN_FORMS = f"<{'|'.join(form for form in Form if form not in READ_ONLY)}>"
 
 
+@with_groups
 def convert(
     source: Annotated[Path, typer.Argument(metavar="IN", help="A recording, or the raw bytes of a camera.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="A new file.")],
@@ -44,14 +45,8 @@ def convert(
         typer.Option("--from", help="The form of IN. Default: detected.", parser=_form, metavar=_FORMS),
     ] = None,
     array: Annotated[str | None, typer.Option(help="Name of the array in an .npz or HDF5 file.")] = None,
-    width: g.Width = None,
-    height: g.Height = None,
-    rate: g.Rate = None,
-    layout: g.FrameLayout = None,
-    bit_order: g.Bits = None,
-    flipped: g.Flipped = None,
-    mosaic: g.Colours = None,
-    response: g.SensorResponse = None,
+    *,
+    geometry: g.GeometryFlags,
 ) -> None:
     """Convert between recordings (compact, row_tagged) and raw camera bytes (usb 400x250, pcie 1000x1000).
 
@@ -75,7 +70,7 @@ def convert(
     - `spiked convert vidar.dat rec.dat --from bits --width 346 --height 260`
     """
     outputs.try_file("OUT", out)
-    given = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic, response=response)
+    given = geometry.stated()
     content = read_content(source, source_form, given, report_warning, array)
     for question in orientation_questions(content.assumed, content.sensor):
         report_warning(question)

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from spiked.datasets import KINDS, Clip, Comparison, Dataset, DatasetKind, compare, find_kind, recognise
 from spiked.errors import ConfigurationError
+from spiked_service.cli import outputs
 from spiked_service.cli.console import messages, output, report_error, report_warning
 from spiked_service.cli.dataset_runs.children import INTERRUPTED
 from spiked_service.cli.dataset_runs.run import DatasetRun, InterruptedRunError
@@ -134,10 +135,10 @@ def run(
             report_warning(note)
     work = DatasetRun(kind, dataset, out, list(context.args), shlex.split(simulate), keep_recordings, _say)
     work.begin()
-    compared = _compared(dataset)
-    compared.raise_if_changed(dataset.folder)
     try:
-        table = work.carry_out()
+        with outputs.alone("--out", out, "run of a data set"):
+            _compared(dataset).raise_if_changed(dataset.folder)
+            table = work.carry_out()
     except InterruptedRunError as error:
         report_error(error)
         raise typer.Exit(INTERRUPTED) from error

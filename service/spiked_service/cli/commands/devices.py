@@ -16,11 +16,10 @@ from spiked_driver.usb_kind import KIND as USB
 from spiked.errors import SourceError
 from spiked_service.base.version import installed_version
 from spiked_service.cli.console import messages, output
-from spiked_service.operations.doctor import Diagnosis, DiagnosisStatus, examine
+from spiked_service.cli.findings import show_findings
+from spiked_service.operations.doctor import examine
 from spiked_service.settings.settings import load_settings
 from spiked_service.store.folder import default_folder
-
-_COLOURS = {DiagnosisStatus.OK: "green", DiagnosisStatus.WARNING: "yellow", DiagnosisStatus.PROBLEM: "red"}
 
 
 def devices(
@@ -61,13 +60,7 @@ def devices(
         _probe(probe, as_json)
         return
     if doctor:
-        findings = examine(data or load_settings().settings.data or default_folder())
-        if as_json:
-            print(json.dumps([asdict(finding) for finding in findings], indent=2))
-        else:
-            _show_findings(findings)
-        if any(finding.status is DiagnosisStatus.PROBLEM for finding in findings):
-            raise typer.Exit(1)
+        show_findings(examine(data or load_settings().settings.data or default_folder()), as_json)
         return
     found = known_devices(load_settings().settings.devices)
     if as_json:
@@ -133,11 +126,3 @@ def _show_devices(found: list[Device]) -> None:
         named = next(device for device in found if device.kind == kind and device.capabilities)
         listed = ", ".join(f"{name} {capability}" for name, capability in named.capabilities.items())
         output.print(f"{kind} cameras: {listed}".replace("_", " "), markup=False)
-
-
-def _show_findings(findings: list[Diagnosis]) -> None:
-    for finding in findings:
-        output.print(f"[{_COLOURS[finding.status]}]{finding.status:8s}[/] {finding.name}: ", end="")
-        output.print(finding.finding, markup=False)
-        if finding.what_to_do:
-            output.print(f"         {finding.what_to_do}", markup=False)

@@ -7,26 +7,22 @@ import numpy as np
 import typer
 
 from spiked.recon.frontend.mosaic_check import recorded_layout_warnings
-from spiked.recording import Recording, RecordingGeometry
+from spiked.recording import Recording
 from spiked.recording.time_base import MeasuredRate, measured_rate
 from spiked.sensor import Response
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import output, report_warning
+from spiked_service.cli.flag_groups import with_groups
 
 _SAMPLED_FRAMES = 4096
 """Frames from which the mean rate is computed."""
 
 
+@with_groups
 def info(
     file: Annotated[Path, typer.Argument(help="A recording.", readable=False)],
-    width: g.Width = None,
-    height: g.Height = None,
-    rate: g.Rate = None,
-    layout: g.FrameLayout = None,
-    bit_order: g.Bits = None,
-    flipped: g.Flipped = None,
-    mosaic: g.Colours = None,
-    response: g.SensorResponse = None,
+    *,
+    geometry: g.GeometryFlags,
     profile: g.Profile = None,
 ) -> None:
     """Print geometry, length, spike rate and gaps of a recording, and the origin of the geometry.
@@ -37,7 +33,7 @@ def info(
 
     - `spiked info rec.dat --width 640 --height 360 --rate 40000 --mosaic BGGR`
     """
-    stated = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic, response=response)
+    stated = geometry.stated()
     recording = g.open_described(file, stated, profile).recording
     for warning in recording.warnings:
         report_warning(warning)

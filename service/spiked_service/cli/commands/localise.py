@@ -11,11 +11,12 @@ from rich.progress import track
 from spiked.errors import RecordingError
 from spiked.recon import Localisation, Localiser, MapIndex
 from spiked.recon.report import machine, versions
-from spiked.recording import Recording, RecordingGeometry
+from spiked.recording import Recording
 from spiked.sensor import Sensor
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import messages, output, report_warning
+from spiked_service.cli.flag_groups import with_groups
 from spiked_service.results.map_folder import MapFolder, camera_in
 from spiked_service.results.map_reports import LOCALISATION, localisation_figures, recording_section
 from spiked_service.results.recording_feed import pieces
@@ -24,6 +25,7 @@ NOT_RECOGNISED = 1
 """Exit code; errors have 2."""
 
 
+@with_groups
 def localise(
     map_folder: Annotated[Path, typer.Argument(metavar="MAP", help="Output folder of `spiked reconstruct`.")],
     file: Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording.", readable=False)],
@@ -33,17 +35,9 @@ def localise(
     start: Annotated[int, typer.Option(help="First stored frame to use.", min=0)] = 0,
     frames: Annotated[int | None, typer.Option(help="Number of frames to use. Default: all.", min=1)] = None,
     json_out: Annotated[Path | None, typer.Option("--json", help="Also write the figures to this file.")] = None,
-    fov: g.Fov = None,
-    intrinsics: g.IntrinsicsText = None,
-    distortion: g.DistortionText = None,
-    width: g.Width = None,
-    height: g.Height = None,
-    rate: g.Rate = None,
-    layout: g.FrameLayout = None,
-    bit_order: g.Bits = None,
-    flipped: g.Flipped = None,
-    mosaic: g.Colours = None,
-    response: g.SensorResponse = None,
+    *,
+    optics: g.OpticsFlags,
+    geometry: g.GeometryFlags,
     profile: g.Profile = None,
     calibration: g.CalibrationFile = None,
 ) -> None:
@@ -65,16 +59,14 @@ def localise(
     if json_out is not None:
         outputs.try_file("--json", json_out)
     known = MapFolder.read(map_folder)
-    stated = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic, response=response)
-    described = g.open_described(file, stated, profile)
+    described = g.open_described(file, geometry.stated(), profile)
     recording = described.recording
-    measured = g.read_calibration(calibration, described)
     for warning in recording.warnings:
         report_warning(warning)
     end = _end(recording, start, frames)
-    sensor = g.with_optics(recording.sensor, fov, intrinsics, distortion)
+    sensor = optics.of(recording.sensor)
     index = MapIndex(known.scene, known.known.trajectory, camera_in(sensor, known.camera))
-    localiser = Localiser(index, sensor, measured)
+    localiser = Localiser(index, sensor, g.read_calibration(calibration, described))
     for first_frame, part in track(
         list(_parts(recording, start, end)), "localising", console=messages, transient=True,
         disable=not messages.is_terminal,

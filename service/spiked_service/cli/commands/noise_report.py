@@ -9,25 +9,20 @@ import typer
 
 from spiked.noise import NoiseReport, measure_noise
 from spiked.photon_noise import PhotonNoiseReport, measure_photon_noise
-from spiked.recording import RecordingGeometry
 from spiked.sensor import Response
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import output, report_warning
+from spiked_service.cli.flag_groups import with_groups
 
 
+@with_groups
 def noise_report(
     file: Annotated[Path, typer.Argument(help="A recording in which nothing moves.", readable=False)],
     frames: Annotated[int, typer.Option(min=80, max=60_000, help="Maximum number of frames to read.")] = 2048,
     json_file: Annotated[Path | None, typer.Option("--json", help="Also write the figures to this file.")] = None,
-    width: g.Width = None,
-    height: g.Height = None,
-    rate: g.Rate = None,
-    layout: g.FrameLayout = None,
-    bit_order: g.Bits = None,
-    flipped: g.Flipped = None,
-    mosaic: g.Colours = None,
-    response: g.SensorResponse = None,
+    *,
+    geometry: g.GeometryFlags,
     profile: g.Profile = None,
 ) -> None:
     """Measure the noise of a camera from a recording of a static scene.
@@ -48,7 +43,7 @@ def noise_report(
     """
     if json_file is not None:
         outputs.try_file("--json", json_file)
-    stated = RecordingGeometry(width, height, rate, layout, bit_order, flipped, mosaic, response=response)
+    stated = geometry.stated()
     recording = g.open_described(file, stated, profile).recording
     for warning in recording.warnings:
         report_warning(warning)

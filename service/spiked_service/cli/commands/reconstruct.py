@@ -6,12 +6,14 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import (
@@ -24,12 +26,14 @@ from rich.progress import (
 from rich.text import Text
 
 from spiked.errors import ConfigurationError, SceneError, SpikedError
+from spiked.numpy_files import UNREADABLE
 from spiked.recon import (
     Initialisation,
     LossName,
     Merged,
     MethodName,
     NotOnePlaceError,
+    Options,
     PoseStepName,
     Reconstructor,
     State,
@@ -38,14 +42,16 @@ from spiked.recon import (
 )
 from spiked.recon.frontend.mosaic_check import detect
 from spiked.recon.frontend.windowing import Windows
-from spiked.recording import Recording, RecordingGeometry
+from spiked.recording import Recording
 from spiked.sensor import Mosaic, Sensor
 from spiked.trajectory import Trajectory
+from spiked_service.base.signals import handling
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import messages, output, report_error, report_warning
+from spiked_service.cli.flag_groups import with_groups
 from spiked_service.cli.reconstruction_run import RESULTS, ReconstructionRun, parameters_of
-from spiked_service.results.map_folder import MapFolder, file_name, joint_paths, write_map
+from spiked_service.results.map_folder import MapFolder, file_name, joint_paths, replacing, write_map
 from spiked_service.results.recording_feed import reconstruct_recording
 from spiked_service.settings.map_options import changed
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
@@ -80,7 +86,34 @@ MapOptionTexts = Annotated[
 ]
 
 
-# Longer than 60 lines, because each option is a parameter.
+@dataclass(frozen=True)
+class ReconstructionFlags:
+    """One flag for each option of a reconstruction."""
+
+    steps: Annotated[int, _option("steps")] = _DEFAULTS.steps
+    seed: Annotated[int, _option("seed")] = _DEFAULTS.seed
+    window_frames: Annotated[int | None, _option("window_frames")] = _DEFAULTS.window_frames
+    threads: Annotated[int | None, _option("threads")] = _DEFAULTS.threads
+    max_views: Annotated[int, _option("max_views")] = _DEFAULTS.max_views
+    memory_mb: Annotated[int, _option("memory_mb")] = _DEFAULTS.memory_mb
+    refine_poses: Annotated[bool, _option("refine_poses")] = _DEFAULTS.refine_poses
+    method: Annotated[MethodName, _option("method")] = _DEFAULTS.method
+    initialisation: Annotated[Initialisation | None, _option("initialisation")] = _DEFAULTS.initialisation
+    pose_step: Annotated[PoseStepName | None, _option("pose_step")] = _DEFAULTS.pose_step
+    loss: Annotated[LossName | None, _option("loss")] = _DEFAULTS.loss
+
+    def options(self) -> Options:
+        """Raises ConfigurationError."""
+        return ReconstructionOptions(**vars(self)).options()
+
+
+_FIRST_DEPTH = typer.Option(
+    help="With --method nope-sgs: depth of the first view as NumPy's .npy [H, W], in any unit, by any estimator; "
+    "from a flat view that method does not find its path."
+)
+
+
+@with_groups
 def reconstruct(
     context: typer.Context,
     file: Annotated[Path | None, typer.Argument(help="A recording.", readable=False)] = None,
@@ -93,32 +126,15 @@ def reconstruct(
         Path | None, typer.Option(help="Output folder of an earlier run, of the same place: its map is extended.")
     ] = None,
     poses: Annotated[Path | None, typer.Option(help="TUM file of known camera-to-world poses.")] = None,
+    first_depth: Annotated[Path | None, _FIRST_DEPTH] = None,
     seconds: Annotated[float | None, typer.Option(help="Time budget; reduces the number of steps.", min=0.0)] = None,
-    steps: Annotated[int, _option("steps")] = _DEFAULTS.steps,
-    seed: Annotated[int, _option("seed")] = _DEFAULTS.seed,
-    window_frames: Annotated[int | None, _option("window_frames")] = _DEFAULTS.window_frames,
-    threads: Annotated[int | None, _option("threads")] = _DEFAULTS.threads,
-    max_views: Annotated[int, _option("max_views")] = _DEFAULTS.max_views,
-    memory_mb: Annotated[int, _option("memory_mb")] = _DEFAULTS.memory_mb,
-    refine_poses: Annotated[bool, _option("refine_poses")] = _DEFAULTS.refine_poses,
-    method: Annotated[MethodName, _option("method")] = _DEFAULTS.method,
-    initialisation: Annotated[Initialisation | None, _option("initialisation")] = _DEFAULTS.initialisation,
-    pose_step: Annotated[PoseStepName | None, _option("pose_step")] = _DEFAULTS.pose_step,
-    loss: Annotated[LossName | None, _option("loss")] = _DEFAULTS.loss,
+    *,
+    chosen: ReconstructionFlags,
     map_option: MapOptionTexts = None,
     watch: Annotated[bool, typer.Option("--watch", help="Serve a progress page.")] = False,
     watch_port: Annotated[int, typer.Option(help="Port of the progress page; 0: any free port.", min=0)] = 8660,
-    fov: g.Fov = None,
-    intrinsics: g.IntrinsicsText = None,
-    distortion: g.DistortionText = None,
-    width: g.Width = None,
-    height: g.Height = None,
-    rate: g.Rate = None,
-    layout: g.FrameLayout = None,
-    bit_order: g.Bits = None,
-    flipped: g.Flipped = None,
-    mosaic: g.ColoursOrAuto = None,
-    response: g.SensorResponse = None,
+    optics: g.OpticsFlags,
+    geometry: g.DetectableGeometryFlags,
     profile: g.Profile = None,
     calibration: g.CalibrationFile = None,
 ) -> None:
@@ -156,43 +172,50 @@ def reconstruct(
     if file is None or out is None:
         raise ConfigurationError("name a recording and a folder for the results (-o OUT), or --resume OUT")
     outputs.try_folder("--out", out, RESULTS)
-    if map is not None:
-        _check_map(map, out)
-    colours = None if mosaic in (None, g.MosaicChoice.AUTO) else Mosaic(mosaic)
-    described = g.open_described(
-        file, RecordingGeometry(width, height, rate, layout, bit_order, flipped, colours, response=response), profile
-    )
+    run = _begun(context, file, out, chosen, optics, geometry)
+    _carry_out(run, _watched(file.name, watch_port) if watch else None)
+
+
+def _begun(
+    context: typer.Context,
+    file: Path,
+    out: Path,
+    chosen: ReconstructionFlags,
+    optics: g.OpticsFlags,
+    geometry: g.DetectableGeometryFlags,
+) -> ReconstructionRun:
+    """A new run, by the other parameters of the command, too. Raises SpikedError."""
+    given = context.params
+    if given["map"] is not None:
+        _check_map(given["map"], out)
+    described = g.open_described(file, geometry.stated(), given["profile"])
     recording = described.recording
     for warning in recording.warnings:
         report_warning(warning)
-    sensor = g.with_optics(recording.sensor, fov, intrinsics, distortion)
+    sensor = optics.of(recording.sensor)
     questions = list(recording.questions)
-    if mosaic is g.MosaicChoice.AUTO:
+    if geometry.detects:
         sensor, question = _by_pixels(recording, sensor)
         questions += question
-    chosen = ReconstructionOptions(
-        steps=steps,
-        seed=seed,
-        window_frames=window_frames,
-        threads=threads,
-        max_views=max_views,
-        memory_mb=memory_mb,
-        refine_poses=refine_poses,
-        method=method,
-        initialisation=initialisation,
-        pose_step=pose_step,
-        loss=loss,
-    )
-    known = None if poses is None else Trajectory.read_tum(poses)
-    measured = g.read_calibration(calibration, described)
-    options = chosen.options()
-    mapping = changed(options.mapping, map_option or [])
-    reconstructor = Reconstructor(
-        sensor, replace(options, poses=known, calibration=measured, mapping=mapping), recording=recording
-    )
+    known = None if given["poses"] is None else Trajectory.read_tum(given["poses"])
+    first_depth = None if given["first_depth"] is None else _read_depth(given["first_depth"])
+    measured = g.read_calibration(given["calibration"], described)
+    options = replace(chosen.options(), poses=known, calibration=measured, first_depth=first_depth)
+    mapping = changed(options.mapping, given["map_option"] or [])
+    reconstructor = Reconstructor(sensor, replace(options, mapping=mapping), recording=recording)
     reconstructor.warnings += questions
-    run = ReconstructionRun.begun(recording, reconstructor, out, parameters_of(context, described.geometry))
-    _carry_out(run, _watched(file.name, watch_port) if watch else None)
+    return ReconstructionRun.begun(recording, reconstructor, out, parameters_of(context, described.geometry))
+
+
+def _read_depth(file: Path) -> NDArray[np.float64]:
+    """A depth map. Raises ConfigurationError."""
+    try:
+        depth = np.load(file, allow_pickle=False)
+    except UNREADABLE as error:
+        raise ConfigurationError(f"--first-depth {file}: {error}") from error
+    if not isinstance(depth, np.ndarray) or depth.ndim != 2 or depth.dtype.kind not in "fiu":
+        raise ConfigurationError(f"--first-depth {file}: expected one array of numbers [H, W]")
+    return depth.astype(np.float64)
 
 
 def _carry_out(run: ReconstructionRun, page: "Watch | None") -> None:
@@ -244,7 +267,7 @@ def _write_joint(run: ReconstructionRun, known: MapFolder, made: Merged) -> None
     report = {**run.report(), "splats": len(made.scene), "extended": figures}
     with outputs.writing("--out", run.out):
         run.out.mkdir(parents=True, exist_ok=True)
-        _draw(run)
+        _draw(run, run.out)
         write_map(run.out, made.scene, made.joint.second.trajectory, _joint_paths(run, known, made), report)
 
 
@@ -352,12 +375,8 @@ class _Interrupt:
 @contextmanager
 def _interruptible() -> Iterator[_Interrupt]:
     interrupt = _Interrupt()
-    before = {number: signal.signal(number, interrupt.handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with handling(dict.fromkeys((signal.SIGINT, signal.SIGTERM), interrupt.handle)):
         yield interrupt
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 class ProgressDisplay:
@@ -423,16 +442,15 @@ def _write(run: ReconstructionRun, extended: dict[str, object]) -> None:
     """Write the reconstruction alone; `extended` says why the map is not in it, if there is one."""
     reconstructor, out = run.reconstructor, run.out
     report = {**run.report(), **({"extended": extended} if extended else {})}
-    with outputs.writing("--out", out):
-        out.mkdir(parents=True, exist_ok=True)
-        reconstructor.scene().write_ply(out / "scene.ply", reconstructor.white)
-        reconstructor.trajectory().write_tum(out / "trajectory.tum")
-        (out / "report.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
-        _draw(run)
+    with outputs.writing("--out", out), replacing(out) as making:
+        reconstructor.scene().write_ply(making / "scene.ply", reconstructor.white)
+        reconstructor.trajectory().write_tum(making / "trajectory.tum")
+        (making / "report.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
+        _draw(run, making)
 
 
-def _draw(run: ReconstructionRun) -> None:
+def _draw(run: ReconstructionRun, folder: Path) -> None:
     from spiked_service.cli.overview import draw_overview  # matplotlib takes longer to load than most commands run
 
     reconstructor = run.reconstructor
-    draw_overview(reconstructor, run.recording.path.name, reconstructor.losses, run.out / "overview.png")
+    draw_overview(reconstructor, run.recording.path.name, reconstructor.losses, folder / "overview.png")

@@ -1,5 +1,6 @@
 """`spiked record`: captures of one or several devices of a running service, started together."""
 
+import signal
 import time
 from pathlib import Path
 from typing import Annotated
@@ -10,6 +11,7 @@ from rich.table import Table
 
 from spiked.client import CaptureOut, CaptureRequest, CaptureState, GroupOut, Spiked
 from spiked.errors import ConfigurationError
+from spiked_service.base.signals import handling
 from spiked_service.cli import outputs
 from spiked_service.cli.console import messages, output, report_warning
 from spiked_service.results.map_folder import file_name
@@ -46,9 +48,9 @@ def record(
 ) -> None:
     """Record devices of a running service together, and print how their clocks lie to each other.
 
-    Several devices are started together or not at all: if one cannot start, the error names it. Ctrl-C stops all of
-    them. At the end each recording is printed with its frames and losses, and, of all but the first, the time from the
-    first frame of the first recording to its own, with its standard deviation.
+    Several devices are started together or not at all: if one cannot start, the error names it. Ctrl-C or SIGTERM
+    stops all of them. At the end each recording is printed with its frames and losses, and, of all but the first, the
+    time from the first frame of the first recording to its own, with its standard deviation.
 
     The exit code is 1 if a capture failed.
 
@@ -73,15 +75,22 @@ def record(
         for source in sources
     ]
     with Spiked(address, token=chosen_token(token, token_file)) as client:
-        run = _Run(client, plans)
-        stopped = run.wait()
+        # The end of the terminal and SIGTERM stop the captures, as Ctrl-C does: nobody else would.
+        with handling(dict.fromkeys((signal.SIGTERM, signal.SIGHUP), signal.default_int_handler)):
+            run = _Run(client, plans)
+            stopped = run.wait()
         _show(run)
         if out is not None:
             _save(client, run.captures, out)
-    if stopped and any(one.state not in _OVER for one in run.captures):
-        raise typer.Exit(INTERRUPTED)
-    if any(one.state is CaptureState.failed for one in run.captures):
-        raise typer.Exit(1)
+    if status := _status(run.captures, stopped):
+        raise typer.Exit(status)
+
+
+def _status(captures: list[CaptureOut], stopped: bool) -> int:
+    """The exit status."""
+    if stopped and any(one.state not in _OVER for one in captures):
+        return INTERRUPTED
+    return int(any(one.state is CaptureState.failed for one in captures))
 
 
 class _Run:

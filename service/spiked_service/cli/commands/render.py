@@ -55,6 +55,7 @@ def render(
     with outputs.writing("--out", out):
         out.mkdir(parents=True, exist_ok=True)
         for row in track(rows, "rendering", console=messages, transient=True):
-            image = rasteriser.forward(splats, path.rotations[row][None], path.centres[row][None])
+            shown = splats.seen_from(path.centres[row])
+            image = rasteriser.forward(shown, path.rotations[row][None], path.centres[row][None])
             (out / f"{row:06d}.{kind}").write_bytes(encode(image.values, kind, shown_white))
     output.print(f"{out}: {len(rows)} pictures")

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from spiked.errors import ConfigurationError
 from spiked.render.cpu import usable_cores
 from spiked.sensor import Mosaic, Response, Sensor
-from spiked.simulate import MotionKind, SimulatedCamera
+from spiked.simulate import MotionKind, NoiseOptions, SimulatedCamera
 from spiked.simulate.camera import DEFAULT_GAIN, LONG_FRAMES, LONG_STEP_PX, default_step_px
 from spiked.simulate.pictures.record import Interpolation
 from spiked.simulate.record import camera_of_files
@@ -21,6 +21,7 @@ from spiked.simulate.record import simulate as write_simulation
 from spiked_service.cli import noise_flags as n
 from spiked_service.cli import outputs
 from spiked_service.cli.console import messages, output
+from spiked_service.cli.flag_groups import with_groups
 from spiked_service.cli.picture_simulation import VideoOptions, simulate_video
 from spiked_service.cli.recording_flags import DistortionText, with_optics
 
@@ -35,23 +36,19 @@ _LINE_S = 10.0
 """Time between two lines of progress where standard error is not a terminal."""
 
 
-# Longer than 60 lines, because each option is a parameter.
-def simulate(
-    context: typer.Context,
-    out: Annotated[Path, typer.Option("--out", "-o", help="New folder for recording and ground truth.")],
-    name: Annotated[str, typer.Option(help="Name of the recording.")] = "simulated",
-    frames: Annotated[
-        int | None, typer.Option(help="Number of frames. Default: 1280; of pictures: as long as they last.", min=1)
-    ] = None,
-    scene: Annotated[Path | None, typer.Option(help="A 3DGS PLY instead of the built-in room.")] = None,
+@dataclass(frozen=True)
+class LightFlags:
+    """What a simulated camera sees."""
+
+    scene: Annotated[Path | None, typer.Option(help="A 3DGS PLY instead of the built-in room.")] = None
     poses: Annotated[
         Path | None,
         typer.Option(help="TUM file of the camera path, of --scene or --video; of a video also a transforms.json."),
-    ] = None,
+    ] = None
     video: Annotated[
         Path | None,
         typer.Option(help="A video, or a folder of images, instead of the built-in room.", rich_help_panel=_PICTURES),
-    ] = None,
+    ] = None
     picture_rate: Annotated[
         float | None,
         typer.Option(
@@ -61,45 +58,62 @@ def simulate(
             max=1e6,
             rich_help_panel=_PICTURES,
         ),
-    ] = None,
+    ] = None
     gamma: Annotated[
         str,
         typer.Option(
             help="How values of pictures follow from light: srgb, linear, or an exponent such as 2.2.",
             rich_help_panel=_PICTURES,
         ),
-    ] = "srgb",
+    ] = "srgb"
     interpolation: Annotated[
         Interpolation,
         typer.Option(
             help="Light between pictures: linear fades from one to the next; motion moves it along the optical flow.",
             rich_help_panel=_PICTURES,
         ),
-    ] = Interpolation.LINEAR,
-    motion: Annotated[MotionKind, typer.Option(help="Path through the built-in room.")] = MotionKind.HAND_SHAKE,
-    flow: Annotated[
-        float, typer.Option(help="Image motion in pixels per frame, in the built-in room.", min=0.0)
-    ] = 0.12,
+    ] = Interpolation.LINEAR
+    motion: Annotated[MotionKind, typer.Option(help="Path through the built-in room.")] = MotionKind.HAND_SHAKE
+    flow: Annotated[float, typer.Option(help="Image motion in pixels per frame, in the built-in room.", min=0.0)] = 0.12
+
+
+@dataclass(frozen=True)
+class CameraFlags:
+    """Geometry and optics of a simulated camera."""
+
     width: Annotated[
         int | None, typer.Option(help="Width in pixels; a multiple of 8. Default: 400, or that of the pictures.")
-    ] = None,
-    height: Annotated[int | None, typer.Option(help="Height in pixels. Default: 250, or that of the pictures.")] = None,
-    rate: Annotated[float, typer.Option(help="Frame rate in Hz.")] = 20_000.0,
-    mosaic: Annotated[Mosaic | None, typer.Option(help="Colour mosaic of the upright image. Default: grey.")] = None,
-    response: Annotated[
-        Response, typer.Option(help="How light becomes spikes; bernoulli: a single-photon camera.")
-    ] = Response.INTEGRATE_AND_FIRE,
-    fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees. Default: 60.")] = None,
-    intrinsics: Annotated[str | None, typer.Option(help="fx,fy,cx,cy in pixels.", metavar="FX,FY,CX,CY")] = None,
-    distortion: DistortionText = None,
+    ] = None
+    height: Annotated[int | None, typer.Option(help="Height in pixels. Default: 250, or that of the pictures.")] = None
+    rate: Annotated[float, typer.Option(help="Frame rate in Hz.")] = 20_000.0
+    mosaic: Annotated[Mosaic | None, typer.Option(help="Colour mosaic of the upright image. Default: grey.")] = None
+    response: Annotated[Response, typer.Option(help="How light becomes spikes; bernoulli: a single-photon camera.")] = (
+        Response.INTEGRATE_AND_FIRE
+    )
+    fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees. Default: 60.")] = None
+    intrinsics: Annotated[str | None, typer.Option(help="fx,fy,cx,cy in pixels.", metavar="FX,FY,CX,CY")] = None
+    distortion: DistortionText = None
+
+    def sensor(self) -> Sensor:
+        """Of a rendered scene. Raises ConfigurationError."""
+        size = self.width or _WIDTH, self.height or _HEIGHT
+        fov = _FOV_DEG if self.intrinsics is None and self.fov is None else self.fov
+        sensor = Sensor(*size, self.rate, mosaic=self.mosaic, response=self.response)
+        return with_optics(sensor, fov, self.intrinsics, self.distortion)
+
+
+@dataclass(frozen=True)
+class TakeFlags:
+    """Light level, held-out views and random numbers of a simulation."""
+
     gain: Annotated[
         float | None,
         typer.Option(help="Spikes per frame of white. Default: from the PLY, or 0.35."),
-    ] = None,
+    ] = None
     views: Annotated[
         int | None,
         typer.Option(help="Number of held-out noise-free views. Default: 16; of pictures: 0.", min=0),
-    ] = None,
+    ] = None
     picture_step: Annotated[
         float | None,
         typer.Option(
@@ -109,22 +123,23 @@ def simulate(
             "pictures that are made.",
             min=0.01,
         ),
+    ] = None
+    seed: Annotated[int, typer.Option(help="Same seed and options: same bytes.")] = 0
+
+
+@with_groups
+def simulate(
+    context: typer.Context,
+    out: Annotated[Path, typer.Option("--out", "-o", help="New folder for recording and ground truth.")],
+    name: Annotated[str, typer.Option(help="Name of the recording.")] = "simulated",
+    frames: Annotated[
+        int | None, typer.Option(help="Number of frames. Default: 1280; of pictures: as long as they last.", min=1)
     ] = None,
-    seed: Annotated[int, typer.Option(help="Same seed and options: same bytes.")] = 0,
-    electrons_a_spike: n.ElectronsASpike = n.DEFAULT.electrons_a_spike,
-    temperature_k: n.TemperatureK = n.DEFAULT.temperature_k,
-    swing_v: n.SwingV = n.DEFAULT.swing_v,
-    reset_noise: n.ResetNoise = n.DEFAULT.reset_noise,
-    threshold_jitter: n.ThresholdJitter = n.DEFAULT.threshold_jitter,
-    dark: n.Dark = n.DEFAULT.dark,
-    dark_spread: n.DarkSpread = n.DEFAULT.dark_spread,
-    capacitance_mismatch: n.CapacitanceMismatch = n.DEFAULT.capacitance_mismatch,
-    reset_bias: n.ResetBias = n.DEFAULT.reset_bias,
-    hot_share: n.HotShare = n.DEFAULT.hot_share,
-    hot_rate: n.HotRate = n.DEFAULT.hot_rate,
-    dead_share: n.DeadShare = n.DEFAULT.dead_share,
-    flicker: n.Flicker = n.DEFAULT.flicker,
-    flicker_hz: n.FlickerHz = n.DEFAULT.flicker_hz,
+    *,
+    light: LightFlags,
+    camera: CameraFlags,
+    take: TakeFlags,
+    noise: n.NoiseFlags,
 ) -> None:
     """Simulate a camera with shot, thermal, dark and fixed-pattern noise, with ground truth.
 
@@ -149,51 +164,39 @@ def simulate(
     - `spiked simulate -o walk --scene flat.ply --poses walk.tum --fov 60 --frames 200000 --views 40`
     """
     outputs.try_folder("--out", out)
-    threads = usable_cores()
-    options = n.noise_of(context.params).checked(response)
-    if video is not None:
+    options = noise.options().checked(camera.response)
+    if light.video is not None:
         _refuse_with_video(context)
         given: dict[str, Any] = {one.name: context.params.get(one.name) for one in fields(VideoOptions)}
-        given |= {"noise": options, "threads": threads, "views": views or 0}
+        given |= {"noise": options, "threads": usable_cores(), "views": take.views or 0}
         simulate_video(VideoOptions(**given), show_progress)
         return
     frames = _FRAMES if frames is None else frames
-    sensor = Sensor(width or _WIDTH, height or _HEIGHT, rate, mosaic=mosaic, response=response)
-    if intrinsics is None and fov is None:
-        fov = _FOV_DEG
-    sensor = with_optics(sensor, fov, intrinsics, distortion)
-    if (scene is None) != (poses is None):
-        raise ConfigurationError("give --scene and --poses together")
-    step_px = default_step_px(frames) if picture_step is None else picture_step
-    if scene is not None and poses is not None:
-        camera = camera_of_files(
-            sensor,
-            scene,
-            poses,
-            seed=seed,
-            noise=options.noise(),
-            lighting=options.lighting(),
-            gain=gain,
-            step_px=step_px,
-            threads=threads,
-        )
-    else:
-        gain = DEFAULT_GAIN if gain is None else gain
-        camera = SimulatedCamera(
-            sensor,
-            seed,
-            motion,
-            noise=options.noise(),
-            gain=gain,
-            flow_px=flow,
-            lighting=options.lighting(),
-            step_px=step_px,
-            threads=threads,
-        )
-    views = _VIEWS if views is None else views
+    views = _VIEWS if take.views is None else take.views
+    made = _rendered(light, camera.sensor(), take, options, default_step_px(frames))
     with show_progress("simulating", frames) as show:
-        path = write_simulation(camera, out, name, frames, views=views, seed=seed, progress=show)
-    output.print(f"{path}: {frames} frames, {sensor.width}x{sensor.height}, ground truth in {out / 'groundtruth.tum'}")
+        path = write_simulation(made, out, name, frames, views=views, seed=take.seed, progress=show)
+    size = f"{made.sensor.width}x{made.sensor.height}"
+    output.print(f"{path}: {frames} frames, {size}, ground truth in {out / 'groundtruth.tum'}")
+
+
+def _rendered(
+    light: LightFlags, sensor: Sensor, take: TakeFlags, noise: NoiseOptions, step_px: float | None
+) -> SimulatedCamera:
+    """The camera in a scene; `step_px`: between exact pictures if the flags do not say. Raises ConfigurationError."""
+    if (light.scene is None) != (light.poses is None):
+        raise ConfigurationError("give --scene and --poses together")
+    common: dict[str, Any] = {
+        "seed": take.seed,
+        "noise": noise.noise(),
+        "lighting": noise.lighting(),
+        "step_px": step_px if take.picture_step is None else take.picture_step,
+        "threads": usable_cores(),
+    }
+    if light.scene is not None and light.poses is not None:
+        return camera_of_files(sensor, light.scene, light.poses, gain=take.gain, **common)
+    gain = DEFAULT_GAIN if take.gain is None else take.gain
+    return SimulatedCamera(sensor, motion=light.motion, gain=gain, flow_px=light.flow, **common)
 
 
 def _refuse_with_video(context: typer.Context) -> None:

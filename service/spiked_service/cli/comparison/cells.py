@@ -1,10 +1,9 @@
 """A cell: one method on one recording with one seed, run in a process of its own, measured and scored.
 
 A cell is made in a folder beside its place and moved there when it is complete, so that a killed comparison leaves
-whole cells or none. A cell that failed is one, too.
+whole cells or none. A cell that failed is one, too. It is kept for the recording and truth that it was made of.
 """
 
-import ctypes
 import json
 import os
 import shutil
@@ -17,11 +16,11 @@ from pathlib import Path
 
 from pydantic import BaseModel, ValidationError
 
+from spiked.lifetime import ending_with_this
 from spiked_service.base.version import installed_version
+from spiked_service.cli.comparison.inputs import GROUND_TRUTH, HELD_OUT, digest_of_inputs
 from spiked_service.cli.comparison.rows import TRUTH, Row
 
-GROUND_TRUTH, HELD_OUT = "groundtruth.tum", "views.json"
-"""Files of the truth beside a recording."""
 RECORD = "cell.json"
 RESULT, PICTURES = "result", "pictures"
 """Folders in a cell: what the method wrote, and the held-out views."""
@@ -31,9 +30,6 @@ _FRAME = " \t│╭╮╰╯─"
 """Around the message about an option that cannot be parsed."""
 _POLL_S = 0.02
 """Seconds between two looks at the process."""
-_LIBC = ctypes.CDLL(None)
-_PR_SET_PDEATHSIG = 1
-"""Of prctl(2)."""
 
 
 class Outcome(BaseModel):
@@ -54,6 +50,8 @@ class Outcome(BaseModel):
     figures: dict[str, float] = {}
     """Of `spiked evaluate`; empty without a truth."""
     version: str = ""
+    inputs: str = ""
+    """Digest of the recording and of what lies beside it; empty if they changed meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -89,26 +87,40 @@ class Cell:
 
 
 def stored(cell: Cell, out: Path) -> Outcome | None:
-    """The outcome of an earlier run of the same cell; None if there is none, or its options were others."""
+    """The outcome of an earlier run of the same cell; None if there is none, or its options, recording or truth
+    were others. Raises RecordingError."""
     try:
         outcome = Outcome.model_validate_json((out / cell.place / RECORD).read_bytes())
     except (OSError, ValidationError):
         return None
-    return outcome if outcome.command == cell.command else None
+    same = outcome.recording == cell.name and outcome.command == cell.command
+    return outcome if same and outcome.inputs == digest_of_inputs(cell.recording) else None
 
 
 def run_cell(cell: Cell, out: Path, limit_s: float | None = None) -> Outcome:
-    """Run, score and store a cell. One that fails or takes longer than `limit_s` has an outcome with a reason."""
+    """Run, score and store a cell. One that fails or takes longer than `limit_s` has an outcome with a reason.
+
+    Raises RecordingError and OSError.
+    """
     place = out / cell.place
     place.parent.mkdir(parents=True, exist_ok=True)
     for left in place.parent.glob(f"{place.name}.making-*"):
         shutil.rmtree(left, ignore_errors=True)
     making = place.with_name(f"{place.name}.making-{os.getpid()}")
     making.mkdir()
+    inputs = digest_of_inputs(cell.recording)
     outcome = _outcome(cell, making, limit_s)
+    if digest_of_inputs(cell.recording) == inputs:
+        outcome = outcome.model_copy(update={"inputs": inputs})
+    else:
+        changed = "the recording or its truth changed while the cell was made; give the command again"
+        outcome = outcome.model_copy(update={"reason": changed})
     (making / RECORD).write_text(outcome.model_dump_json(indent=1), encoding="utf-8")
-    shutil.rmtree(place, ignore_errors=True)
+    old = place.with_name(f"{place.name}.making-old")
+    if place.exists():
+        place.rename(old)  # not deleted in its place: half of it must not be taken for a cell
     making.rename(place)
+    shutil.rmtree(old, ignore_errors=True)
     return outcome
 
 
@@ -173,7 +185,7 @@ def _run(words: list[str], log: Path, limit_s: float | None) -> _Run:
             stderr=subprocess.STDOUT,
             env=os.environ | {"TERMINAL_WIDTH": str(2 * _REASON)},
             start_new_session=True,
-            preexec_fn=_end_with_parent,  # noqa: PLW1509 - it takes no lock that a thread may hold
+            preexec_fn=ending_with_this(),  # noqa: PLW1509 - it takes no lock that a thread may hold
         )
     late = False
     try:
@@ -195,11 +207,6 @@ def _run(words: list[str], log: Path, limit_s: float | None) -> _Run:
     return _Run(reason, time.perf_counter() - begin, cpu_s, usage.ru_maxrss / 2**20)
 
 
-def _end_with_parent() -> None:
-    """Have the kernel kill this process when its parent is killed: nobody else would."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-
-
 def _reason(status: int, log: Path) -> str | None:
     """What a command that failed said last."""
     if status == 0:
@@ -208,4 +215,5 @@ def _reason(status: int, log: Path) -> str | None:
     lines = [line for raw in text.splitlines() if (line := raw.strip(_FRAME))]
     errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
     said = (errors or lines or ["no output"])[-1]
-    return f"exit status {status}: {said}"[:_REASON]
+    how = f"exit status {status}" if status > 0 else f"killed by {signal.Signals(-status).name}"
+    return f"{how}: {said}"[:_REASON]

@@ -16,7 +16,8 @@ from spiked.render import Camera, Rasteriser
 from spiked.scene import Scene
 from spiked.sensor import Image
 from spiked.trajectory import Trajectory
-from spiked_service.cli.comparison.cells import HELD_OUT, PICTURES, RESULT
+from spiked_service.cli.comparison.cells import PICTURES, RESULT
+from spiked_service.cli.comparison.inputs import HELD_OUT
 
 WINDOW_FRAMES = 16
 """Frames of an observed picture: charge between spikes, as a person would look at it."""

@@ -8,6 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
+from spiked.lifetime import ending_with_this
+from spiked_service.base.signals import handling
+
 INTERRUPTED = 130
 """Exit status of a command that was interrupted, and wrote what there was."""
 
@@ -15,14 +18,21 @@ INTERRUPTED = 130
 def run_spiked(arguments: list[str], log: Path, show: Callable[[str], None]) -> int:
     """Run `spiked ARGUMENTS` and return its exit status. Its lines go to `log`, appended, and to `show`.
 
-    Ctrl-C reaches it as it reaches this process; SIGTERM is passed on. Either way its end is waited for.
+    Ctrl-C reaches it as it reaches this process; SIGTERM is passed on. Either way its end is waited for. It is killed
+    when this process is.
     """
     command = [sys.executable, "-m", "spiked_service", *arguments]
     with log.open("a", encoding="utf-8") as file:
         file.write(f"$ spiked {' '.join(arguments)}\n")
         file.flush()
         process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="replace"
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            encoding="utf-8",
+            errors="replace",
+            preexec_fn=ending_with_this(),  # noqa: PLW1509 - it takes no lock that a thread may hold
         )
         assert process.stdout is not None
         with _passed_on(process):
@@ -41,9 +51,5 @@ def _passed_on(process: subprocess.Popen[str]) -> Iterator[None]:
     def end(number: int, frame: FrameType | None) -> None:
         process.terminate()
 
-    before = {signal.SIGINT: signal.signal(signal.SIGINT, wait), signal.SIGTERM: signal.signal(signal.SIGTERM, end)}
-    try:
+    with handling({signal.SIGINT: wait, signal.SIGTERM: end}):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -20,6 +20,7 @@ from spiked_service.cli.dataset_runs.children import INTERRUPTED, run_spiked
 from spiked_service.cli.dataset_runs.pictures import simulation_arguments
 from spiked_service.cli.dataset_runs.scores import score
 from spiked_service.cli.dataset_runs.table import Row, Table, write_zip
+from spiked_service.results.versions import write_atomically
 
 _DONE = "done.json"
 """In the folder of a result: its row, written when all else is."""
@@ -80,7 +81,7 @@ class DatasetRun:
                 )
         with outputs.writing("--out", self.out):
             self.out.mkdir(parents=True, exist_ok=True)
-            path.write_text(begun.model_dump_json(indent=1), "utf-8")
+            write_atomically(path, begun.model_dump_json(indent=1).encode())
 
     def carry_out(self) -> Table:
         """All recordings in turn, the table, and the zip. Raises InterruptedRunError and ConfigurationError."""
@@ -100,8 +101,8 @@ class DatasetRun:
         table = Table(self.kind, self.options, self._rows)
         results = {_folder_name(row.name): self.out / "results" / _folder_name(row.name) for row in self._rows}
         with outputs.writing("--out", self.out):
-            (self.out / "table.md").write_text(table.markdown(), "utf-8")
-            (self.out / "table.csv").write_text(table.csv(), "utf-8")
+            write_atomically(self.out / "table.md", table.markdown().encode())
+            write_atomically(self.out / "table.csv", table.csv().encode())
             write_zip(self.out / f"{self.kind.name}.zip", table, results)
         return table
 

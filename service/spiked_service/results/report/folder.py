@@ -1,7 +1,7 @@
 """Reports of the output folders of `spiked reconstruct`, `localise` and `merge`."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.errors import CheckpointError, SceneError, SpikedError
+from spiked.export import ExportSource
 from spiked.recon.checkpoint import CHECKPOINT, Interrupted, exists
 from spiked.recording import Recording, open_recording, sidecar_path
 from spiked.render.cpu import Rasteriser
@@ -73,6 +74,23 @@ class FolderReport:
             others=others,
             sidecar=sidecar,
             recording=place if self.with_recording else None,
+        )
+
+    def export_source(self) -> ExportSource:
+        """The result for exports. Raises SceneError and RecordingError."""
+        document = self._document()
+        figures = Figures.read(without_folders(document), str(self.folder / REPORT))
+        place, scene = self._recording_place(document), self._files / "scene.ply"
+        recording = None if place is None else self._open(place, document)
+        sensor = figures.described_sensor
+        if sensor is not None and recording is not None:
+            sensor = replace(recording.sensor, intrinsics=sensor.intrinsics)
+        return ExportSource(
+            path=self._trajectory(),
+            sensor=sensor,
+            scene=Scene.read_ply(scene) if scene.is_file() else None,
+            recording=recording,
+            name=self.folder.resolve().name,
         )
 
     def _document(self) -> dict[str, Any]:

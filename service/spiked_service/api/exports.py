@@ -1,0 +1,109 @@
+"""Published versions in the formats of other programs, made in a worker process and kept for further requests."""
+
+import shutil
+import threading
+import zlib
+from pathlib import Path
+
+from fastapi import Request, Response
+
+from spiked.errors import ConfigurationError
+from spiked.export import ExportKind, ExportOptions
+from spiked_service.api import files
+from spiked_service.api.results import Result, Results
+from spiked_service.base.limits import OverloadedError
+from spiked_service.captures.captures import Captures
+from spiked_service.store.folder import DataFolder
+from spiked_service.store.rows import ReconstructionRow
+from spiked_service.workers.messages import ExportCommand, WorkerError, WorkerEvent
+from spiked_service.workers.process import WorkerProcess
+
+KEPT = 4
+"""Files that are kept: somebody may resume a download or ask again."""
+
+
+class Exports:
+    """Makes exports, one at a time, and sends them."""
+
+    def __init__(self, results: Results, captures: Captures, folder: DataFolder) -> None:
+        self._results = results
+        self._captures = captures
+        self._folder = folder
+        self._place = folder.path / "exports"
+        self._making = threading.Lock()
+        shutil.rmtree(self._place, ignore_errors=True)  # of an earlier service
+
+    def response(
+        self,
+        request: Request,
+        row: ReconstructionRow,
+        kind: ExportKind,
+        options: ExportOptions,
+        *,
+        version: int | None,
+        metric: bool,
+    ) -> Response:
+        """The file, or a ZIP of the folder; made now if it is not kept.
+
+        Raises NotReadyError, NothingError, GoneError, OverloadedError while another one is made, and ConfigurationError
+        for what the version lacks.
+        """
+        kind.check()
+        result = self._results.of(row, version)
+        result = result.metric() if metric else result
+        known = (row.id, files.stamp(result.scene), kind.name, options, result.frame)
+        number = result.published.version
+        made = self._place / f"{row.id}-{number:06d}-{zlib.crc32(repr(known).encode()):08x}"
+        if not made.exists():
+            self._make(self._command(row, result, kind, options, made))
+        name = f"{row.id}-{number:06d}-{kind.name}{kind.suffix or '.zip'}"
+        return files.ranged(request, made, name, kind.sent_as, **{"X-Scene-Version": str(number)})
+
+    def _command(
+        self, row: ReconstructionRow, result: Result, kind: ExportKind, options: ExportOptions, out: Path
+    ) -> ExportCommand:
+        capture = self._captures.get(row.capture_id).row
+        closed = capture.recording is not None and not capture.state.acquiring
+        return ExportCommand(
+            capture_id=row.capture_id,
+            reconstruction_id=row.id,
+            kind=kind.name,
+            out=out,
+            options=options,
+            name=f"{row.id}-{result.published.version:06d}",
+            scene=result.scene,
+            poses=result.poses().path,
+            white=result.published.white,
+            sensor=result.sensor,
+            recording=self._folder.recording(row.capture_id) if closed else None,
+            first_frame=0 if capture.recording is None else capture.recording.first_frame,
+            metres_per_unit=None if result.frame is None else result.frame.metres_per_unit,
+            up=None if result.frame is None else result.frame.up,
+        )
+
+    def _make(self, command: ExportCommand) -> None:
+        """Run the worker to its end. Raises OverloadedError and ConfigurationError."""
+        if not self._making.acquire(blocking=False):
+            raise OverloadedError("another export is being made; try again when it is ready")
+        try:
+            self._place.mkdir(exist_ok=True)
+            for old in sorted(self._place.iterdir(), key=lambda file: file.stat().st_mtime)[: -KEPT + 1 or None]:
+                old.unlink()
+            reasons: list[str] = []
+            ended = threading.Event()
+
+            def on_event(event: WorkerEvent) -> None:
+                if isinstance(event, WorkerError):
+                    reasons.append(event.reason)
+
+            def on_exit(reason: str | None) -> None:
+                if reason is not None:
+                    reasons.append(reason)
+                ended.set()
+
+            WorkerProcess(command, self._folder.path / "exports.log", on_event, on_exit)
+            ended.wait()
+            if reasons:
+                raise ConfigurationError(reasons[0])
+        finally:
+            self._making.release()

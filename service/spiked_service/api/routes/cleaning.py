@@ -1,0 +1,63 @@
+"""`reconstructions/ID:clean` and `:revert`: edited scenes are versions like any."""
+
+from fastapi import APIRouter
+from fastapi.routing import APIRoute
+
+from spiked.cleaning import FloaterRemoval, clean
+from spiked.errors import ConfigurationError
+from spiked.scene import Scene
+from spiked_service.api.idempotency import IdempotencyKey
+from spiked_service.api.problems import problems
+from spiked_service.api.results import Results
+from spiked_service.api.schemas.cleaning import CleanRequest, EditedOut, RevertRequest
+from spiked_service.reconstructions.repository import ReconstructionRepository
+from spiked_service.results.scene_scale import forget_scale, read_scale
+
+_POSES = 256
+"""Poses of the path that views are chosen from."""
+
+
+def cleaning_routes(rows: ReconstructionRepository, results: Results, route_class: type[APIRoute]) -> APIRouter:
+    """`:clean` and `:revert` of a reconstruction."""
+    router = APIRouter(
+        prefix="/reconstructions/{reconstruction_id:id}", tags=["reconstructions"], route_class=route_class
+    )
+
+    @router.post(":clean", responses=problems(404, 409, 507))
+    def clean_scene(reconstruction_id: str, body: CleanRequest, idempotency_key: IdempotencyKey = None) -> EditedOut:
+        """Publish a version without what is outside of a box, and without floaters. `:revert` undoes it."""
+        result = results.of(rows.get(reconstruction_id), body.version)
+        camera, path = result.camera, result.path(_POSES)
+        if camera is None or not len(path):
+            raise ConfigurationError("the camera or the path of this scene is not known, so no view can tell floaters")
+        with results.downloads():
+            found = clean(
+                Scene.read_ply(result.scene),
+                path,
+                camera,
+                None if body.box is None else body.box.box(),
+                FloaterRemoval(shrink=body.shrink) if body.floaters else None,
+            )
+        published = rows.publish_edit(
+            reconstruction_id, body.version, lambda publisher: publisher.again(result.published, found.scene)
+        )
+        return EditedOut(
+            version=published.version,
+            splats=published.splats,
+            outside=found.outside,
+            floaters=found.floaters,
+            shrunk=found.shrunk,
+        )
+
+    @router.post(":revert", responses=problems(404, 409, 507))
+    def revert_scene(reconstruction_id: str, body: RevertRequest, idempotency_key: IdempotencyKey = None) -> EditedOut:
+        """Publish an earlier version again, as the newest."""
+        earlier = results.of(rows.get(reconstruction_id), body.to).published
+        folder = rows.folder(reconstruction_id)
+        other_unit = earlier.version <= read_scale(folder).since
+        published = rows.publish_edit(reconstruction_id, body.version, lambda publisher: publisher.again(earlier))
+        if other_unit:
+            forget_scale(folder, published.version - 1)
+        return EditedOut(version=published.version, splats=published.splats, outside=0, floaters=0, shrunk=0)
+
+    return router

@@ -1,0 +1,104 @@
+"""`exports`: the formats of other programs, and the newest or any version in one of them."""
+
+from collections.abc import Callable
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import Path as PathParameter
+from fastapi.routing import APIRoute
+
+from spiked.export import KINDS, ExportOptions, find_kind
+from spiked.export.source import KEY_VIEWS
+from spiked_service.api.exports import Exports
+from spiked_service.api.problems import problems
+from spiked_service.api.results import Results
+from spiked_service.api.routes.parameters import BINARY, ETAG, NOT_MODIFIED, Version
+from spiked_service.api.schemas.base import IN_DIGITS
+from spiked_service.api.schemas.exports import ExportFormatOut, ExportFormatsOut
+from spiked_service.reconstructions.repository import ReconstructionRepository
+from spiked_service.store.rows import ReconstructionRow
+
+FormatName = Annotated[
+    str,
+    PathParameter(
+        description="Name of a format.",
+        json_schema_extra={"enum": [kind.name for kind in KINDS], "example": "mesh-glb"},
+    ),
+]
+Views = Annotated[
+    int,
+    Query(ge=1, le=1000, description="Key views: poses of pictures, depth maps and points, evenly along the path."),
+    IN_DIGITS,
+]
+Undistorted = Annotated[bool, Query(description="Pictures, depth maps and cameras without the lens's distortion.")]
+ExpectedDepth = Annotated[bool, Query(description="Mean depth of what a pixel shows; less exact than the median.")]
+Resolution = Annotated[
+    int, Query(ge=16, le=512, description="Voxels of a mesh along the longest side of the scene."), IN_DIGITS
+]
+Metric = Annotated[bool, Query(description="In metres, with up along -y; 404 while the scale is not known.")]
+
+_HEADERS: dict[str, Any] = {
+    **ETAG,
+    "X-Scene-Version": {"description": "Its version.", "schema": {"type": "integer"}},
+    "Content-Disposition": {"description": "With a file name.", "schema": {"type": "string"}},
+}
+_CONTENT: dict[str, Any] = {kind.sent_as: BINARY for kind in KINDS}
+_FILE: dict[int | str, dict[str, Any]] = {
+    200: {"description": "The file, or a ZIP of the folder.", "headers": _HEADERS, "content": _CONTENT},
+    206: {"description": "The requested range.", "content": _CONTENT},
+    **NOT_MODIFIED,
+    **problems(404, 416, 503, 507),
+}
+_DESCRIPTION = (
+    "in a format of another program; `GET exports` lists them. The file is made in a worker process, which takes "
+    "seconds to minutes, and kept for a while; one is made at a time."
+)
+
+
+def export_routes(
+    rows: ReconstructionRepository, results: Results, exports: Exports, route_class: type[APIRoute]
+) -> APIRouter:
+    """The list of formats, and exports of reconstructions and of captures."""
+    router = APIRouter(route_class=route_class)
+
+    @router.get("/exports", tags=["reconstructions"], responses=problems())
+    def list_export_formats() -> ExportFormatsOut:
+        """The formats of other programs that results are exported in, and what each loses."""
+        return ExportFormatsOut(formats=[ExportFormatOut.of(kind) for kind in KINDS])
+
+    def named(reconstruction_id: str) -> ReconstructionRow:
+        return rows.get(reconstruction_id)
+
+    def newest(capture_id: str) -> ReconstructionRow:
+        return results.newest(capture_id)
+
+    _add(router, "/reconstructions/{reconstruction_id:id}", "get_reconstruction_export", named, exports)
+    _add(router, "/captures/{capture_id:id}", "get_export", newest, exports)
+    return router
+
+
+def _add(router: APIRouter, prefix: str, name: str, find: Callable[..., ReconstructionRow], exports: Exports) -> None:
+    """The route of an export; `find` takes the id in its path and returns the reconstruction."""
+    of = "A version" if "reconstruction" in name else "The newest reconstruction"
+
+    @router.get(
+        f"{prefix}/exports/{{format}}",
+        name=name,
+        tags=[prefix.split("/")[1]],
+        description=f"{of} {_DESCRIPTION}",
+        responses=_FILE,
+        response_class=Response,
+    )
+    def get_export(
+        request: Request,
+        row: Annotated[ReconstructionRow, Depends(find)],
+        format: FormatName,
+        version: Version = None,
+        views: Views = KEY_VIEWS,
+        undistorted: Undistorted = False,
+        expected_depth: ExpectedDepth = False,
+        resolution: Resolution = 256,
+        metric: Metric = False,
+    ) -> Response:
+        options = ExportOptions(views, undistorted, "expected" if expected_depth else "median", resolution)
+        return exports.response(request, row, find_kind(format), options, version=version, metric=metric)

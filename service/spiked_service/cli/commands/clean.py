@@ -1,0 +1,70 @@
+"""`spiked clean`: a scene without floaters."""
+
+import shutil
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import Progress
+
+from spiked.cleaning import Box, FloaterRemoval
+from spiked.cleaning import clean as clean_scene
+from spiked_service.cli import outputs
+from spiked_service.cli.console import messages, output
+from spiked_service.results.map_folder import MAP_FILES, PATHS, MapFolder
+from spiked_service.results.scene_scale import SCALE, remove_scale
+
+
+def clean(
+    map_folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Output folder of `spiked reconstruct` or `merge`.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the cleaned scene; created if missing.")],
+    box: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Remove splats outside of this box, in the scene's axes."),
+    ] = None,
+    floaters: Annotated[bool, typer.Option(help="Remove splats that few views see.")] = True,
+    shrink: Annotated[
+        bool, typer.Option(help="Also make splats smaller that are larger than a quarter of the scene.")
+    ] = False,
+) -> None:
+    """Remove floaters from a scene, and what is outside of a box.
+
+    A floater is a splat that fewer than two views along the path see, or a lonely one that few see. OUT is an output
+    folder like the other one, which stays as it is.
+
+    Examples:
+
+    - `spiked clean out -o cleaned`
+
+    - `spiked clean out -o desk --box -1 -1 0 1 0.5 3`
+    """
+    outputs.try_folder("--out", out, MAP_FILES)
+    found = MapFolder.read(map_folder)
+    with Progress(console=messages, transient=True, disable=not messages.is_terminal) as bar:
+        task = bar.add_task("cleaning", total=1.0)
+        cleaned = clean_scene(
+            found.scene,
+            found.trajectory,
+            found.camera,
+            None if box is None else Box(box[:3], box[3:]),
+            FloaterRemoval(shrink=shrink) if floaters or shrink else None,
+            lambda share: bar.update(task, completed=share),
+        )
+    with outputs.writing("--out", out):
+        out.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(map_folder / "trajectory.tum", out / "trajectory.tum")  # refuses the folder itself
+        (out / "report.json").unlink(missing_ok=True)
+        remove_scale(out)
+        if (map_folder / SCALE).is_file():
+            shutil.copyfile(map_folder / SCALE, out / SCALE)
+        if (map_folder / PATHS).is_dir():
+            shutil.copytree(map_folder / PATHS, out / PATHS, dirs_exist_ok=True)
+        cleaned.scene.write_ply(out / "scene.ply")
+        shutil.copyfile(map_folder / "report.json", out / "report.json")  # last: half a map is none
+    output.print(
+        f"{out}: {len(cleaned.scene)} of {len(found.scene)} splats; removed {cleaned.outside} outside and "
+        f"{cleaned.floaters} floaters, made {cleaned.shrunk} smaller",
+        markup=False,
+    )

@@ -1,0 +1,115 @@
+"""`spiked export`: a result in the format of another program."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from spiked.errors import ConfigurationError
+from spiked.export import KINDS, ExportKind, ExportOptions, ExportSource, find_kind
+from spiked.export.source import KEY_VIEWS
+from spiked.scene import Scene
+from spiked.spz import decode
+from spiked.trajectory import Trajectory
+from spiked_service.cli import outputs
+from spiked_service.cli.console import output
+from spiked_service.results.report.folder import FolderReport
+from spiked_service.results.scene_scale import known_frame
+
+_FORMATS = "\n\n".join(f"- `{kind.name}`: {kind.title}. For {kind.readers}." for kind in KINDS)
+_HELP = f"""Write a result in the format of another program.
+
+Pictures, depth maps and points are made at key views, evenly spaced along the path. Poses are camera to world with
+OpenCV's axes unless a format has its own; lengths are in the unit of the scene, or with --metric in metres.
+docs/exports.md says what each format loses and who reads it. A format whose package is not installed says how to
+get it.
+
+Formats:
+
+{_FORMATS}
+
+OUT may also be a file of splats, .ply or .spz, of this or another program: the formats of splats are made of it.
+
+Examples:
+
+- `spiked export out colmap -o project`
+
+- `spiked export out mesh-glb -o room.glb --resolution 384`
+
+- `spiked export out depth --views 200 --undistorted`
+
+- `spiked export garden.ply spz -o garden.spz`
+
+- `spiked scale out --length 3.0 1.42 && spiked export out mesh-glb --metric`
+"""
+
+
+def _kind(name: str) -> ExportKind:
+    try:
+        return find_kind(name)
+    except ConfigurationError as error:
+        raise typer.BadParameter(str(error)) from error
+
+
+def _export(
+    result: Annotated[
+        Path,
+        typer.Argument(metavar="OUT", help="Output folder of `spiked reconstruct` or `merge`, or a file of splats."),
+    ],
+    kind: Annotated[ExportKind, typer.Argument(metavar="FORMAT", help="One of those above.", parser=_kind)],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="File or folder to write. Default: OUT/export/FORMAT with the usual ending."),
+    ] = None,
+    recording: Annotated[
+        Path | None, typer.Option(help="The recording, if it is not where the run found it: for pictures and frames.")
+    ] = None,
+    views: Annotated[
+        int, typer.Option(help="Key views: poses of pictures, depth maps and points.", min=1, max=100_000)
+    ] = KEY_VIEWS,
+    undistorted: Annotated[
+        bool, typer.Option("--undistorted", help="Pictures, depth maps and cameras without the lens's distortion.")
+    ] = False,
+    expected: Annotated[
+        bool,
+        typer.Option("--expected-depth", help="Mean depth of what a pixel shows; less exact than the median."),
+    ] = False,
+    resolution: Annotated[
+        int, typer.Option(help="Voxels of a mesh along the longest side of the scene.", min=16, max=1024)
+    ] = 256,
+    metric: Annotated[
+        bool, typer.Option("--metric", help="In metres, with up along -y, by the scale of `spiked scale`.")
+    ] = False,
+) -> None:
+    kind.check()
+    name = f"{kind.name}{'-metric' if metric else ''}{kind.suffix}"
+    place = out or (result.with_name(f"{result.stem}-{name}") if result.is_file() else result / "export" / name)
+    if out is None and result.is_dir():
+        with outputs.writing("OUT", place.parent):
+            place.parent.mkdir(exist_ok=True)
+    (outputs.try_folder if kind.folder else outputs.try_file)("--out", place)
+    source = _source(result, recording, metric)
+    options = ExportOptions(views, undistorted, "expected" if expected else "median", resolution)
+    with outputs.writing("--out", place):
+        if kind.folder:
+            place.mkdir(parents=True, exist_ok=True)
+        said = kind.write(source, place, options)
+    output.print(f"{place}: {said}", markup=False)
+
+
+def _source(result: Path, recording: Path | None, metric: bool) -> ExportSource:
+    """What is exported: a folder of results, or the splats of a file."""
+    if result.is_file():
+        if metric:
+            raise ConfigurationError(f"--metric: {result} is a file, and no scale is known of it; name a folder")
+        scene = decode(result.read_bytes()) if result.suffix == ".spz" else Scene.read_ply(result)
+        path = Trajectory(np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+        return ExportSource(path, None, scene, name=result.name)
+    source = FolderReport(result, recording).export_source()
+    return source.in_frame(known_frame(result)) if metric else source
+
+
+_export.__doc__ = _HELP
+_export.__name__ = "export"
+export = _export

@@ -1,0 +1,64 @@
+"""The export worker: writes a published version in the format of another program."""
+
+import os
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from spiked.errors import SceneError
+from spiked.export import ExportSource, find_kind
+from spiked.frame_of_reference import FrameOfReference
+from spiked.poses import PoseFile
+from spiked.recording import open_recording
+from spiked.scene import Scene
+from spiked_service.workers.channel import WorkerChannel
+from spiked_service.workers.messages import ExportCommand
+
+_NICE = 10
+"""Niceness: live captures have priority."""
+
+
+def run_export(command: ExportCommand, channel: WorkerChannel) -> None:
+    """Write the file; a half-written one has another name. Raises SpikedError for what the user can correct."""
+    os.nice(_NICE)
+    kind = find_kind(command.kind)
+    part = command.out.with_name(command.out.name + ".part")
+    try:
+        if kind.folder:
+            with TemporaryDirectory(dir=part.parent, prefix=".export-") as name:
+                folder = Path(name) / command.name
+                folder.mkdir()
+                kind.write(source_of(command), folder, command.options)
+                _zip(folder, part)
+        else:
+            kind.write(source_of(command), part, command.options)
+        part.replace(command.out)
+    except OSError as error:
+        raise SceneError(f"the export cannot be written: {error.strerror or error}; free disk space") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def source_of(command: ExportCommand) -> ExportSource:
+    """The version. Raises SceneError and RecordingError."""
+    poses = PoseFile(command.poses)
+    recording = None if command.recording is None else open_recording(command.recording)
+    source = ExportSource(
+        path=poses.trajectory(range(len(poses))),
+        sensor=command.sensor,
+        scene=replace(Scene.read_ply(command.scene), white=command.white),
+        recording=recording,
+        first_frame=command.first_frame,
+        name=command.name,
+    )
+    if command.metres_per_unit is None:
+        return source
+    return source.in_frame(FrameOfReference(command.metres_per_unit, command.up))
+
+
+def _zip(folder: Path, out: Path) -> None:
+    """All files of a folder, below its name; pictures are compressed already."""
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_STORED) as archive:
+        for file in sorted(folder.rglob("*")):
+            archive.write(file, file.relative_to(folder.parent))

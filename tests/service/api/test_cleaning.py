@@ -1,0 +1,38 @@
+"""A scene cleaned over HTTP, and brought back."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spiked.client import CaptureOut
+from spiked.scene import Scene
+
+
+def scene_of(service: Any, job: str, folder: Path) -> Scene:
+    (folder / "scene.ply").write_bytes(service.client.scene(job))
+    return Scene.read_ply(folder / "scene.ply")
+
+
+def test_a_cleaned_scene_is_a_version_and_can_be_undone(
+    service: Any, done: CaptureOut, job: str, tmp_path: Path
+) -> None:
+    http, url = service.http, f"reconstructions/{job}"
+    before = http.get(url).json()
+    scene = scene_of(service, job, tmp_path)
+    low, high = np.percentile(scene.means, (5, 95), axis=0)
+    body = {"version": before["version"], "box": {"low": low.tolist(), "high": high.tolist()}, "floaters": True}
+    answer = http.post(f"{url}:clean", json=body)
+    assert answer.status_code == 200, answer.text
+    edited = answer.json()
+    assert edited["version"] == before["version"] + 1 and edited["outside"] > 0
+    assert edited["splats"] == len(scene_of(service, job, tmp_path)) < len(scene)
+    assert http.get(url).json()["splats"] == edited["splats"]
+    assert http.get(f"{url}/trajectory").json()["frames"]
+    assert http.get(f"{url}/versions").json()["items"][-1]["version"] == edited["version"]
+    assert http.post(f"{url}:clean", json=body).status_code == 409
+    back = http.post(f"{url}:revert", json={"version": edited["version"], "to": before["version"]})
+    assert back.status_code == 200, back.text
+    assert (
+        len(scene_of(service, job, tmp_path)) == len(scene) and http.get(url).json()["version"] == edited["version"] + 1
+    )

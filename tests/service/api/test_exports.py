@@ -1,0 +1,57 @@
+"""Results in the formats of other programs over HTTP."""
+
+import io
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+from plyfile import PlyData
+
+from spiked.client import CaptureOut
+from spiked.export import KINDS, find_kind
+
+
+def test_formats_are_listed_with_what_they_lose(service: Any) -> None:
+    found = service.http.get("exports").json()["formats"]
+    assert [one["name"] for one in found] == [kind.name for kind in KINDS]
+    assert all(one["loses"] and one["readers"] and one["suffix"].startswith(".") for one in found)
+
+
+def test_a_version_is_sent_in_a_format_and_in_ranges(service: Any, done: CaptureOut, job: str, tmp_path: Path) -> None:
+    url = f"reconstructions/{job}/exports/ply"
+    answer = service.http.get(url)
+    assert answer.status_code == 200, answer.text
+    version = answer.headers["x-scene-version"]
+    assert f'filename="{job}-{int(version):06d}-ply.ply"' in answer.headers["content-disposition"]
+    (tmp_path / "scene.ply").write_bytes(answer.content)
+    assert len(PlyData.read(str(tmp_path / "scene.ply"))["vertex"].data) > 0
+    tag = answer.headers["etag"]
+    assert service.http.get(url, headers={"if-none-match": tag}).status_code == 304
+    part = service.http.get(url, headers={"range": "bytes=0-9"})
+    assert part.status_code == 206 and part.content == answer.content[:10]
+    assert service.http.get(f"captures/{done.id}/exports/ply").content == answer.content
+
+
+def test_a_folder_is_sent_as_zip_with_the_pictures_of_the_recording(service: Any, done: CaptureOut, job: str) -> None:
+    answer = service.http.get(f"reconstructions/{job}/exports/depth?views=2&expected_depth=true", timeout=120)
+    assert answer.status_code == 200, answer.text
+    names = zipfile.ZipFile(io.BytesIO(answer.content)).namelist()
+    assert sum(name.endswith(".exr") for name in names) == 4 and any(name.endswith("depth.json") for name in names)
+    bag = service.http.get(f"reconstructions/{job}/exports/nexus?views=2&expected_depth=true", timeout=120)
+    assert bag.status_code == 200 and bag.content.startswith(b"\x89HDF")
+
+
+@pytest.mark.parametrize("form", ["mesh-glb", "ply", "sog"])
+def test_files_are_sent_as_the_schema_says(service: Any, job: str, form: str) -> None:
+    answer = service.http.get(f"reconstructions/{job}/exports/{form}?views=4&resolution=32", timeout=120)
+    assert answer.status_code == 200, answer.text
+    paths = service.http.get(f"{service.daemon.address}openapi.json").json()["paths"]
+    told = paths["/api/v1/reconstructions/{reconstruction_id}/exports/{format}"]["get"]["responses"]["200"]["content"]
+    assert answer.headers["content-type"] in told and answer.headers["content-type"] == find_kind(form).sent_as
+
+
+def test_what_cannot_be_made_is_said(service: Any, done: CaptureOut, job: str) -> None:
+    assert service.http.get(f"reconstructions/{job}/exports/ply?metric=true").status_code == 404
+    assert service.http.get(f"reconstructions/{job}/exports/blend").status_code == 422
+    assert service.http.get(f"reconstructions/{job}/exports/ply?version=999").status_code == 404

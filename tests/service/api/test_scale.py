@@ -1,0 +1,42 @@
+"""The scale of a scene over HTTP."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from spiked.client import CaptureOut
+
+
+def test_a_scale_is_stored_once_and_answers_are_in_metres(service: Any, done: CaptureOut, job: str) -> None:
+    http, url = service.http, f"reconstructions/{job}"
+    before = http.get(f"{url}/scale").json()
+    assert (before["revision"], before["metres_per_unit"]) == (0, None)
+    assert http.get(f"{url}/trajectory?metric=true").status_code == 404
+    own = http.get(f"{url}/trajectory?step=50").json()
+    stored = http.put(f"{url}/scale", json={"revision": 0, "metres_per_unit": 2.0, "sigma": 0.01})
+    assert stored.status_code == 200, stored.text
+    assert stored.json() | {"version": 0} == {
+        "revision": 1, "metres_per_unit": 2.0, "sigma": 0.01, "source": "length", "up": None, "version": 0,
+    }  # fmt: skip
+    assert http.put(f"{url}/scale", json={"revision": 0, "metres_per_unit": 3.0}).status_code == 409
+    metric = http.get(f"{url}/trajectory?step=50&metric=true").json()
+    np.testing.assert_allclose(metric["positions"], 2 * np.array(own["positions"]), atol=1e-8)
+    up = http.put(f"{url}/scale", json={"revision": 1, "up": [0, 0, -3]}).json()
+    assert up["up"] == [0, 0, -1] and up["metres_per_unit"] == 2.0
+    turned = http.get(f"{url}/trajectory?step=50&metric=true").json()
+    np.testing.assert_allclose(np.array(turned["positions"])[:, 1], 2 * np.array(own["positions"])[:, 2], atol=1e-8)
+    plain, larger = (http.get(f"{url}/scene?metric={flag}").content for flag in ("false", "true"))
+    assert len(plain) == len(larger) and plain != larger
+    assert http.delete(f"{url}/scale").json()["metres_per_unit"] is None
+
+
+@pytest.mark.parametrize("body", [{"revision": 2, "up": [0, 0, 0]}, {"revision": 2, "metres_per_unit": -1.0}])
+def test_what_is_no_scale_is_refused(service: Any, job: str, body: dict[str, Any]) -> None:
+    assert service.http.put(f"reconstructions/{job}/scale", json=body).status_code == 422
+
+
+def test_a_scene_without_tags_says_so(service: Any, job: str) -> None:
+    revision = service.http.get(f"reconstructions/{job}/scale").json()["revision"]
+    answer = service.http.post(f"reconstructions/{job}/scale:tag", json={"revision": revision, "side_m": 0.1})
+    assert answer.status_code == 422 and "no tag" in answer.json()["detail"]

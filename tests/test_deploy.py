@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
@@ -73,9 +74,13 @@ def test_the_settings_file_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(commented) <= set(Settings.model_fields)
 
 
-@pytest.mark.parametrize("file", ["systemd/spiked.service", "container/Containerfile"])
+@pytest.mark.parametrize(
+    "file",
+    ["systemd/spiked.service", "container/Containerfile", "compose/compose.yaml", "kubernetes/spiked.yaml"],
+)
 def test_the_environment_they_set_is_settings(file: str) -> None:
-    names = re.findall(r"\bSPIKED_[A-Z_]+(?==)", (DEPLOY / file).read_text())
+    lines = (line for line in (DEPLOY / file).read_text().splitlines() if not line.lstrip().startswith("#"))
+    names = re.findall(r"\bSPIKED_[A-Z_]+(?=[=:,])", "\n".join(lines))
     assert names
     assert {name.removeprefix("SPIKED_").lower() for name in names} <= set(Settings.model_fields)
 
@@ -90,6 +95,65 @@ def test_systemd_reads_the_unit(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     unit.write_text(unit.read_text().replace("[Service]", "[Service]\nExecStop=/nowhere/at/all"))
     assert "/nowhere/at/all" in subprocess.run(command, capture_output=True, text=True, check=False).stderr
+
+
+def test_kubernetes_takes_the_manifests() -> None:
+    kubernetes_validate = pytest.importorskip("kubernetes_validate", reason="needs kubernetes-validate")
+    documents = list(yaml.safe_load_all((DEPLOY / "kubernetes/spiked.yaml").read_text()))
+    for one in documents:
+        kubernetes_validate.validate(one, kubernetes_validate.latest_version(), strict=True)
+    (pod,) = (one["spec"]["template"]["spec"] for one in documents if one["kind"] == "StatefulSet")
+    volumes = {volume["name"] for volume in pod["volumes"]} | {"data"}
+    assert {mount["name"] for mount in pod["containers"][0]["volumeMounts"]} == volumes
+    pod["securityContext"]["runAsNonRoots"] = True
+    with pytest.raises(kubernetes_validate.ValidationError):
+        kubernetes_validate.validate(documents[-1], kubernetes_validate.latest_version(), strict=True)
+
+
+def test_compose_takes_the_file() -> None:
+    pytest.importorskip("check_jsonschema", reason="needs check-jsonschema")
+    command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec"]
+    done = subprocess.run([*command, DEPLOY / "compose/compose.yaml"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_images_ask_the_same_health() -> None:
+    assert 'CMD ["spiked", "health"]' in (DEPLOY / "container/Containerfile").read_text()
+    assert '["CMD", "spiked", "health"]' in (DEPLOY / "build_image.py").read_text()
+
+
+@pytest.mark.parametrize("script", ["postinst", "prerm", "postrm"])
+def test_the_scripts_of_the_package_are_shell(script: str) -> None:
+    done = subprocess.run(["sh", "-n", DEPLOY / "debian" / script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_bill_of_materials_names_what_is_installed() -> None:
+    site = Path(yaml.__file__).parents[1]
+    command = [sys.executable, DEPLOY / "sbom.py", site]
+    first, second = (subprocess.run(command, capture_output=True, check=True).stdout for _ in range(2))
+    bill = json.loads(first)
+    assert first == second and (bill["bomFormat"], bill["specVersion"]) == ("CycloneDX", "1.6")
+    numpy = next(part for part in bill["components"] if part["name"] == "numpy")
+    assert numpy["purl"] == f"pkg:pypi/numpy@{np.__version__}" and numpy["hashes"][0]["alg"] == "SHA-256"
+    assert bill["metadata"]["component"]["name"] == "spiked"
+
+
+@pytest.mark.slow
+def test_a_wheel_is_the_same_from_two_folders(tmp_path: Path) -> None:
+    """Builds the wheel of CPython 3.11 twice, some CPU minutes each."""
+    wheels = []
+    for name in ("one", "another/folder"):
+        tree = tmp_path / name
+        shutil.copytree(
+            DEPLOY.parent, tree, ignore=shutil.ignore_patterns(".venv", "build", "node_modules", ".git", "*.so", "dist")
+        )
+        command = ["python3.11", tree / "deploy/build_wheels.py", "--python", "python3.11", "--machine", "x86_64"]
+        environment = {**os.environ, "SOURCE_DATE_EPOCH": "1700000000"}
+        subprocess.run([*command, "--out", tree / "dist"], env=environment, check=True)
+        (wheel,) = (tree / "dist").glob("*.whl")
+        wheels.append((wheel.name, wheel.read_bytes()))
+    assert wheels[0] == wheels[1]
 
 
 @pytest.mark.slow

@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 from browsing import STEPS, Studied, address, finished, until
 
+from spiked.export import KINDS
+
 
 def test_a_capture_is_found_and_looked_at(studied: Studied, visit: Callable[..., Any]) -> None:
     page = visit(f"{studied.address}?page=captures")
@@ -30,10 +32,16 @@ def test_a_capture_is_found_and_looked_at(studied: Studied, visit: Callable[...,
     until(
         lambda: studied.http.get(f"captures/{studied.capture_id}").json()["notes"] == "the lamp was off", "kept notes"
     )
+    tags = page.get_by_label("Tags")
+    tags.fill("desk,  by night, desk")
+    tags.blur()
+    until(
+        lambda: studied.http.get(f"captures/{studied.capture_id}").json()["tags"] == ["desk", "by night"], "kept tags"
+    )
     page.go_back()
     page.get_by_label("Search captures").fill("lamp")
     row.wait_for()
-    assert "the lamp was off" in row.inner_text()
+    assert "the lamp was off" in row.inner_text() and "#desk #by night" in row.inner_text()
     row.get_by_role("link").click()
     page.get_by_text("Over time").wait_for()
     assert studied.capture_id in address(page)
@@ -54,6 +62,12 @@ def test_everything_can_be_downloaded(studied: Studied, visit: Callable[..., Any
         answer = studied.http.get(target)
         assert answer.status_code == 200, target
         assert answer.content, target
+    page.locator("summary", has_text="For other programs").click()
+    page.get_by_role("link", name="mesh-glb").wait_for()
+    offered = page.locator(".exports a[download]")
+    assert offered.count() == len(KINDS)
+    answer = studied.http.get(page.get_by_role("link", name="compressed-ply").evaluate("link => link.href"))
+    assert answer.status_code == 200 and answer.content.startswith(b"ply")
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ import { PageLink } from "../shared/ui/PageLink";
 import { Loading } from "../shared/ui/parts";
 import { Toasts } from "../shared/ui/Toasts";
 import { ErrorBoundary } from "./ErrorBoundary";
+import { Help } from "./Help";
 import { SignIn } from "./SignIn";
 
 const ScenePage = lazy(() => import("../features/scene/ScenePage").then((m) => ({ default: m.ScenePage })));
@@ -31,6 +32,7 @@ const THEMES: Record<Theme, { next: Theme; icon: IconName; label: string }> = {
 
 export function App(): JSX.Element {
   const { page } = useRoute();
+  const [help, setHelp] = useState(false);
   const signedOut = useService((state) => state.signedOut);
   useEffect(() => (signedOut ? undefined : follow()), [signedOut]);
   useEffect(() => {
@@ -43,6 +45,7 @@ export function App(): JSX.Element {
       if (typing || event.ctrlKey || event.metaKey || event.altKey) return;
       const tab = TABS.find((one) => one.key === event.key);
       if (tab !== undefined) go({ page: tab.page });
+      if (event.key === "?") setHelp(true);
     };
     window.addEventListener("keydown", onKey);
     return () => window.removeEventListener("keydown", onKey);
@@ -73,6 +76,16 @@ export function App(): JSX.Element {
           ))}
         </nav>
         {!signedOut && <LinkStatus />}
+        <button
+          type="button"
+          className="bare"
+          aria-label="Keys and help"
+          aria-keyshortcuts="?"
+          title="Keys and help (?)"
+          onClick={() => setHelp(true)}
+        >
+          <Icon name="help" />
+        </button>
         <ThemeSwitch />
       </header>
       {!signedOut && <Disconnected />}
@@ -91,6 +104,7 @@ export function App(): JSX.Element {
         )}
       </main>
       <Toasts />
+      <Help open={help} onClose={() => setHelp(false)} />
     </>
   );
 }

@@ -187,8 +187,25 @@ function Head({ capture }: { capture: Capture }): JSX.Element {
   );
 }
 
+/** Words of a text, separated by commas; each once. */
+const tagsOf = (text: string): string[] => [
+  ...new Set(
+    text
+      .split(",")
+      .map((word) => word.trim())
+      .filter((word) => word !== ""),
+  ),
+];
+
 function Notes({ capture }: { capture: Capture }): JSX.Element {
   const [notes, setNotes] = useState(capture.notes);
+  const [tags, setTags] = useState(capture.tags.join(", "));
+  const saveTags = async (): Promise<void> => {
+    const wanted = tagsOf(tags);
+    if (wanted.join() === capture.tags.join()) return;
+    await attempt(async () => storeCapture(await calls.changeCapture(capture.id, { tags: wanted })));
+  };
+  const noted = Object.entries(capture.metadata);
   const readOnly = useDenied("operate");
   const save = async (): Promise<void> => {
     if (notes === capture.notes) return;
@@ -207,6 +224,27 @@ function Notes({ capture }: { capture: Capture }): JSX.Element {
         onChange={(event) => setNotes(event.target.value)}
         onBlur={() => void save()}
       />
+      <label className="tags">
+        Tags
+        <input
+          value={tags}
+          placeholder="desk, night"
+          maxLength={1000}
+          readOnly={readOnly !== null}
+          onChange={(event) => setTags(event.target.value)}
+          onBlur={() => void saveTags()}
+        />
+      </label>
+      {noted.length > 0 && (
+        <dl className="facts">
+          {noted.map(([key, value]) => (
+            <div key={key}>
+              <dt>{key}</dt>
+              <dd>{value}</dd>
+            </div>
+          ))}
+        </dl>
+      )}
     </Panel>
   );
 }

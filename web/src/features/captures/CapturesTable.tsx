@@ -13,6 +13,8 @@ import { Icon } from "../../shared/ui/icons";
 import { PageLink } from "../../shared/ui/PageLink";
 import { CaptureBadge, Empty, ErrorMessage, JobBadge, JobReason, Loading } from "../../shared/ui/parts";
 import { Table } from "../../shared/ui/Table";
+import { filtered, type GradeFilter, type Order, sorted } from "./listing";
+import { ListControls, SelectionBar } from "./SelectionBar";
 import { removeWithUndo } from "./remove";
 import { UploadPanel } from "./UploadPanel";
 
@@ -20,6 +22,7 @@ const ROWS = 50;
 const TYPING_MS = 200;
 
 const COLUMNS = [
+  { name: "Select", hidden: true },
   { name: "Picture", hidden: true },
   { name: "Name" },
   { name: "Started" },
@@ -42,6 +45,9 @@ export function CapturesTable(): JSX.Element {
   const [problem, setProblem] = useState<string | null>(null);
   const [round, setRound] = useState(0);
   const [uploads, setUploads] = useState(false);
+  const [selected, setSelected] = useState<ReadonlySet<string>>(new Set());
+  const [grade, setGrade] = useState<GradeFilter>("");
+  const [order, setOrder] = useState<Order>("newest");
   const known = useService((state) => state.captures);
   const newest = Object.keys(known).sort().at(-1);
 
@@ -73,6 +79,7 @@ export function CapturesTable(): JSX.Element {
     }
   };
 
+  const shown = listed === null ? [] : sorted(filtered(listed.items, grade), order);
   return (
     <div className="captures">
       <header className="head">
@@ -82,11 +89,12 @@ export function CapturesTable(): JSX.Element {
           <span className="hidden">Search captures</span>
           <input
             type="search"
-            placeholder="Search name, notes, source"
+            placeholder="Search name, notes, tags, source"
             value={search}
             onChange={(event) => adjust({ search: event.target.value })}
           />
         </label>
+        <ListControls grade={grade} onGrade={setGrade} order={order} onOrder={setOrder} />
         {!uploads && (
           <ActionButton className="opens-upload" onClick={() => setUploads(true)}>
             Upload
@@ -94,6 +102,16 @@ export function CapturesTable(): JSX.Element {
         )}
       </header>
       {uploads && <UploadPanel onClose={() => setUploads(false)} />}
+      {selected.size > 0 && (
+        <SelectionBar
+          chosen={shown.filter((one) => selected.has(one.id)).map((one) => known[one.id] ?? one)}
+          onDone={() => {
+            setSelected(new Set());
+            setRound((n) => n + 1);
+          }}
+          onNone={() => setSelected(new Set())}
+        />
+      )}
       {problem !== null && <ErrorMessage text={problem} again={() => setRound((n) => n + 1)} />}
       {listed === null && problem === null && <Loading what="captures" />}
       {listed !== null &&
@@ -120,10 +138,14 @@ export function CapturesTable(): JSX.Element {
               )
             }
           >
-            {listed.items.map((one) => (
+            {shown.map((one) => (
               <Row
                 key={one.id}
                 capture={known[one.id] ?? one}
+                selected={selected.has(one.id)}
+                onSelect={(wanted) =>
+                  setSelected((old) => new Set(wanted ? [...old, one.id] : [...old].filter((id) => id !== one.id)))
+                }
                 onRemoved={() =>
                   setListed((old) => old && { ...old, items: old.items.filter((item) => item.id !== one.id) })
                 }
@@ -138,10 +160,14 @@ export function CapturesTable(): JSX.Element {
 
 function Row({
   capture,
+  selected,
+  onSelect,
   onRemoved,
   onRestored,
 }: {
   capture: Capture;
+  selected: boolean;
+  onSelect: (wanted: boolean) => void;
   onRemoved: () => void;
   onRestored: () => void;
 }): JSX.Element {
@@ -153,6 +179,14 @@ function Row({
   }, [unknown, capture.id]);
   return (
     <tr>
+      <td>
+        <input
+          type="checkbox"
+          aria-label={`Select ${nameOf(capture)}`}
+          checked={selected}
+          onChange={(event) => onSelect(event.target.checked)}
+        />
+      </td>
       <td>
         <Thumbnail id={capture.id} />
       </td>
@@ -168,6 +202,7 @@ function Row({
             group {capture.group.slice(-6)}
           </span>
         )}
+        {capture.tags.length > 0 && <span className="dim">{capture.tags.map((tag) => `#${tag}`).join(" ")}</span>}
         {capture.notes !== "" && (
           <span className="dim notes" title={capture.notes}>
             {capture.notes}

@@ -1,6 +1,6 @@
 /** The reconstructions of a capture: which one is shown, which one it is compared with, and new ones. */
 
-import type { JSX } from "react";
+import { type JSX, useState } from "react";
 
 import * as calls from "../../shared/api/calls";
 import type { OptionValues, Reconstruction, Task } from "../../shared/api/types";
@@ -8,7 +8,7 @@ import { attempt } from "../../shared/state/attempt";
 import { progressText } from "../../shared/state/capture";
 import { count, decibel, when } from "../../shared/state/format";
 import { adjust, go } from "../../shared/state/route";
-import { isEnded, storeReconstruction } from "../../shared/state/store";
+import { isEnded, removeReconstruction, storeReconstruction } from "../../shared/state/store";
 import { useFetch } from "../../shared/state/useFetch";
 import { ActionButton } from "../../shared/ui/access";
 import { Fetched } from "../../shared/ui/Fetched";
@@ -149,7 +149,16 @@ function Row({
       <td className="number">{count(job.poses)}</td>
       <td className="number">{count(job.splats)}</td>
       <td className="number">{decibel(job.psnr_db)}</td>
-      <td className="number">{isEnded(job) ? <SceneButton job={job} name={name} /> : <CancelButton job={job} />}</td>
+      <td className="number">
+        {isEnded(job) ? (
+          <>
+            <SceneButton job={job} name={name} />
+            <DeleteButton job={job} name={name} />
+          </>
+        ) : (
+          <CancelButton job={job} />
+        )}
+      </td>
     </tr>
   );
 }
@@ -174,6 +183,23 @@ function SceneButton({ job, name }: { job: Reconstruction; name: string }): JSX.
     >
       <Icon name="scene" />
     </button>
+  );
+}
+
+/** Asks once more, since a reconstruction that is deleted cannot be brought back. */
+function DeleteButton({ job, name }: { job: Reconstruction; name: string }): JSX.Element {
+  const [asked, setAsked] = useState(false);
+  const remove = async (): Promise<void> => {
+    await calls.removeReconstruction(job.id);
+    adjust({ reconstruction: null });
+    removeReconstruction(job.id);
+  };
+  return asked ? (
+    <ActionButton onClick={() => void attempt(remove)}>Delete for good</ActionButton>
+  ) : (
+    <ActionButton className="bare" aria-label={`Delete reconstruction ${name}`} onClick={() => setAsked(true)}>
+      <Icon name="trash" />
+    </ActionButton>
   );
 }
 

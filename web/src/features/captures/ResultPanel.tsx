@@ -11,6 +11,7 @@ import { Fetched } from "../../shared/ui/Fetched";
 import { Icon } from "../../shared/ui/icons";
 import { Panel, Stat } from "../../shared/ui/parts";
 import { textOf } from "../../shared/ui/options";
+import { ExportMenu } from "./ExportMenu";
 
 const TRAJECTORIES = [
   { format: "tum", label: "TUM" },
@@ -93,6 +94,7 @@ export function ResultPanel({
               <Icon name="download" /> SPZ
             </a>
           </div>
+          <ExportMenu job={job} />
           <div className="downloads" role="group" aria-label="Trajectory">
             {TRAJECTORIES.map(({ format, label }) => (
               <a key={format} className="button" href={calls.address.trajectory(job.id, format)} download>

@@ -2,9 +2,14 @@
 
 import type { JSX } from "react";
 
+import * as calls from "../../shared/api/calls";
 import type { Reconstruction } from "../../shared/api/types";
+import { attempt } from "../../shared/state/attempt";
 import { nameOf, progressText } from "../../shared/state/capture";
-import { activeJobs, useService } from "../../shared/state/store";
+import { activeJobs, storeReconstruction, useService } from "../../shared/state/store";
+import { ActionButton } from "../../shared/ui/access";
+import { NotifySwitch } from "./NotifySwitch";
+import { Icon } from "../../shared/ui/icons";
 import { PageLink } from "../../shared/ui/PageLink";
 import { JobBadge, Panel } from "../../shared/ui/parts";
 
@@ -13,7 +18,7 @@ export function Queue({ shown }: { shown: string | null }): JSX.Element | null {
   const jobs = activeJobs(all);
   if (jobs.every((job) => job.capture_id === shown)) return null;
   return (
-    <Panel title="Reconstructions under way">
+    <Panel title="Reconstructions under way" aside={<NotifySwitch />}>
       <ol className="queue">
         {jobs.map((job) => (
           <Turn key={job.id} job={job} />
@@ -32,6 +37,14 @@ function Turn({ job }: { job: Reconstruction }): JSX.Element {
       </PageLink>
       <JobBadge job={job} />
       <span className="dim">{progressText(job)}</span>
+      <ActionButton
+        className="bare"
+        aria-label={`Cancel the reconstruction of ${capture === null ? "an older capture" : nameOf(capture)}`}
+        title="Cancel"
+        onClick={() => void attempt(async () => storeReconstruction(await calls.cancel(job.id)))}
+      >
+        <Icon name="close" />
+      </ActionButton>
     </li>
   );
 }

@@ -3,7 +3,7 @@
 import { type JSX, useState } from "react";
 
 import type { Capture, Closure, Reconstruction, Version } from "../../shared/api/types";
-import { nameOf } from "../../shared/state/capture";
+import { nameOf, progressText } from "../../shared/state/capture";
 import { count, decibel, duration, percent } from "../../shared/state/format";
 import { toast } from "../../shared/state/toasts";
 import { Icon } from "../../shared/ui/icons";
@@ -13,7 +13,11 @@ import type { Colouring } from "./path";
 import { MAX_WIDTH_PX, type LineStyle, SPEED_STYLES, STATE_STYLES, STATES } from "./stateStyles";
 import type { Closures } from "./useClosures";
 import type { Shown } from "./useScene";
-import type { Layers, Steering } from "./Viewer";
+import type { Layers, Steering, Viewer } from "./Viewer";
+import { ViewPanel, type Shows } from "./ViewPanel";
+import { CleanPanel } from "./CleanPanel";
+import { MeasurePanel } from "./MeasurePanel";
+import type { Preset } from "./presets";
 
 const LAYER_NAMES: Record<keyof Layers, string> = {
   splats: "Splats",
@@ -33,6 +37,7 @@ const COLOURINGS = [
 ] as const;
 
 export interface InspectorProps {
+  viewer: Viewer | null;
   capture: Capture;
   job: Reconstruction;
   /** The versions that are kept, oldest first. */
@@ -53,6 +58,11 @@ export interface InspectorProps {
   steering: Steering;
   onSteering: (steering: Steering) => void;
   ride: boolean;
+  shows: Shows;
+  onShows: (shows: Shows) => void;
+  fov: number;
+  onFov: (fov: number) => void;
+  onPreset: (preset: Preset) => void;
   onRide: (ride: boolean) => void;
   onHome: () => void;
   onScreenshot: () => void;
@@ -82,9 +92,12 @@ export function Inspector(props: InspectorProps): JSX.Element {
       {running && job.stage === "refining" && (
         <div className="refining">
           <Meter share={job.progress} label="Refinement" />
-          <span>{percent(job.progress)} refined</span>
+          <span>
+            {percent(job.progress)} refined{job.eta_s !== null && `, about ${duration(job.eta_s)} left`}
+          </span>
         </div>
       )}
+      {job.state === "queued" && <p className="dim hint">{progressText(job)}</p>}
       {shown !== null && !shown.whole && (
         <button type="button" disabled={props.full} onClick={props.onFull}>
           <Icon name="layers" />{" "}
@@ -98,6 +111,7 @@ export function Inspector(props: InspectorProps): JSX.Element {
         </button>
       </div>
       <p className="dim hint">{STEERINGS.find((one) => one.value === props.steering)?.hint}</p>
+      <ViewPanel {...props} />
       <button type="button" aria-pressed={props.ride} onClick={() => props.onRide(!props.ride)}>
         <Icon name="eye" /> Ride along
       </button>
@@ -120,6 +134,8 @@ export function Inspector(props: InspectorProps): JSX.Element {
       </div>
       <Legend colouring={props.colouring} />
       <Loops closures={props.closures} onTime={props.onTime} />
+      <MeasurePanel viewer={props.viewer} jobId={job.id} />
+      <CleanPanel viewer={props.viewer} job={job} newest={pinned === null} />
       <Bookmarks key={capture.id} captureId={capture.id} currentView={props.currentView} onView={props.onView} />
       <button type="button" onClick={props.onScreenshot}>
         <Icon name="camera" /> Screenshot

@@ -6,7 +6,7 @@ import { address, fetched } from "../../shared/api/calls";
 import type { Capture, Sensor } from "../../shared/api/types";
 import { Segmented } from "../../shared/ui/parts";
 
-type Comparison = "wipe" | "difference" | "rendered" | "observed";
+export type Comparison = "wipe" | "difference" | "rendered" | "observed";
 const CHOICES = [
   { value: "wipe", label: "Wipe" },
   { value: "difference", label: "Difference" },
@@ -22,14 +22,17 @@ export function RideAlong({
   white,
   sensor,
   frame,
+  comparison,
+  onComparison,
 }: {
   capture: Capture;
   /** Radiance of white in the scene. */
   white: number | undefined;
   sensor: Sensor;
   frame: number | null;
+  comparison: Comparison;
+  onComparison: (comparison: Comparison) => void;
 }): JSX.Element {
-  const [comparison, setComparison] = useState<Comparison>("wipe");
   const [share, setShare] = useState(0.5);
   const image = useRef<HTMLImageElement>(null);
   const observed = useObserved(capture.id, white, frame);
@@ -58,7 +61,7 @@ export function RideAlong({
       {comparison === "wipe" && <Wipe share={share} onShare={setShare} />}
       {comparison === "difference" && <span className="brightened" aria-hidden="true" />}
       <div className="compare" ref={bar}>
-        <Segmented label="Comparison" value={comparison} choices={CHOICES} onChange={setComparison} />
+        <Segmented label="Comparison" value={comparison} choices={CHOICES} onChange={onComparison} />
         {comparison === "difference" && <span className="note">|observed − rendered| × {DIFFERENCE_GAIN}</span>}
         {observed.missing && comparison !== "rendered" && (
           <span className="note">No recorded picture of this frame</span>

@@ -20,13 +20,15 @@ import { toast } from "../../shared/state/toasts";
 import { Empty, ErrorMessage, JobReason, Loading, trackingHint } from "../../shared/ui/parts";
 import { Inspector } from "./Inspector";
 import { type Colouring, rowAt } from "./path";
-import { RideAlong } from "./RideAlong";
+import { type Comparison, RideAlong } from "./RideAlong";
 import { Scrubber } from "./Scrubber";
 import { usePath } from "./usePath";
 import { useClosures } from "./useClosures";
 import { useScene } from "./useScene";
+import { useSceneKeys } from "./useSceneKeys";
 import { useVersions } from "./useVersions";
 import { type Layers, type Steering, Viewer } from "./Viewer";
+import { VIEW_MODES } from "./viewModes";
 
 const LAYERS: Layers = { splats: true, path: true, loops: true, frustum: true, grid: true, axes: true };
 const URL_MS = 300;
@@ -95,6 +97,8 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   const [colouring, setColouring] = useState<Colouring>("state");
   const [steering, setSteering] = useState<Steering>("orbit");
   const [full, setFull] = useState(false);
+  const [comparison, setComparison] = useState<Comparison>("wipe");
+  const mode = VIEW_MODES.find((one) => one === at.show) ?? "colour";
   const sensor = capture.sensor;
   const versions = useVersions(job);
   const pinned = versions.find((one) => one.version === at.version) ?? null;
@@ -144,6 +148,8 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   useEffect(() => viewer?.setLayers(layers), [viewer, layers]);
   useEffect(() => viewer?.steer(steering), [viewer, steering]);
   useEffect(() => viewer?.setRiding(at.ride), [viewer, at.ride]);
+  useEffect(() => viewer?.setMode(at.ride ? "colour" : mode), [viewer, at.ride, mode]);
+  useSceneKeys(viewer, mode, steering === "orbit" && !at.ride);
   const linked = at.camera;
   useEffect(() => {
     // Only views from a link or the history; the viewer's own updates are in effect already.
@@ -179,6 +185,8 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
               white={(pinned ?? job).white ?? undefined}
               sensor={sensor}
               frame={path?.frames[row] ?? null}
+              comparison={comparison}
+              onComparison={setComparison}
             />
           )}
         </div>
@@ -204,6 +212,7 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
         )}
       </div>
       <Inspector
+        viewer={viewer}
         capture={capture}
         job={job}
         versions={versions}
@@ -226,6 +235,17 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
         onSteering={setSteering}
         ride={at.ride}
         onRide={(ride) => adjust({ ride })}
+        shows={at.ride && comparison === "difference" ? "error" : mode}
+        onShows={(shows) => {
+          setComparison(shows === "error" ? "difference" : "wipe");
+          adjust(shows === "error" ? { ride: true } : { ride: false, show: shows === "colour" ? "" : shows });
+        }}
+        fov={Math.round(at.camera?.[6] ?? viewer?.view()[6] ?? 0)}
+        onFov={(fov) => viewer?.setFov(fov)}
+        onPreset={(preset) => {
+          adjust({ ride: false });
+          viewer?.look(preset);
+        }}
         onHome={() => {
           viewer?.home();
           adjust({ camera: null });

@@ -3,12 +3,16 @@
 import { ExtSplats, SparkRenderer, SplatMesh, utils } from "@sparkjsdev/spark";
 import {
   AxesHelper,
+  Box3,
+  Box3Helper,
   Color,
   GridHelper,
   Group,
   PerspectiveCamera,
   Quaternion,
+  Raycaster,
   Scene,
+  Vector2,
   Vector3,
   WebGLRenderer,
 } from "three";
@@ -23,9 +27,14 @@ import { colour } from "../../shared/state/theme";
 import { type Placement, placementOf, pointOf, projectionOf } from "./axes";
 import { axisNames } from "./axisNames";
 import { type Changes, changed, NO_SLOTS, type Slots } from "./changes";
+import type { Box } from "./cropBox";
 import { type Colouring, type Path, quantile } from "./path";
 import { LoopLines } from "./loops";
+import { MarkLines } from "./MarkLines";
 import { OVERLAY_ORDER, PathLines } from "./PathLines";
+import { distanceAlong } from "./picker";
+import { type Preset, presetDirection } from "./presets";
+import { show as showMode, type ViewMode } from "./viewModes";
 
 export type Steering = "orbit" | "fly";
 
@@ -41,6 +50,8 @@ export interface Layers {
 const FRUSTUM_PX = 1.6;
 /** Size of the diamonds at closed loops, in units of the depth of the scene. */
 const LOOP_SIZE = 0.03;
+/** The same of the crosses at points that are measured. */
+const MARK_SIZE = 0.012;
 const SAMPLE = 20_000;
 /** Room for splats that come later, so that a growing scene does not get new textures with every version. */
 const HEADROOM = 1.25;
@@ -77,11 +88,15 @@ export class Viewer {
   private steering: Steering = "orbit";
   private mesh: SplatMesh | null = null;
   private slots: Slots = NO_SLOTS;
+  /** The box around the splats of some slots. */
+  private bounded: { slots: Slots; box: Box | null } | null = null;
   /** Splats for which the textures have room. */
   private capacity = 0;
   private readonly path = new PathLines();
   private readonly loops = new LoopLines();
+  private readonly marks = new MarkLines();
   private readonly frustum = new LineSegments2(new LineSegmentsGeometry(), new LineMaterial({ linewidth: FRUSTUM_PX }));
+  private readonly crop = new Box3Helper(new Box3(), colour("mark"));
   private grid = new GridHelper(1, 1);
   private readonly gridColour = new Color();
   private readonly axes = new AxesHelper(1);
@@ -90,6 +105,7 @@ export class Viewer {
   private placement: Placement | null = null;
   private sensor: Sensor | null = null;
   private riding = false;
+  private mode: ViewMode = "colour";
   private placed = false;
   private scheduled = 0;
   private lastMs = 0;
@@ -98,7 +114,7 @@ export class Viewer {
 
   /** @param onMoved called when the user has moved the camera. */
   constructor(
-    private readonly canvas: HTMLCanvasElement,
+    readonly canvas: HTMLCanvasElement,
     private readonly onMoved: () => void,
   ) {
     this.renderer = new WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
@@ -113,7 +129,7 @@ export class Viewer {
       enableLod: false,
     });
     this.turned.quaternion.set(1, 0, 0, 0);
-    this.world.add(this.spark, this.turned, this.path, this.loops, this.frustum, this.axes);
+    this.world.add(this.spark, this.turned, this.path, this.loops, this.marks, this.crop, this.frustum, this.axes);
     this.frustum.renderOrder = OVERLAY_ORDER;
     this.frustum.frustumCulled = false;
     this.frustum.material.depthTest = false;
@@ -124,6 +140,7 @@ export class Viewer {
     this.frustum.material.color.set(colour("accent", around));
     this.gridColour.set(colour("line", around));
     this.path.visible = false;
+    this.crop.visible = false;
     // Of the capture's world, OpenCV's: y points down and z ahead.
     this.axes.scale.set(1, -1, -1);
     this.axes.setColors(new Color(colour("axis-x")), new Color(colour("axis-y")), new Color(colour("axis-z")));
@@ -144,6 +161,7 @@ export class Viewer {
     this.resizing.observe(canvas);
     canvas.addEventListener("webglcontextlost", this.onLost);
     canvas.addEventListener("webglcontextrestored", this.draw);
+    canvas.addEventListener("dblclick", this.onDoubleClick);
     this.resize();
   }
 
@@ -157,14 +175,20 @@ export class Viewer {
     this.mesh?.dispose();
     this.path.clear();
     this.loops.clear();
+    this.marks.clear();
     this.canvas.removeEventListener("webglcontextlost", this.onLost);
     this.canvas.removeEventListener("webglcontextrestored", this.draw);
+    this.canvas.removeEventListener("dblclick", this.onDoubleClick);
     this.renderer.dispose();
   }
 
   /** Draw in the next animation frame, once for any number of calls. */
   readonly draw = (): void => {
     if (this.scheduled === 0) this.scheduled = requestAnimationFrame(this.render);
+  };
+
+  private readonly onDoubleClick = (event: MouseEvent): void => {
+    if (!this.riding) this.focus(event.clientX, event.clientY);
   };
 
   private readonly onLost = (event: Event): void => event.preventDefault();
@@ -241,6 +265,20 @@ export class Viewer {
     this.mesh = mesh;
     before?.removeFromParent();
     before?.dispose();
+    if (this.mode !== "colour") showMode(mesh, this.mode, this.depth);
+  }
+
+  /** Show another property of the splats. */
+  setMode(mode: ViewMode): void {
+    if (mode === this.mode) return;
+    this.mode = mode;
+    if (this.mesh !== null) showMode(this.mesh, mode, this.depth);
+    this.draw();
+  }
+
+  /** Median distance of the splats from the first pose, 1 before there are any. */
+  get depth(): number {
+    return this.extent?.depth ?? 1;
   }
 
   /** Give the mesh its new splats: into the textures that it has, and shown when they are sorted. */
@@ -295,6 +333,7 @@ export class Viewer {
     this.camera.far = depth * 200;
     this.camera.updateProjectionMatrix();
     this.buildGrid();
+    if (this.mesh !== null && this.mode !== "colour") showMode(this.mesh, this.mode, depth);
     this.axes.scale.set(1, -1, -1).multiplyScalar(depth / 8);
     if (this.placed) return;
     this.home();
@@ -303,7 +342,7 @@ export class Viewer {
   private buildGrid(): void {
     this.world.remove(this.grid);
     this.grid.dispose();
-    const depth = this.extent?.depth ?? 1;
+    const { depth } = this;
     const cell = roundLength(depth / 6);
     const cells = 2 * Math.ceil((1.6 * depth) / cell);
     this.grid = new GridHelper(cells * cell, cells, this.gridColour, this.gridColour);
@@ -318,7 +357,7 @@ export class Viewer {
   }
 
   setLoops(path: Path, closures: readonly Closure[], fresh: number): void {
-    this.loops.set(path, closures, (this.extent?.depth ?? 1) * LOOP_SIZE, fresh);
+    this.loops.set(path, closures, this.depth * LOOP_SIZE, fresh);
     this.show();
   }
 
@@ -333,7 +372,7 @@ export class Viewer {
     this.rider.updateMatrixWorld();
     const k = sensor.intrinsics;
     if (k !== null) {
-      const depth = this.extent?.depth ?? 1;
+      const { depth } = this;
       this.rider.projectionMatrix.copy(projectionOf(k, sensor.width, sensor.height, depth / 200, depth * 200));
       this.rider.projectionMatrixInverse.copy(this.rider.projectionMatrix).invert();
       const size = depth / 8;
@@ -379,20 +418,20 @@ export class Viewer {
     if (this.steering !== "fly" || this.riding || document.activeElement !== this.canvas) return;
     this.fly = new FlyControls(this.camera, this.canvas);
     this.fly.dragToLook = true;
-    this.fly.movementSpeed = (this.extent?.depth ?? 1) / 2;
+    this.fly.movementSpeed = this.depth / 2;
     this.fly.rollSpeed = 0.6;
     this.draw();
   };
 
   /** A point in front of the free camera, at the distance of the scene. */
   private ahead(): Vector3 {
-    const reach = this.extent?.depth ?? 1;
+    const reach = this.depth;
     return this.camera.position.clone().addScaledVector(this.camera.getWorldDirection(new Vector3()), reach);
   }
 
   /** Initial view: behind and slightly above the capture camera. */
   home(): void {
-    const depth = this.extent?.depth ?? 1;
+    const { depth } = this;
     const at = this.placement ?? { position: new Vector3(), quaternion: new Quaternion() };
     const offset = new Vector3(0.22 * depth, 0.22 * depth, 0.6 * depth).applyQuaternion(at.quaternion);
     this.camera.position.copy(at.position).add(offset);
@@ -400,6 +439,107 @@ export class Viewer {
     this.placed = this.placement !== null; // else once more when the path has come
     this.orbit.update();
     this.draw();
+  }
+
+  /** Look at the scene from one of its sides, from as far as now. */
+  look(preset: Preset): void {
+    if (preset === "camera" && this.placement !== null) {
+      const { position, quaternion } = this.placement;
+      this.camera.position.copy(position);
+      this.orbit.target.copy(position).add(new Vector3(0, 0, -this.depth).applyQuaternion(quaternion));
+    } else {
+      const { target } = this.orbit;
+      const away = this.camera.position.distanceTo(target);
+      this.camera.position.copy(target).addScaledVector(presetDirection(preset), away);
+    }
+    this.moved();
+  }
+
+  /** Vertical field of view of the free camera, degrees. */
+  setFov(fov: number): void {
+    this.camera.fov = fov;
+    this.camera.updateProjectionMatrix();
+    this.moved();
+  }
+
+  /** Turn to the point of the scene under a place of the window, and go round it from now on; false if nothing is there. */
+  focus(clientX: number, clientY: number): boolean {
+    const point = this.pick(clientX, clientY);
+    if (point === null) return false;
+    this.orbit.target.copy(point);
+    this.moved();
+    return true;
+  }
+
+  /** The point of the scene under a place of the window, in the axes of three.js; null if nothing opaque is there. */
+  pick(clientX: number, clientY: number): Vector3 | null {
+    const box = this.canvas.getBoundingClientRect();
+    const at = new Vector2(((clientX - box.left) / box.width) * 2 - 1, 1 - ((clientY - box.top) / box.height) * 2);
+    const caster = new Raycaster();
+    caster.setFromCamera(at, this.riding ? this.rider : this.camera);
+    const { origin, direction } = caster.ray;
+    const turned = (v: Vector3): Vector3 => new Vector3(v.x, -v.y, -v.z);
+    const distance = distanceAlong(this.slots, turned(origin), turned(direction));
+    return distance === null ? null : origin.clone().addScaledVector(direction, distance);
+  }
+
+  /** Mark points with crosses, joined by lines. */
+  mark(points: readonly Vector3[], closed: boolean): void {
+    this.marks.set(points, this.depth * MARK_SIZE, closed);
+    this.draw();
+  }
+
+  /** The middle of the canvas, as a place of the window. */
+  get middle(): [number, number] {
+    const box = this.canvas.getBoundingClientRect();
+    return [box.left + box.width / 2, box.top + box.height / 2];
+  }
+
+  /** The box around all splats, in the axes of the scene; null before there are any. Found once for each change. */
+  bounds(): Box | null {
+    if (this.bounded?.slots !== this.slots) this.bounded = { slots: this.slots, box: this.findBounds() };
+    return this.bounded.box;
+  }
+
+  private findBounds(): Box | null {
+    const { arrays, slots, held } = this.slots;
+    const places = new Float32Array(arrays[0].buffer);
+    const low: [number, number, number] = [Infinity, Infinity, Infinity];
+    const high: [number, number, number] = [-Infinity, -Infinity, -Infinity];
+    for (let slot = 0; slot < slots; slot += 1) {
+      if (held[slot] === 0) continue;
+      for (const k of [0, 1, 2] as const) {
+        const x = places[4 * slot + k] ?? 0;
+        low[k] = Math.min(low[k], x);
+        high[k] = Math.max(high[k], x);
+      }
+    }
+    return low[0] > high[0] ? null : { low, high };
+  }
+
+  /** Draw the edges of a box; null: none. */
+  showBox(box: Box | null): void {
+    if (box !== null) this.crop.box.setFromPoints([pointOf(box.low), pointOf(box.high)]);
+    this.crop.visible = box !== null;
+    this.draw();
+  }
+
+  /** Where the free camera is. */
+  get eye(): Vector3 {
+    return this.camera.position.clone();
+  }
+
+  /** The length that a pixel covers at the mean distance of points, in units of the scene. */
+  pixel(points: readonly Vector3[]): number {
+    const away = points.reduce((sum, point) => sum + point.distanceTo(this.camera.position), 0) / points.length;
+    return (2 * away * Math.tan((this.camera.fov * Math.PI) / 360)) / Math.max(this.canvas.clientHeight, 1);
+  }
+
+  private moved(): void {
+    this.placed = true;
+    this.orbit.update();
+    this.draw();
+    this.onMoved();
   }
 
   /** Position and target of the free camera and its field of view in degrees: seven numbers, for URLs and bookmarks. */

@@ -1,4 +1,4 @@
-import { PerspectiveCamera, Vector3 } from "three";
+import { DataUtils, PerspectiveCamera, Vector3 } from "three";
 import { expect, it } from "vitest";
 
 import type { Trajectory } from "../../shared/api/types";
@@ -6,6 +6,7 @@ import { placementOf, projectionOf } from "./axes";
 import { classes, pathOf, rowAt, runs, stylesBy, speeds, thinned } from "./path";
 import { SPEED_STYLES, STATE_STYLES, STATES } from "./stateStyles";
 import { containing, moved, zoomed } from "./timelineWindow";
+import { distanceAlong } from "./picker";
 import { readBookmarks, writeBookmarks } from "./bookmarks";
 
 const straight = (n: number): Trajectory => ({
@@ -125,4 +126,29 @@ it("zooms the timeline around a frame, keeps it inside, and shows everything aga
   expect((close?.last ?? 0) - (close?.first ?? 0)).toBe(100);
   expect(zoomed(null, { first: 3, last: 50 }, 2, 10)).toBeNull();
   expect(moved(null, whole, 5)).toBeNull();
+});
+
+it("finds the distance at which half of the light along a ray is stopped", () => {
+  const half = (x: number): number => DataUtils.toHalfFloat(x);
+  const places = new Float32Array([0, 0, 2, 0, 0.1, 0, 3, 0, 0, 0, 5, 0]);
+  const first = new Uint32Array(places.buffer);
+  const second = new Uint32Array(12);
+  [0.3, 0.4, 0.9].forEach((opacity, slot) => {
+    first[4 * slot + 3] = half(opacity);
+    const size = half(Math.log(slot === 1 ? 10 : 0.1));
+    second[4 * slot + 1] = size << 16;
+    second[4 * slot + 2] = size | (size << 16);
+  });
+  const slots = {
+    arrays: [first, second] as [Uint32Array, Uint32Array],
+    slots: 3,
+    held: new Uint8Array([1, 1, 1]),
+    splats: 3,
+  };
+  const ahead = new Vector3(0, 0, 1);
+  // 0.3 of the light is stopped at 2, and 0.4 of what is left at 3.
+  expect(distanceAlong(slots, new Vector3(), ahead)).toBeCloseTo(3, 2);
+  slots.held[1] = 0;
+  expect(distanceAlong(slots, new Vector3(), ahead)).toBeCloseTo(5, 2);
+  expect(distanceAlong(slots, new Vector3(1, 0, 0), ahead)).toBeNull();
 });

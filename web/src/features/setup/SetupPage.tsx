@@ -19,6 +19,7 @@ import { ProfilePanel } from "./ProfilePanel";
 
 const TONES: Record<Finding["status"], Tone> = { ok: "good", warning: "warning", problem: "problem" };
 const LINKS = [
+  { href: "docs/guide", label: "Documentation", hint: "How-tos, and the reference of commands, settings and API" },
   { href: "docs", label: "API documentation", hint: "All operations, with requests and responses" },
   { href: "openapi.json", label: "OpenAPI schema", hint: "For client generators" },
   { href: "metrics", label: "Metrics", hint: "For Prometheus" },

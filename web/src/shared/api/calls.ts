@@ -7,17 +7,25 @@ import type {
   CaptureChange,
   CapturePage,
   CaptureRequest,
+  CleanRequest,
+  ExportFormat,
   Device,
+  Edited,
   Finding,
   OptionSchema,
   OptionValues,
   PreviewKind,
   Profile,
   Reconstruction,
+  RevertRequest,
+  Scale,
+  ScaleRequest,
   Setting,
   SourceKind,
   Stats,
   System,
+  TagScale,
+  TagScaleRequest,
   Timeline,
   Token,
   Trajectory,
@@ -151,6 +159,8 @@ export const merge = (first: string, other: string): Promise<Reconstruction> =>
       params: { path: { reconstruction_id: first }, header: idempotent() },
     }),
   );
+export const removeReconstruction = (id: string): Promise<unknown> =>
+  answered(client.DELETE("/api/v1/reconstructions/{reconstruction_id}", ofReconstruction(id)));
 export const cancel = (id: string): Promise<Reconstruction> =>
   answered(client.POST("/api/v1/reconstructions/{reconstruction_id}:cancel", ofReconstruction(id)));
 /** At most `points` neighbouring moments joined, of a part of the time. */
@@ -170,6 +180,40 @@ export const trajectory = async (id: string, step: number, version?: number): Pr
   ).json()) as Trajectory;
 export const log = async (id: string): Promise<string> => (await request(`reconstructions/${id}/log`)).text();
 
+/** The formats of other programs. */
+export const exportFormats = async (): Promise<ExportFormat[]> =>
+  (await answered(client.GET("/api/v1/exports"))).formats;
+
+/** Metres for the unit of a scene, and which way is up. */
+export const scale = (id: string): Promise<Scale> =>
+  answered(client.GET("/api/v1/reconstructions/{reconstruction_id}/scale", ofReconstruction(id)));
+export const setScale = (id: string, body: ScaleRequest): Promise<Scale> =>
+  answered(client.PUT("/api/v1/reconstructions/{reconstruction_id}/scale", { ...ofReconstruction(id), body }));
+export const scaleByTag = (id: string, body: TagScaleRequest): Promise<TagScale> =>
+  answered(
+    client.POST("/api/v1/reconstructions/{reconstruction_id}/scale:tag", {
+      body,
+      params: { path: { reconstruction_id: id }, header: idempotent() },
+    }),
+  );
+
+/** Publish a version without floaters, or without what is outside of a box. */
+export const clean = (id: string, body: CleanRequest): Promise<Edited> =>
+  answered(
+    client.POST("/api/v1/reconstructions/{reconstruction_id}:clean", {
+      body,
+      params: { path: { reconstruction_id: id }, header: idempotent() },
+    }),
+  );
+/** Publish an earlier version again. */
+export const revert = (id: string, body: RevertRequest): Promise<Edited> =>
+  answered(
+    client.POST("/api/v1/reconstructions/{reconstruction_id}:revert", {
+      body,
+      params: { path: { reconstruction_id: id }, header: idempotent() },
+    }),
+  );
+
 /** URLs for elements that fetch by themselves. */
 export const address = {
   thumbnail: (id: string): string => `${API}/captures/${id}/thumbnail`,
@@ -187,6 +231,8 @@ export const address = {
   changes: (id: string, asked: { level: number; version?: number | undefined; since?: string | undefined }): string =>
     `${API}/reconstructions/${id}/scene/changes${query(asked)}`,
   report: (id: string): string => `${API}/reconstructions/${id}/report`,
+  exported: (id: string, format: string, metric: boolean): string =>
+    `${API}/reconstructions/${id}/exports/${format}${query(metric ? { metric } : {})}`,
   bundle: (id: string): string => `${API}/reconstructions/${id}/bundle`,
   trajectory: (id: string, format: string): string => `${API}/reconstructions/${id}/trajectory${query({ format })}`,
 };

@@ -231,7 +231,7 @@ export interface paths {
         head?: never;
         /**
          * Change Capture
-         * @description Change its name or notes, or exclude it from retention.
+         * @description Change its name, notes, tags or metadata, or exclude it from retention.
          *
          *     Scope of a token: `operate`.
          */
@@ -914,6 +914,172 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/api/v1/exports": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * List Export Formats
+         * @description The formats of other programs that results are exported in, and what each loses.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["list_export_formats_api_v1_exports_get"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/reconstructions/{reconstruction_id}/exports/{format}": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Reconstruction Export
+         * @description A version in a format of another program; `GET exports` lists them. The file is made in a worker process, which takes seconds to minutes, and kept for a while; one is made at a time.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["get_reconstruction_export_api_v1_reconstructions__reconstruction_id__exports__format__get"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/captures/{capture_id}/exports/{format}": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Export
+         * @description The newest reconstruction in a format of another program; `GET exports` lists them. The file is made in a worker process, which takes seconds to minutes, and kept for a while; one is made at a time.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["get_export_api_v1_captures__capture_id__exports__format__get"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/reconstructions/{reconstruction_id}:clean": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        get?: never;
+        put?: never;
+        /**
+         * Clean Scene
+         * @description Publish a version without what is outside of a box, and without floaters. `:revert` undoes it.
+         *
+         *     Scope of a token: `operate`.
+         */
+        post: operations["clean_scene_api_v1_reconstructions__reconstruction_id__clean_post"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/reconstructions/{reconstruction_id}:revert": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        get?: never;
+        put?: never;
+        /**
+         * Revert Scene
+         * @description Publish an earlier version again, as the newest.
+         *
+         *     Scope of a token: `operate`.
+         */
+        post: operations["revert_scene_api_v1_reconstructions__reconstruction_id__revert_post"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/reconstructions/{reconstruction_id}/scale": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Scale
+         * @description Metres for its unit of length, and the direction of up.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["get_scale_api_v1_reconstructions__reconstruction_id__scale_get"];
+        /**
+         * Set Scale
+         * @description Store what was measured, unless somebody stored something else meanwhile.
+         *
+         *     Scope of a token: `operate`.
+         */
+        put: operations["set_scale_api_v1_reconstructions__reconstruction_id__scale_put"];
+        post?: never;
+        /**
+         * Remove Scale
+         * @description Forget the scale and the direction of up.
+         *
+         *     Scope of a token: `operate`.
+         */
+        delete: operations["remove_scale_api_v1_reconstructions__reconstruction_id__scale_delete"];
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/reconstructions/{reconstruction_id}/scale:tag": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        get?: never;
+        put?: never;
+        /**
+         * Scale By Tag
+         * @description Find AprilTags of known size in the scene, and store the scale that they give.
+         *
+         *     Scope of a token: `operate`.
+         */
+        post: operations["scale_by_tag_api_v1_reconstructions__reconstruction_id__scale_tag_post"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
     "/api/v1/reconstructions/{reconstruction_id}/versions": {
         parameters: {
             query?: never;
@@ -1376,6 +1542,36 @@ export interface components {
          */
         BitOrder: "lsb" | "msb";
         /**
+         * BoxModel
+         * @description A box along the axes of the scene, in its unit.
+         * @example {
+         *       "high": [
+         *         1,
+         *         1,
+         *         4
+         *       ],
+         *       "low": [
+         *         -1,
+         *         -1,
+         *         0
+         *       ]
+         *     }
+         */
+        BoxModel: {
+            /** Low */
+            low: [
+                number,
+                number,
+                number
+            ];
+            /** High */
+            high: [
+                number,
+                number,
+                number
+            ];
+        };
+        /**
          * CalibratedOut
          * @description The completed profile of a device, and what was measured.
          */
@@ -1555,7 +1751,13 @@ export interface components {
          * @description What can be changed of a capture; fields that are not given stay.
          * @example {
          *       "keep": true,
-         *       "name": "desk, second try"
+         *       "metadata": {
+         *         "robot.run": "17"
+         *       },
+         *       "name": "desk, second try",
+         *       "tags": [
+         *         "desk"
+         *       ]
          *     }
          */
         CaptureChange: {
@@ -1568,6 +1770,12 @@ export interface components {
              * @description Retention leaves it alone.
              */
             keep?: boolean | null;
+            /** Tags */
+            tags?: string[] | null;
+            /** Metadata */
+            metadata?: {
+                [key: string]: string;
+            } | null;
         };
         /**
          * CaptureOut
@@ -1577,6 +1785,9 @@ export interface components {
          *       "frames_planned": 1280,
          *       "id": "01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10",
          *       "keep": false,
+         *       "metadata": {
+         *         "robot.run": "17"
+         *       },
          *       "name": "desk, by hand",
          *       "notes": "",
          *       "origin": "live",
@@ -1605,6 +1816,9 @@ export interface components {
          *       "source": "sim:?seed=1&pace=0",
          *       "started_at": "2026-11-21T07:10:00.123456Z",
          *       "state": "complete",
+         *       "tags": [
+         *         "desk"
+         *       ],
          *       "verdict": {
          *         "grade": "good",
          *         "reasons": []
@@ -1628,6 +1842,18 @@ export interface components {
              * @description Retention leaves it alone.
              */
             keep: boolean;
+            /**
+             * Tags
+             * @description Words to find it by.
+             */
+            tags: string[];
+            /**
+             * Metadata
+             * @description Values of other programs by key.
+             */
+            metadata: {
+                [key: string]: string;
+            };
             /** @description live: captured here; upload: a recording from elsewhere; recovered: found in the data folder, its row rebuilt from its files. */
             origin: components["schemas"]["Origin"];
             /** Source */
@@ -1781,6 +2007,35 @@ export interface components {
          * @enum {string}
          */
         CaptureState: "starting" | "waiting" | "streaming" | "finishing" | "complete" | "failed";
+        /**
+         * CleanRequest
+         * @description What is removed.
+         * @example {
+         *       "floaters": true,
+         *       "version": 12
+         *     }
+         */
+        CleanRequest: {
+            /**
+             * Version
+             * @description The newest version, which is edited; 409 if there is another.
+             */
+            version: number;
+            /** @description Splats outside are removed. */
+            box?: components["schemas"]["BoxModel"] | null;
+            /**
+             * Floaters
+             * @description Remove splats that few views see.
+             * @default true
+             */
+            floaters?: boolean;
+            /**
+             * Shrink
+             * @description With floaters: also make splats smaller that are larger than a quarter of the scene.
+             * @default false
+             */
+            shrink?: boolean;
+        };
         /**
          * ClockPair
          * @description Host time at which a frame had arrived whole, Unix time in ns.
@@ -1984,6 +2239,72 @@ export interface components {
             items: components["schemas"]["DoctorItemOut"][];
         };
         /**
+         * EditedOut
+         * @description The version that was published, and what was done.
+         */
+        EditedOut: {
+            /** Version */
+            version: number;
+            /** Splats */
+            splats: number;
+            /**
+             * Outside
+             * @description Splats that lay outside the box.
+             */
+            outside: number;
+            /**
+             * Floaters
+             * @description Splats that were removed as floaters.
+             */
+            floaters: number;
+            /**
+             * Shrunk
+             * @description Splats that were made smaller.
+             */
+            shrunk: number;
+        };
+        /**
+         * ExportFormatOut
+         * @description A format that results are exported in.
+         */
+        ExportFormatOut: {
+            /** Name */
+            name: string;
+            /**
+             * Title
+             * @description What is written.
+             */
+            title: string;
+            /**
+             * Readers
+             * @description Programs that read it.
+             */
+            readers: string;
+            /**
+             * Loses
+             * @description What of the reconstruction is not in it.
+             */
+            loses: string;
+            /**
+             * Suffix
+             * @description Of the file that is sent.
+             */
+            suffix: string;
+            /**
+             * Missing
+             * @description How to install what the format needs; empty if nothing is missing.
+             */
+            missing: string;
+        };
+        /**
+         * ExportFormatsOut
+         * @description All formats, in the order in which they are listed.
+         */
+        ExportFormatsOut: {
+            /** Formats */
+            formats: components["schemas"]["ExportFormatOut"][];
+        };
+        /**
          * FindingOut
          * @description Result of one check.
          */
@@ -2037,6 +2358,31 @@ export interface components {
          * @enum {string}
          */
         Form: "compact" | "row_tagged" | "usb" | "pcie" | "array" | "bits";
+        /**
+         * FoundTagOut
+         * @description A tag in the scene.
+         */
+        FoundTagOut: {
+            /** Tag */
+            tag: number;
+            /** Views */
+            views: number;
+            /**
+             * Side
+             * @description In the unit of the scene.
+             */
+            side: number;
+            /**
+             * Sigma
+             * @description Relative standard deviation.
+             */
+            sigma: number;
+            /**
+             * Corners
+             * @description In the scene, [4, 3].
+             */
+            corners: number[][];
+        };
         /**
          * FrameRangeOut
          * @description Frames `first` to `first + count - 1`, by absolute index.
@@ -3160,6 +3506,102 @@ export interface components {
             options?: components["schemas"]["ReconstructionOptions"] | null;
         };
         /**
+         * RevertRequest
+         * @description An earlier version to go back to.
+         * @example {
+         *       "to": 12,
+         *       "version": 13
+         *     }
+         */
+        RevertRequest: {
+            /**
+             * Version
+             * @description The newest version, which is edited; 409 if there is another.
+             */
+            version: number;
+            /**
+             * To
+             * @description A version that is kept; `GET versions` lists them.
+             */
+            to: number;
+        };
+        /**
+         * ScaleOut
+         * @description Metres for the unit of length of a scene, and the direction of up; null where it is not known.
+         */
+        ScaleOut: {
+            /**
+             * Revision
+             * @description Counts the changes; 0: nothing is known. A change names the one it replaces.
+             */
+            revision: number;
+            /** Metres Per Unit */
+            metres_per_unit: number | null;
+            /**
+             * Sigma
+             * @description Relative standard deviation of metres_per_unit; null: not known.
+             */
+            sigma: number | null;
+            /** @description What the scale rests on: a known length, or AprilTags. */
+            source: components["schemas"]["ScaleSource"] | null;
+            /**
+             * Up
+             * @description Direction in the scene, of length 1; null: -y is taken for up.
+             */
+            up: number[] | null;
+            /**
+             * Version
+             * @description Version of the scene that it was measured in.
+             */
+            version: number | null;
+        };
+        /**
+         * ScaleRequest
+         * @description What is measured; what is left out stays as it is.
+         * @example {
+         *       "metres_per_unit": 2.11,
+         *       "revision": 0,
+         *       "sigma": 0.004
+         *     }
+         * @example {
+         *       "revision": 1,
+         *       "up": [
+         *         0,
+         *         -1,
+         *         0
+         *       ]
+         *     }
+         */
+        ScaleRequest: {
+            /**
+             * Revision
+             * @description The one that this replaces; 409 if it is not.
+             */
+            revision: number;
+            /** Metres Per Unit */
+            metres_per_unit?: number | null;
+            /**
+             * Sigma
+             * @description Relative standard deviation, if known.
+             */
+            sigma?: number | null;
+            /**
+             * Up
+             * @description Of any length but zero.
+             */
+            up?: [
+                number,
+                number,
+                number
+            ] | null;
+        };
+        /**
+         * ScaleSource
+         * @description What a scale rests on.
+         * @enum {string}
+         */
+        ScaleSource: "length" | "tag";
+        /**
          * SceneFormat
          * @description How a scene is written.
          * @enum {string}
@@ -3375,7 +3817,7 @@ export interface components {
         SystemOut: {
             /**
              * Version
-             * @example 0.1.0
+             * @example 0.2.0
              */
             version: string;
             /**
@@ -3409,6 +3851,41 @@ export interface components {
             zmq: components["schemas"]["ZmqOut"] | null;
             /** @description Scope of the token of this request; admin where no token is required. */
             scope: components["schemas"]["Scope"];
+        };
+        /**
+         * TagScaleOut
+         * @description The scale by tags.
+         */
+        TagScaleOut: {
+            scale: components["schemas"]["ScaleOut"];
+            /** Tags */
+            tags: components["schemas"]["FoundTagOut"][];
+        };
+        /**
+         * TagScaleRequest
+         * @description AprilTags of known size.
+         * @example {
+         *       "revision": 0,
+         *       "side_m": 0.1
+         *     }
+         */
+        TagScaleRequest: {
+            /**
+             * Revision
+             * @description The one that this replaces; 409 if it is not.
+             */
+            revision: number;
+            /**
+             * Side M
+             * @description Side of the black square.
+             */
+            side_m: number;
+            /**
+             * Family
+             * @description 16h5, 25h9, 36h10 or 36h11.
+             * @default 36h11
+             */
+            family?: string;
         };
         /**
          * Task
@@ -4829,13 +5306,15 @@ export interface operations {
                 limit?: number;
                 /** @description `next_cursor` of the page before. */
                 cursor?: string | null;
-                /** @description Text to search for in name, notes and source. */
+                /** @description Text to look for in name, notes, source, tags and metadata. */
                 q?: string | null;
                 state?: components["schemas"]["CaptureState"] | null;
                 /** @description List removed captures instead. */
                 deleted?: boolean;
                 /** @description Captures that were started together, by their group's id. */
                 group?: string | null;
+                /** @description Captures with this tag. */
+                tag?: string | null;
             };
             header?: never;
             path?: never;
@@ -6520,6 +6999,8 @@ export interface operations {
                 step?: number;
                 /** @description Of a map of several recordings, another one's path; `GET paths` lists them. */
                 path?: number;
+                /** @description In metres, with up along -y, by the scale that is stored; 404 while there is none. */
+                metric?: boolean;
             };
             header?: never;
             path: {
@@ -6636,6 +7117,8 @@ export interface operations {
                 version?: number | null;
                 /** @description Most splats: a fixed sample is returned. Default: all. */
                 max_splats?: number | null;
+                /** @description In metres, with up along -y, by the scale that is stored; 404 while there is none. */
+                metric?: boolean;
             };
             header?: never;
             path: {
@@ -8161,6 +8644,8 @@ export interface operations {
                 step?: number;
                 /** @description Of a map of several recordings, another one's path; `GET paths` lists them. */
                 path?: number;
+                /** @description In metres, with up along -y, by the scale that is stored; 404 while there is none. */
+                metric?: boolean;
             };
             header?: never;
             path: {
@@ -8277,6 +8762,8 @@ export interface operations {
                 version?: number | null;
                 /** @description Most splats: a fixed sample is returned. Default: all. */
                 max_splats?: number | null;
+                /** @description In metres, with up along -y, by the scale that is stored; 404 while there is none. */
+                metric?: boolean;
             };
             header?: never;
             path: {
@@ -8877,6 +9364,1065 @@ export interface operations {
             };
             /** @description The service is overloaded, or stops. */
             503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    list_export_formats_api_v1_exports_get: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["ExportFormatsOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_reconstruction_export_api_v1_reconstructions__reconstruction_id__exports__format__get: {
+        parameters: {
+            query?: {
+                /** @description Default: the newest; `GET versions` lists them. */
+                version?: number | null;
+                /** @description Key views: poses of pictures, depth maps and points, evenly along the path. */
+                views?: number;
+                /** @description Pictures, depth maps and cameras without the lens's distortion. */
+                undistorted?: boolean;
+                /** @description Mean depth of what a pixel shows; less exact than the median. */
+                expected_depth?: boolean;
+                /** @description Voxels of a mesh along the longest side of the scene. */
+                resolution?: number;
+                /** @description In metres, with up along -y; 404 while the scale is not known. */
+                metric?: boolean;
+            };
+            header?: never;
+            path: {
+                /** @description Name of a format. */
+                format: "depth" | "points-ply" | "points-pcd" | "mesh-ply" | "mesh-glb" | "colmap" | "nerfstudio" | "ply" | "compressed-ply" | "spz" | "sog" | "rerun" | "mcap" | "ros-bag" | "nexus";
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description The file, or a ZIP of the folder. */
+            200: {
+                headers: {
+                    /** @description Changes with the content. */
+                    ETag?: string;
+                    /** @description Its version. */
+                    "X-Scene-Version"?: number;
+                    /** @description With a file name. */
+                    "Content-Disposition"?: string;
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/zip": string;
+                    "application/octet-stream": string;
+                    "model/gltf-binary": string;
+                };
+            };
+            /** @description The requested range. */
+            206: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/zip": string;
+                    "application/octet-stream": string;
+                    "model/gltf-binary": string;
+                };
+            };
+            /** @description The content has not changed. */
+            304: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The range lies outside the file. */
+            416: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_export_api_v1_captures__capture_id__exports__format__get: {
+        parameters: {
+            query?: {
+                /** @description Default: the newest; `GET versions` lists them. */
+                version?: number | null;
+                /** @description Key views: poses of pictures, depth maps and points, evenly along the path. */
+                views?: number;
+                /** @description Pictures, depth maps and cameras without the lens's distortion. */
+                undistorted?: boolean;
+                /** @description Mean depth of what a pixel shows; less exact than the median. */
+                expected_depth?: boolean;
+                /** @description Voxels of a mesh along the longest side of the scene. */
+                resolution?: number;
+                /** @description In metres, with up along -y; 404 while the scale is not known. */
+                metric?: boolean;
+            };
+            header?: never;
+            path: {
+                /** @description Name of a format. */
+                format: "depth" | "points-ply" | "points-pcd" | "mesh-ply" | "mesh-glb" | "colmap" | "nerfstudio" | "ply" | "compressed-ply" | "spz" | "sog" | "rerun" | "mcap" | "ros-bag" | "nexus";
+                capture_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description The file, or a ZIP of the folder. */
+            200: {
+                headers: {
+                    /** @description Changes with the content. */
+                    ETag?: string;
+                    /** @description Its version. */
+                    "X-Scene-Version"?: number;
+                    /** @description With a file name. */
+                    "Content-Disposition"?: string;
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/zip": string;
+                    "application/octet-stream": string;
+                    "model/gltf-binary": string;
+                };
+            };
+            /** @description The requested range. */
+            206: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/zip": string;
+                    "application/octet-stream": string;
+                    "model/gltf-binary": string;
+                };
+            };
+            /** @description The content has not changed. */
+            304: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The range lies outside the file. */
+            416: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    clean_scene_api_v1_reconstructions__reconstruction_id__clean_post: {
+        parameters: {
+            query?: never;
+            header?: {
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                "idempotency-key"?: string;
+            };
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["CleanRequest"];
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["EditedOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It conflicts with the current state. */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    revert_scene_api_v1_reconstructions__reconstruction_id__revert_post: {
+        parameters: {
+            query?: never;
+            header?: {
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                "idempotency-key"?: string;
+            };
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["RevertRequest"];
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["EditedOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It conflicts with the current state. */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_scale_api_v1_reconstructions__reconstruction_id__scale_get: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["ScaleOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    set_scale_api_v1_reconstructions__reconstruction_id__scale_put: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["ScaleRequest"];
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["ScaleOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It conflicts with the current state. */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    remove_scale_api_v1_reconstructions__reconstruction_id__scale_delete: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["ScaleOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    scale_by_tag_api_v1_reconstructions__reconstruction_id__scale_tag_post: {
+        parameters: {
+            query?: never;
+            header?: {
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                "idempotency-key"?: string;
+            };
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["TagScaleRequest"];
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["TagScaleOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It conflicts with the current state. */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
                 headers: {
                     [name: string]: unknown;
                 };

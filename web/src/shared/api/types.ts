@@ -30,6 +30,14 @@ export type UploadRequest = Omit<Schemas["UploadRequest"], "profile"> & {
   profile?: Omit<Schemas["UploadProfile"], "calibration"> | null;
 };
 export type Reconstruction = Schemas["ReconstructionOut"];
+export type Scale = Schemas["ScaleOut"];
+export type ScaleRequest = Schemas["ScaleRequest"];
+export type TagScale = Schemas["TagScaleOut"];
+export type TagScaleRequest = Schemas["TagScaleRequest"];
+export type ExportFormat = Schemas["ExportFormatOut"];
+export type CleanRequest = Schemas["CleanRequest"];
+export type RevertRequest = Schemas["RevertRequest"];
+export type Edited = Schemas["EditedOut"];
 export type OptionValues = Record<string, unknown>;
 export type Version = Schemas["VersionOut"];
 export type Trajectory = Schemas["TrajectoryOut"];

@@ -13,6 +13,7 @@ it("keeps everything that is looked at in the URL", () => {
     frame: 640,
     camera: [0.5, 1, -2, 0, 0, -1, 55],
     ride: true,
+    show: "depth",
     search: "desk & lamp",
   };
   expect(parseRoute(formatRoute(there).slice(2))).toEqual(there);

@@ -19,6 +19,8 @@ export interface Route {
   camera: number[] | null;
   /** Whether the scene is shown from the camera of the capture. */
   ride: boolean;
+  /** What the splats show. */
+  show: string;
   /** Search text of the captures table. */
   search: string;
 }
@@ -31,6 +33,7 @@ export const HOME: Route = {
   frame: null,
   camera: null,
   ride: false,
+  show: "",
   search: "",
 };
 
@@ -52,6 +55,7 @@ export function parseRoute(search: string): Route {
     frame: counted(query.get("frame")),
     camera: camera?.length === 7 && camera.every(Number.isFinite) ? camera : null,
     ride: query.get("ride") === "1",
+    show: /^[a-z]{1,16}$/.exec(query.get("show") ?? "")?.[0] ?? "",
     search: query.get("search") ?? "",
   };
 }
@@ -65,6 +69,7 @@ export function formatRoute(route: Route): string {
   if (route.frame !== null) pairs.set("frame", String(route.frame));
   if (route.camera !== null) pairs.set("camera", route.camera.map((x) => Number(x.toPrecision(5))).join(","));
   if (route.ride) pairs.set("ride", "1");
+  if (route.show !== "") pairs.set("show", route.show);
   if (route.search !== "") pairs.set("search", route.search);
   const text = pairs.toString().replaceAll("%2C", ",");
   return text === "" ? "./" : `./?${text}`;

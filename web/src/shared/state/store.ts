@@ -6,6 +6,7 @@ import * as calls from "../api/calls";
 import { Events, type ConnectionState } from "../api/events";
 import { ApiError, UnreachableError, onUnauthorized } from "../api/http";
 import type { Capture, Device, Message, Preview, Reconstruction, SceneEvent, System } from "../api/types";
+import { notifyOfEnd } from "./notifying";
 import { poses } from "./poses";
 
 const NEWEST = 20;
@@ -114,11 +115,19 @@ export function storeCapture(capture: Capture): void {
 }
 
 export function storeReconstruction(job: Reconstruction): void {
+  notifyOfEnd(get().reconstructions[job.id], job);
   set((state) => ({ reconstructions: { ...state.reconstructions, [job.id]: job } }));
 }
 
+const without = <T>(all: Record<string, T>, id: string): Record<string, T> =>
+  Object.fromEntries(Object.entries(all).filter(([key]) => key !== id));
+
+export function removeReconstruction(id: string): void {
+  set((state) => ({ reconstructions: without(state.reconstructions, id) }));
+}
+
 export function removeFromStore(id: string): void {
-  set((state) => ({ captures: Object.fromEntries(Object.entries(state.captures).filter(([key]) => key !== id)) }));
+  set((state) => ({ captures: without(state.captures, id) }));
 }
 
 export function handleMessage(message: Message): void {

@@ -1,0 +1,151 @@
+"""Tools of the Scene page: what the splats show, from where, and help."""
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from browsing import PHONE, Studied, address, picture, shown_version, still, until, violations
+
+
+@pytest.fixture
+def scene(studied: Studied, visit: Callable[..., Any]) -> Callable[..., Any]:
+    """Opens the scene of the studied capture, and waits until it is drawn."""
+
+    def open_scene(query: str = "", **more: Any) -> Any:
+        page = visit(f"{studied.address}?page=scene&capture={studied.capture_id}{query}", **more)
+        until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+        still(page)
+        return page
+
+    return open_scene
+
+
+def unlike(page: Any, before: Any) -> bool:
+    """Whether the canvas shows something else than before."""
+    now = picture(page)
+    return now.shape != before.shape or bool(np.abs(now - before).mean() > 2e-3)
+
+
+def test_each_view_mode_shows_something_else(scene: Callable[..., Any]) -> None:
+    page = scene()
+    colour = last = still(page)
+    modes = page.get_by_label("Show", exact=True)
+    for mode in ("Depth", "Normals", "Opacity", "Number of splats", "Points"):
+        modes.select_option(label=mode)
+        until(lambda: unlike(page, colour) and unlike(page, last), f"{mode} looks otherwise")  # noqa: B023
+        last = picture(page)
+    assert "show=points" in address(page)
+    modes.select_option(label="Error against the views")
+    page.get_by_text("observed − rendered").wait_for()
+    assert violations(page) == []
+    modes.select_option(label="Colour")
+    until(lambda: not unlike(page, colour), "the colours are back")
+
+
+def test_the_view_is_changed_by_presets_keys_and_a_double_click(scene: Callable[..., Any]) -> None:
+    page = scene()
+    before = still(page)
+    page.get_by_role("button", name="Top", exact=True).click()
+    until(lambda: unlike(page, before), "another view")
+    page.locator(".stage canvas").focus()
+    page.keyboard.press("h")
+    until(lambda: not unlike(page, before), "home")
+    page.get_by_role("slider", name="Field of view").fill("90")
+    until(lambda: ",90" in address(page), "the field of view is in the address")
+    page.keyboard.press("Shift+Tab")
+    target = address(page)
+    box = page.locator(".stage canvas").bounding_box()
+    page.mouse.dblclick(box["x"] + 0.4 * box["width"], box["y"] + 0.5 * box["height"])
+    until(lambda: address(page) != target, "the view turns to the point")
+    page.locator(".stage canvas").focus()
+    page.keyboard.press("m")
+    until(lambda: "show=depth" in address(page), "the next mode")
+
+
+def test_help_is_one_key_away(scene: Callable[..., Any]) -> None:
+    page = scene(viewport=PHONE)
+    page.get_by_role("button", name="Keys and help").click()
+    page.get_by_role("dialog").get_by_text("It says degraded").wait_for()
+    assert violations(page) == []
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
+    page.keyboard.press("Escape")
+    page.get_by_role("dialog").wait_for(state="hidden")
+    page.keyboard.press("?")
+    page.get_by_role("dialog").wait_for()
+
+
+def test_a_known_length_gives_metres(studied: Studied, scene: Callable[..., Any]) -> None:
+    url = f"reconstructions/{studied.reconstruction_id}/scale"
+    studied.http.delete(url)
+    page = scene()
+    page.get_by_text("Measure", exact=True).click()
+    page.get_by_text("The scale is not known").wait_for()
+    box = page.locator(".stage canvas").bounding_box()
+    measured = page.locator(".measured")
+    for across in (0.45, 0.62):
+        page.mouse.click(box["x"] + across * box["width"], box["y"] + 0.45 * box["height"])
+    until(lambda: "units" in measured.inner_text(), "a length in the scene's unit")
+    units = float(measured.inner_text().split()[0])
+    page.get_by_label("Known length in metres").fill("3")
+    page.get_by_role("button", name="Set the scale").click()
+    until(lambda: measured.inner_text().startswith("3.000 m ±"), "the length is 3 m")
+    stored = studied.http.get(url).json()
+    assert stored["metres_per_unit"] == pytest.approx(3 / units, rel=1e-3)
+    assert 0 < stored["sigma"] < 0.02
+    page.get_by_role("radio", name="Up").check()
+    page.locator(".stage canvas").focus()
+    for key in ("ArrowLeft", "ArrowUp", "ArrowRight"):
+        for _ in range(4):
+            page.keyboard.press(key)
+        page.keyboard.press("Enter")
+    page.get_by_role("button", name="This is the floor").click()
+    page.get_by_text("Up is known").wait_for()
+    assert studied.http.get(url).json()["up"] is not None
+    assert violations(page) == []
+    studied.http.delete(url)
+
+
+def test_a_scene_is_cleaned_and_brought_back(studied: Studied, scene: Callable[..., Any]) -> None:
+    page = scene()
+    before = studied.reconstruction()
+    page.locator("summary").filter(has_text="Clean").click()
+    page.get_by_role("slider", name="far").focus()
+    page.keyboard.press("PageUp")
+    cut = page.get_by_role("button", name="Cut to the box")
+    cut.click()
+    page.get_by_text("splats outside of the box").wait_for()
+    until(lambda: studied.reconstruction()["splats"] < before["splats"], "fewer splats")
+    until(lambda: shown_version(page) > before["version"], "the cut scene is shown")
+    page.get_by_role("button", name="Undo").click()
+    until(lambda: studied.reconstruction()["splats"] == before["splats"], "all splats are back")
+    page.get_by_role("button", name="Remove floaters").click()
+    page.get_by_text(re.compile(r"Removed \d.* floaters")).wait_for()
+    assert violations(page) == []
+    page.get_by_role("button", name="Undo").click()
+    until(lambda: studied.reconstruction()["splats"] == before["splats"], "all splats are back")
+
+
+def test_many_captures_are_kept_and_deleted_at_once(studied: Studied, visit: Callable[..., Any]) -> None:
+    ids = []
+    for name in ("first of two", "second of two"):
+        plan = {"source": "sim:?width=64&height=48", "frames": 64, "name": name, "reconstruct": False}
+        capture_id = studied.http.post("captures", json=plan).json()["id"]
+        until(lambda: studied.http.get(f"captures/{capture_id}").json()["state"] == "complete", name)  # noqa: B023
+        ids.append(capture_id)
+    page = visit(f"{studied.address}?page=captures&search=of%20two")
+    for name in ("first of two", "second of two"):
+        page.get_by_role("checkbox", name=f"Select {name}").check()
+    page.get_by_text("2 selected").wait_for()
+    assert violations(page) == []
+    page.get_by_role("button", name="Keep", exact=True).click()
+    until(lambda: all(studied.http.get(f"captures/{one}").json()["keep"] for one in ids), "both are kept")
+    page.get_by_label("Order").select_option(label="by name")
+    page.get_by_label("Filter").select_option(label="kept")
+    rows = page.locator("table.list tbody tr")
+    until(lambda: rows.count() == 2 and "first" in rows.first.inner_text(), "sorted by name")
+    for name in ("first of two", "second of two"):
+        page.get_by_role("checkbox", name=f"Select {name}").check()
+    page.get_by_role("group", name="Selected captures").get_by_role("button", name="Delete").click()
+    until(lambda: all(studied.http.get(f"captures/{one}").json()["deleted_at"] for one in ids), "both are deleted")

@@ -1,0 +1,114 @@
+/** What is done to many captures at once, and how the list is filtered and sorted. */
+
+import { type JSX, useState } from "react";
+
+import * as calls from "../../shared/api/calls";
+import type { Capture } from "../../shared/api/types";
+import { attempt } from "../../shared/state/attempt";
+import { removeFromStore, storeCapture, storeReconstruction } from "../../shared/state/store";
+import { toast } from "../../shared/state/toasts";
+import { ActionButton } from "../../shared/ui/access";
+import type { GradeFilter, Order } from "./listing";
+
+export function ListControls({
+  grade,
+  onGrade,
+  order,
+  onOrder,
+}: {
+  grade: GradeFilter;
+  onGrade: (grade: GradeFilter) => void;
+  order: Order;
+  onOrder: (order: Order) => void;
+}): JSX.Element {
+  return (
+    <>
+      <select aria-label="Filter" value={grade} onChange={(event) => onGrade(event.target.value as GradeFilter)}>
+        <option value="">all</option>
+        <option value="good">good</option>
+        <option value="degraded">degraded</option>
+        <option value="bad">bad</option>
+        <option value="kept">kept</option>
+      </select>
+      <select aria-label="Order" value={order} onChange={(event) => onOrder(event.target.value as Order)}>
+        <option value="newest">newest first</option>
+        <option value="oldest">oldest first</option>
+        <option value="name">by name</option>
+        <option value="size">largest first</option>
+        <option value="length">longest first</option>
+      </select>
+    </>
+  );
+}
+
+export function SelectionBar({
+  chosen,
+  onDone,
+  onNone,
+}: {
+  chosen: readonly Capture[];
+  onDone: () => void;
+  onNone: () => void;
+}): JSX.Element {
+  const [busy, setBusy] = useState(false);
+  const each = async (change: (capture: Capture) => Promise<unknown>): Promise<void> => {
+    setBusy(true);
+    await attempt(async () => {
+      for (const one of chosen) await change(one);
+    });
+    setBusy(false);
+    onDone();
+  };
+  const remove = async (): Promise<void> => {
+    const before = [...chosen];
+    await each(async (one) => {
+      await calls.removeCapture(one.id);
+      removeFromStore(one.id);
+    });
+    const undo = async (): Promise<void> => {
+      for (const one of before) storeCapture(await calls.restoreCapture(one.id));
+      onDone();
+    };
+    toast(`Deleted ${before.length} captures`, { action: { label: "Undo", run: () => void attempt(undo) } });
+  };
+  const recorded = chosen.filter((one) => one.recording !== null);
+  return (
+    <div className="selection" role="group" aria-label="Selected captures">
+      <strong>{chosen.length} selected</strong>
+      <ActionButton
+        disabled={busy}
+        onClick={() => void each(async (one) => storeCapture(await calls.changeCapture(one.id, { keep: true })))}
+      >
+        Keep
+      </ActionButton>
+      <ActionButton
+        disabled={busy || recorded.length < chosen.length}
+        title={recorded.length < chosen.length ? "Needs complete recordings" : "With the usual options"}
+        onClick={() => void each(async (one) => storeReconstruction(await calls.submit(one.id, {})))}
+      >
+        Re-run
+      </ActionButton>
+      <button type="button" disabled={recorded.length === 0} onClick={() => download(recorded)}>
+        Download
+      </button>
+      <ActionButton disabled={busy} onClick={() => void remove()}>
+        Delete
+      </ActionButton>
+      <button type="button" onClick={onNone}>
+        Select none
+      </button>
+    </div>
+  );
+}
+
+/** Recordings, one after the other: browsers ask once whether a page may do that. */
+function download(captures: readonly Capture[]): void {
+  captures.forEach((one, i) => {
+    setTimeout(() => {
+      const link = document.createElement("a");
+      link.href = calls.address.recording(one.id);
+      link.download = "";
+      link.click();
+    }, 400 * i);
+  });
+}

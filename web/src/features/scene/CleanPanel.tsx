@@ -1,0 +1,124 @@
+/** Removes floaters and what is outside of a box; each change is a version, and can be undone. */
+
+import { type JSX, useEffect, useMemo, useState } from "react";
+
+import * as calls from "../../shared/api/calls";
+import type { Reconstruction } from "../../shared/api/types";
+import { attempt } from "../../shared/state/attempt";
+import { count } from "../../shared/state/format";
+import { isEnded } from "../../shared/state/store";
+import { toast } from "../../shared/state/toasts";
+import { ActionButton } from "../../shared/ui/access";
+import { type Box, cut, NO_CUT, SIDES } from "./cropBox";
+import type { Viewer } from "./Viewer";
+
+export interface CleanProps {
+  viewer: Viewer | null;
+  job: Reconstruction;
+  /** Whether the newest version is shown: only that one is edited. */
+  newest: boolean;
+}
+
+export function CleanPanel(props: CleanProps): JSX.Element {
+  const [open, setOpen] = useState(false);
+  return (
+    <details className="tool" onToggle={(event) => setOpen(event.currentTarget.open)}>
+      <summary>Clean</summary>
+      {open && props.viewer !== null && <Cleaning {...props} viewer={props.viewer} />}
+    </details>
+  );
+}
+
+function Cleaning({ viewer, job, newest }: CleanProps & { viewer: Viewer }): JSX.Element {
+  const [shares, setShares] = useState(NO_CUT);
+  const [busy, setBusy] = useState(false);
+  const [undo, setUndo] = useState<{ after: number; to: number } | null>(null);
+  const bounds = viewer.bounds();
+  const box = useMemo(() => (bounds === null ? null : cut(bounds, shares)), [bounds, shares]);
+  const cropped = shares.some((share) => share > 0);
+  useEffect(() => {
+    viewer.showBox(cropped ? box : null);
+    return () => viewer.showBox(null);
+  }, [viewer, cropped, box]);
+
+  const edit = async (begin: () => ReturnType<typeof calls.clean>, say: (found: Edited) => string): Promise<void> => {
+    setBusy(true);
+    await attempt(async () => {
+      const found = await begin();
+      setUndo({ after: found.version, to: job.version });
+      setShares(NO_CUT);
+      toast(say(found));
+    });
+    setBusy(false);
+  };
+  const ready = isEnded(job) && newest && !busy;
+  return (
+    <>
+      {!ready && !busy && (
+        <p className="dim hint">The newest version of a reconstruction that has ended can be cleaned.</p>
+      )}
+      <ActionButton
+        disabled={!ready}
+        onClick={() =>
+          void edit(
+            () => calls.clean(job.id, { version: job.version, floaters: true, shrink: false, box: null }),
+            (found) => `Removed ${count(found.floaters)} floaters`,
+          )
+        }
+      >
+        {busy ? "Cleaning…" : "Remove floaters"}
+      </ActionButton>
+      <fieldset className="crop">
+        <legend>Crop box: cut off, in percent</legend>
+        {SIDES.map((side, i) => (
+          <label key={side} className="row">
+            <span className="dim">{side}</span>
+            <input
+              type="range"
+              min={0}
+              max={95}
+              value={Math.round(100 * (shares[i] ?? 0))}
+              aria-valuetext={`${Math.round(100 * (shares[i] ?? 0))} percent`}
+              onChange={(event) =>
+                setShares(shares.map((share, k) => (k === i ? event.target.valueAsNumber / 100 : share)))
+              }
+            />
+          </label>
+        ))}
+      </fieldset>
+      <ActionButton
+        disabled={!ready || !cropped || box === null}
+        onClick={() => {
+          if (box === null) return;
+          void edit(
+            () => calls.clean(job.id, { version: job.version, floaters: false, shrink: false, box: boxOf(box) }),
+            (found) => `Removed ${count(found.outside)} splats outside of the box`,
+          );
+        }}
+      >
+        Cut to the box
+      </ActionButton>
+      {undo !== null && (
+        <ActionButton
+          disabled={busy || job.version !== undo.after}
+          onClick={() =>
+            void attempt(async () => {
+              await calls.revert(job.id, { version: job.version, to: undo.to });
+              setUndo(null);
+              toast(`The scene is as version ${undo.to} was`);
+            })
+          }
+        >
+          Undo
+        </ActionButton>
+      )}
+    </>
+  );
+}
+
+type Edited = Awaited<ReturnType<typeof calls.clean>>;
+
+const boxOf = ({ low, high }: Box): { low: [number, number, number]; high: [number, number, number] } => ({
+  low: [...low],
+  high: [...high],
+});

@@ -22,7 +22,7 @@ WEB := $(shell find web -path web/node_modules -prune -o -type f -print)
 PAGE := service/spiked_service/page/index.html
 NPM_CI := web/node_modules/.package-lock.json
 
-.PHONY: demo check hooks test test-slow validation lint bench page api docs wheel clean
+.PHONY: demo check hooks test test-slow validation lint bench page api docs wheel wheels packages clean
 .DELETE_ON_ERROR:
 
 # Without Node the daemon runs all the same; its page then says how to build it.
@@ -44,7 +44,7 @@ test: lint $(PAGE) $(VENV)/.chromium $(VENV)/.mocks
 	cd web && npm run --silent test
 	$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not slow"
 
-test-slow: $(VENV)/.native $(PAGE) $(VENV)/.chromium $(VENV)/.mocks $(VENV)/.guest
+test-slow: $(VENV)/.native $(PAGE) docs $(VENV)/.chromium $(VENV)/.mocks $(VENV)/.guest
 	$(BIN)/pytest -m slow
 
 # the figures that the method has to hold, printed; half an hour on two cores, without the slow ones two minutes
@@ -57,6 +57,7 @@ lint: $(VENV)/.native $(NPM_CI)
 	$(BIN)/mypy
 	$(if $(CPP),$(BIN)/clang-format --dry-run -Werror $(CPP))
 	$(BIN)/lint-imports
+	$(BIN)/python tests/sizes.py
 	cd web && npm run --silent lint
 
 bench: $(VENV)/.native
@@ -70,16 +71,25 @@ api: $(VENV)/.native $(NPM_CI)
 	$(BIN)/python tests/client/generate.py web/openapi.json
 	cd web && npm run --silent types
 
-# The documentation as a site in build/site, which a browser reads from disk.
-docs: $(VENV)/.packages
+# The documentation as a site, which the daemon serves at /docs/guide and a browser also reads from disk.
+docs: $(VENV)/.native
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
-	@echo "open build/site/index.html"
+	@echo "open service/spiked_service/guide/index.html"
 
-wheel: $(VENV)/.native $(PAGE)
+wheel: $(VENV)/.native $(PAGE) docs
 	$(BIN)/pip wheel --quiet --no-build-isolation --no-deps --wheel-dir dist .
 
+# the wheels of a release: each Python, each processor; needs python3.11 and python3.12, and CPU minutes
+wheels: $(PAGE) docs
+	$(PYTHON) deploy/build_wheels.py
+
+# the Debian package and the container image of this machine's processor; the image needs root and mmdebstrap
+packages: wheel
+	$(PYTHON) deploy/build_debian.py dist/spiked-*-cp311-cp311-linux_$$(uname -m).whl
+	$(PYTHON) deploy/build_image.py dist/spiked_*_$$(dpkg --print-architecture).deb
+
 clean:
-	rm -rf web/node_modules service/spiked_service/page
+	rm -rf web/node_modules service/spiked_service/page service/spiked_service/guide
 	rm -rf $(VENV) build dist out .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find spiked -name '*.so' -delete
 

@@ -106,8 +106,8 @@ def cameras() -> Iterator[Callable[..., VirtualCameras]]:
         pytest.skip(reason)
     made: list[VirtualCameras] = []
 
-    def make(*settings: CameraSettings, usbfs_memory_mb: int = 16, direct_memory: bool = True) -> VirtualCameras:
-        made.append(VirtualCameras(settings, usbfs_memory_mb=usbfs_memory_mb, direct_memory=direct_memory))
+    def make(*settings: CameraSettings, **machine: Any) -> VirtualCameras:
+        made.append(VirtualCameras(settings, **machine))
         return made[-1]
 
     yield make

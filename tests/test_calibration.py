@@ -1,5 +1,9 @@
 """Calibrations: what a flat and a dark recording say of each pixel, and what is refused."""
 
+import io
+import resource
+import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +68,14 @@ def test_a_calibration_comes_back_from_its_file(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(again, name), getattr(measured, name))
     with pytest.raises(CalibrationError, match="64x48"):
         again.check(Sensor(400, 250, 20000.0))
+    whole, before = (tmp_path / "camera.npz").read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))  # as a full disk
+    try:
+        with pytest.raises(CalibrationError, match="cannot write"):
+            measured.write(tmp_path / "camera.npz")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert (tmp_path / "camera.npz").read_bytes() == whole and not list(tmp_path.glob(".*"))
 
 
 @pytest.mark.parametrize(
@@ -88,6 +100,49 @@ def test_other_files_are_no_calibrations(tmp_path: Path, content: bytes) -> None
     path.write_bytes(content)
     with pytest.raises(CalibrationError, match=r"camera\.npz"):
         Calibration.read(path)
+
+
+def packed(**arrays: bytes) -> bytes:
+    """An archive of arrays in the `.npy` format."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, array in arrays.items():
+            archive.writestr(f"{name}.npy", array)
+    return content.getvalue()
+
+
+def npy(descr: str, shape: tuple[int, ...], content: bytes) -> bytes:
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": descr, "fortran_order": False, "shape": shape})
+    return file.getvalue() + content
+
+
+@pytest.mark.parametrize(
+    "gain",
+    [
+        b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + bytes(99),
+        npy("<f4", (10**5, 10**5), bytes(4096)),
+        npy("<f4", (-2, -2), bytes(16)),
+        npy("<U4", (1, 1), b"a\0\0\0" * 4),
+        npy("<f4", (2, 2), bytes(7)),
+        b"\x93NUMPY\x01\x00\x04\x00{(\n ",
+    ],
+)
+def test_hostile_archives_are_no_calibrations(tmp_path: Path, gain: bytes) -> None:
+    rest = npy("<f4", (1, 1), bytes(4))
+    (tmp_path / "camera.npz").write_bytes(packed(gain=gain, dark=rest, dead=rest))
+    with pytest.raises(CalibrationError, match=r"camera\.npz is not a calibration"):
+        Calibration.read(tmp_path / "camera.npz")
+
+
+@pytest.mark.parametrize("at", range(40, 400, 24))
+def test_a_calibration_with_a_wrong_byte_is_an_error_or_another_calibration(tmp_path: Path, at: int) -> None:
+    image = npy("<f4", (16, 16), np.ones(256, "<f4").tobytes())
+    whole = bytearray(packed(gain=image, dark=image, dead=image))
+    whole[at % len(whole)] ^= 0x55
+    (tmp_path / "camera.npz").write_bytes(whole)
+    with suppress(CalibrationError):
+        Calibration.read(tmp_path / "camera.npz")
 
 
 def test_a_missing_pixel_takes_the_mean_of_the_nearest_good_ones() -> None:

@@ -142,8 +142,9 @@ def test_cubes_and_masks_that_do_not_fit(folder: Path) -> None:
     fails("wision", folder, "this mask is of 3x3")
     np.save(folder / "hot_pixels.npy", np.zeros((2, 250, 400), bool))
     fails("wision", folder, r"masks are \[rows, columns\]")
-    (folder / "hot_pixels.npy").write_bytes(b"\x93NUMPY")
-    fails("wision", folder, "hot_pixels.npy: cannot be read")
+    for damaged in (b"\x93NUMPY", b"\x93NUMPY\1\0\4\0{(\n "):
+        (folder / "hot_pixels.npy").write_bytes(damaged)
+        fails("wision", folder, "hot_pixels.npy: cannot be read")
     (folder / "hot_pixels.npy").unlink()
     np.save(folder / "colour.npy", np.zeros((3, 8, 1, 3), np.uint8))
     fails("wision", folder, "colours in a fourth axis")

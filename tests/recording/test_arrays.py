@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -114,6 +115,24 @@ def test_damaged_and_dangerous_files_are_refused(tmp_path: Path) -> None:
         assert "readable" in converted(tmp_path / f"{number}.dat", code=2)[1]
     np.save(tmp_path / "pickled.npy", np.array([{"a": 1}], object), allow_pickle=True)
     assert "readable" in converted(tmp_path / "pickled.npy", code=2)[1]
+
+
+def test_archives_that_unpack_to_the_whole_memory_are_refused(tmp_path: Path) -> None:
+    long, many, chunks = tmp_path / "long.npz", tmp_path / "many.npz", tmp_path / "chunks.h5"
+    with zipfile.ZipFile(long, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("a.npy", "w") as member:
+        member.write(b"\x93NUMPY\x02\x00" + (1 << 30).to_bytes(4, "little") + bytes(1 << 20))
+    with zipfile.ZipFile(many, "w") as archive:
+        for number in range(1001):
+            archive.writestr(f"{number}.npy", b"")
+    with pytest.raises(RecordingError, match="1073741824 bytes, more than"):
+        open_array(long)
+    with pytest.raises(RecordingError, match="1001 arrays, more than 1000"):
+        open_array(many)
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed: pip install 'spiked[hdf5]'")
+    with h5py.File(chunks, "w") as file:
+        file.create_dataset("a", (4000, 1000, 400), "u1", chunks=(3000, 1000, 400), compression="gzip")
+    with pytest.raises(RecordingError, match=r"chunks of \[3000, 1000, 400\]"):
+        open_array(chunks)
 
 
 def test_several_arrays_need_a_name(tmp_path: Path) -> None:

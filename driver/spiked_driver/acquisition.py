@@ -250,7 +250,7 @@ def _pump(source: Source, packer: SlotPacker, timing: _Timing | None, stop: Stop
             case Chunk():
                 packer.add(item)
                 if timing is not None:
-                    timing.arrived(packer.next_frame, seen_ns)
+                    timing.arrived(packer.next_frame, item.seen_ns or seen_ns)
             case Gap():
                 if timing is not None and source.device_status.state is not DeviceState.STREAMING:
                     timing.interrupted()

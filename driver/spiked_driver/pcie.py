@@ -111,7 +111,9 @@ class PcieSource:
                 return received
         if self._card.is_open:
             self._card.status = DeviceStatus(DeviceState.STREAMING)
-        return replace(item, first=self._zero + item.first)
+        if isinstance(item, Gap):
+            return replace(item, first=self._zero + item.first)
+        return Chunk(self._zero + item.first, item.frames, round(1e9 * self._read_s))
 
     def _receive(self) -> int | Gap | None:
         """Feed the next bytes to the framing, and return their number; None if nothing came within READ_WAIT_S.

@@ -1,7 +1,7 @@
 """The protocol of a source: it writes its next frames into its caller's memory."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -21,6 +21,8 @@ class Chunk:
 
     first: int
     frames: int
+    seen_ns: int | None = field(default=None, compare=False)
+    """Monotonic time, ns, at which they had all arrived, if that was before the source returned; else None."""
 
 
 class Source(Protocol):

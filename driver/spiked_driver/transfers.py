@@ -10,7 +10,7 @@ import errno
 import mmap
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import islice
 from typing import Protocol, TypeVar
@@ -64,6 +64,8 @@ class CompletedTransfer:
     data: NDArray[np.uint8]
     """uint8 [n], valid until `release`."""
     error: TransferError | None = None
+    seen_ns: int = field(default_factory=time.monotonic_ns)
+    """Monotonic time, ns, at which it was seen to be complete; others may have been dealt with since."""
 
 
 class BulkReader(Protocol):
@@ -117,6 +119,7 @@ class _Read:
         self.buffer = buffer
         self.transfer = transfer
         self.pending = False
+        self.seen_ns = 0
 
 
 class _Request:
@@ -201,7 +204,7 @@ class AsynchronousBulkReader:
         read = self._current = self._queue.popleft()
         self._ask_for_more()
         status = TransferStatus(read.transfer.status)
-        return CompletedTransfer(read.buffer[: read.transfer.actual_length], _ERRORS.get(status))
+        return CompletedTransfer(read.buffer[: read.transfer.actual_length], _ERRORS.get(status), read.seen_ns)
 
     def release(self) -> None:
         """See `BulkReader`. Raises usb.core.USBError, or OutOfUsbMemoryError if no read can be queued any more."""
@@ -339,6 +342,7 @@ class AsynchronousBulkReader:
             if one.transfer.status != TransferStatus.COMPLETED and self._running:
                 self._request_error = _ERRORS.get(TransferStatus(one.transfer.status), TransferError.FAILED)
         else:
+            one.seen_ns = time.monotonic_ns()
             self._in_flight -= 1
 
 

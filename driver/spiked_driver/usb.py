@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,7 @@ class UsbSource:
         camera = self.options.camera.model_copy(update={"rate": self.options.rate_hz})
         self._sensor = camera.sensor(Sensor(USB_WIDTH, USB_HEIGHT, self.options.rate_hz))
         self._connection: UsbConnection | None = None
+        self._seen_ns = 0
         self._start_stream()
 
     @property
@@ -106,7 +108,7 @@ class UsbSource:
         if isinstance(item, Gap):
             return self._gaps.attributed(item)
         self._connection.frame_delivered()
-        return item
+        return replace(item, seen_ns=self._seen_ns)
 
     def _receive(self, connection: UsbConnection) -> bool:
         """Feed the next bytes to the framing; false when the caller should get control back."""
@@ -119,6 +121,7 @@ class UsbSource:
         if not reception.contiguous:
             self._framing.mark_loss()
         self._gaps.received(reception.data.size, time.monotonic(), reception.ended_break)
+        self._seen_ns = reception.seen_ns
         self._framing.feed(reception.data)
         return connection.frameless_s < READ_WAIT_S
 

@@ -24,7 +24,7 @@ from spiked_driver.libusb import OutOfUsbMemoryError
 from spiked_driver.source import READ_WAIT_S
 from spiked_driver.source_kind import RATE_HZ
 from spiked_driver.stream_watch import StreamWatch
-from spiked_driver.transfers import MOST_REQUESTS, Buffers, TransferError, transfer_error_of
+from spiked_driver.transfers import MOST_REQUESTS, Buffers, CompletedTransfer, TransferError, transfer_error_of
 from spiked_driver.usb_budget import TRANSFER_BYTES, TransferPlan
 from spiked_driver.usb_cameras import CameraChoice, NotUsableError, UsbCamera
 from spiked_driver.usb_session import NotThereError, UsbSession
@@ -85,6 +85,8 @@ class Reception:
     """If no read was queued: complete bytes that come with this and the next receptions. None: reads were queued."""
     ended_break: StreamBreak | None = None
     """The break that ends with `data`."""
+    seen_ns: int = 0
+    """Monotonic time, ns, at which `data` was seen to be there."""
 
 
 class UsbConnection:
@@ -190,7 +192,7 @@ class UsbConnection:
         self._watch.update(transfer.data, frames)
         self._search.refresh_if_due()
         self._check_frames(frames)
-        reception = self._reception(transfer.data, underrun_bytes=underrun_bytes)
+        reception = self._reception(transfer, underrun_bytes=underrun_bytes)
         if transfer.error:
             self._break_off(transfer.error)
         return reception
@@ -202,16 +204,16 @@ class UsbConnection:
         if transfer is None:
             self._recover()
             return Reception()
-        return self._reception(transfer.data, contiguous=False)
+        return self._reception(transfer, contiguous=False)
 
     def _reception(
-        self, data: NDArray[np.uint8], *, contiguous: bool = True, underrun_bytes: int | None = None
+        self, transfer: CompletedTransfer, *, contiguous: bool = True, underrun_bytes: int | None = None
     ) -> Reception:
         ended_break = None
-        if data.size:
+        if transfer.data.size:
             ended_break, self._break = self._break, None
             self._keep_mode()
-        return Reception(data, contiguous, underrun_bytes, ended_break)
+        return Reception(transfer.data, contiguous, underrun_bytes, ended_break, transfer.seen_ns)
 
     def _check_frames(self, frames: int) -> None:
         """Raises SourceError for a device that never sent a frame."""

@@ -1,6 +1,8 @@
 """From a simulated camera, with and without faults, through the ring to a reader."""
 
 import threading
+import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -189,6 +191,34 @@ def test_a_source_that_renumbers_or_skips_frames_is_refused() -> None:
         source.number = number
         with RingWriter.create(source.sensor, slots=16) as writer, pytest.raises(SourceError, match=message):
             acquire(source, writer, threading.Event())
+
+
+def test_frames_are_timed_by_when_the_source_had_them() -> None:
+    """And not by when it has unpacked them."""
+    begin_ns = time.monotonic_ns()
+
+    class Live(SimulatedSource):
+        """A camera whose frames came at its rate, from a minute ago on."""
+
+        can_block = False
+
+        def read_into(self, view: np.ndarray) -> Chunk | Gap | End | None:
+            chunk = super().read_into(view)
+            if not isinstance(chunk, Chunk):
+                return chunk
+            last = chunk.first + chunk.frames
+            return replace(chunk, seen_ns=begin_ns + round((last / SENSOR.frame_rate_hz - 60) * 1e9))
+
+    source = Live(SENSOR, seed=3, frames=FRAMES, pace=0)
+    with RingWriter.create(source.sensor, slots=16) as writer:
+        reader = RingReader.attach(writer.name, Policy.LOSSLESS, "test")
+        unix_ns = time.time_ns()
+        acquire(source, writer, threading.Event())
+        take_all(reader)
+        for pair in (pairs := reader.clock_pairs()):
+            came_ns = unix_ns + ((pair.frame + 1) / SENSOR.frame_rate_hz - 60) * 1e9
+            assert pair.unix_ns == pytest.approx(came_ns, abs=1e9)
+    assert pairs
 
 
 def test_a_paced_source_keeps_to_its_rate_without_adding_up_delays() -> None:

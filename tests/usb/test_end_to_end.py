@@ -18,7 +18,7 @@ import pytest
 from numpy.typing import NDArray
 from virtual_camera.faults import Fault, Kind
 from virtual_camera.host import CameraSettings
-from virtual_camera.rig import VirtualCameras
+from virtual_camera.rig import Report, VirtualCameras
 
 from spiked.recording import open_recording
 from spiked.recording.time_base import offset
@@ -183,6 +183,17 @@ def test_a_killed_acquisition_is_followed_and_the_capture_goes_on(
     assert not list(Path("/dev/shm").glob(f"spiked-{capture_id}*"))
 
 
+def late_s(report: Report) -> float:
+    """How late the simulated camera and the mocked kernel hand frames over when nothing keeps them waiting.
+
+    They are programs themselves. The median of the least delays of quarters of a second.
+    """
+    frames, times_s = np.array(report.handed_over).T
+    delays_s = times_s - report.start_s - (frames + 1) / RATE
+    quarters = ((times_s - times_s[0]) / 0.25).astype(int)
+    return float(np.median([delays_s[quarters == at].min() for at in range(quarters[-1] + 1) if at in quarters]))
+
+
 @pytest.fixture
 def busy() -> Iterator[None]:
     """Twice as many programs that want a core as there are cores."""
@@ -215,7 +226,8 @@ def test_frames_are_timed_within_a_millisecond_on_a_busy_machine(
     numbers = recording.compact(0, recording.frames)[:, :8].copy().view("<i8")[:, 0]
     indices = np.array([recording.capture_index(k) for k in range(recording.frames)])
     # This camera sends whole frames only: a transfer is full when the frame is there in which it ends.
-    came_ns = 1e9 * (rig.report().start_s + (numbers + 2) / RATE)
+    report = rig.report()
+    came_ns = 1e9 * (report.start_s + late_s(report) + (numbers + 2) / RATE)
     told_ns = recording.unix_ns(indices) - (time.time_ns() - time.monotonic_ns())
     error_ms = np.abs(told_ns - came_ns) / 1e6
     figure("time of a frame, busy machine, 99 %", f"{np.percentile(error_ms, 99):.2f} ms", "at most 1 ms")

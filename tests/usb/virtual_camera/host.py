@@ -299,6 +299,7 @@ class Host:
                     "sent": [[run.first, run.count] for run in stream.sent],
                     "next_frame": stream.next_frame,
                     "start_s": stream.start_s,
+                    "handed_over": list(stream.handed_over),
                     "dropped": stream.dropped,
                     "done": [asdict(fault) for fault in stream.done],
                     "requests": [asdict(request) for request in socketed.camera.requests],

@@ -35,6 +35,9 @@ class Report:
     next_frame: int
     start_s: float
     """Monotonic: with a rate, frame k is there 1 + k frames later."""
+    handed_over: tuple[tuple[int, float], ...]
+    """For the last full transfers: the frame in which each ends, and the monotonic time at which the host had
+    it: after the frame was there by what the camera's process and its usbfs take."""
     dropped: int
     """Frames that the host did not take in time."""
     done: tuple[str, ...]
@@ -141,6 +144,7 @@ class VirtualCameras:
         """What the camera has done."""
         values = self._ask(do="report", camera=camera)
         values["sent"] = tuple(Run(*run) for run in values["sent"])
+        values["handed_over"] = tuple((frame, time_s) for frame, time_s in values["handed_over"])
         values["done"] = tuple(fault["kind"] for fault in values["done"])
         values["requests"] = tuple((request["index"], request["length"]) for request in values["requests"])
         values["commands"] = tuple(values["commands"])

@@ -2,6 +2,7 @@
 
 import heapq
 import time
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ COMPACT_BYTES = ROWS * ROW_BYTES
 FRAME_BYTES = 16 + ROWS * (ROW_BYTES + 2)
 MAGIC, WORD1 = 0x63606300, 0x00100021
 STAMP_BYTES = 8
+_TRANSFERS_KEPT = 4096
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,9 @@ class Stream:
         self.dropped = 0
         """Frames that the host did not take in time."""
         self.done: list[Fault] = []
+        self.handed_over: deque[tuple[int, float]] = deque(maxlen=_TRANSFERS_KEPT)
+        """For the last transfers that were full: the frame in which each ends, and the monotonic time at which the host
+        had it."""
 
     def add(self, fault: Fault) -> None:
         """One more fault; at a frame that has gone by: now."""

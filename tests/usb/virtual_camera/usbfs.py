@@ -13,6 +13,7 @@ import fcntl
 import os
 import socket
 import struct
+import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -20,6 +21,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .core import Camera, Stalled
+from .descriptors import DATA_IN
 from .faults import Fault, Kind
 
 _MESSAGE = struct.Struct("@LLL")
@@ -129,6 +131,8 @@ class Urb:
     length: int
     actual: int = 0
     status: int = 0
+    last_frame: int | None = None
+    """Of a full bulk transfer: the frame in which it ends."""
     kept: bytearray = field(default_factory=bytearray)
     """What could not be written into the process's memory at once."""
 
@@ -275,6 +279,8 @@ class Client:
         self.memory.write(urb.address + _STATUS, struct.pack("<i", urb.status))
         self.memory.write(urb.address + _ACTUAL_LENGTH, struct.pack("<i", urb.actual))
         self.memory.write(argument, struct.pack("<Q", urb.address))
+        if urb.last_frame is not None:
+            self.node.camera.stream.handed_over.append((urb.last_frame, time.monotonic()))
 
     def answer_waiting(self) -> None:
         """Let a blocking reap return, if there is one and something to return."""
@@ -355,6 +361,8 @@ class Node:
         if fault is None:
             if urb.actual < urb.length:
                 return bool(pieces)
+            if urb.endpoint == DATA_IN:
+                urb.last_frame = self.camera.stream.next_frame - 1
         elif fault.kind is Kind.STALL:
             urb.status = -errno.EPIPE
         elif fault.kind is Kind.BABBLE:

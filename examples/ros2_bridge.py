@@ -21,9 +21,10 @@ import numpy as np
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from spiked.export.ros_bag import RosBag
+from spiked.export.ros_bag import FILES, RosBag
 from spiked.export.ros_messages import RosMessages
 from spiked.export.timeline import CAMERA, WORLD
+from spiked.export.whole import whole_folder
 
 Send = Callable[[str, int, Any], None]
 """Takes topic, time in ns and message."""
@@ -93,7 +94,7 @@ def main() -> None:
         with publishing(make) as send:
             forward(asked.address, make, send, asked.captures)
     else:
-        with RosBag(asked.bag, make) as bag:
+        with whole_folder(asked.bag, FILES) as folder, RosBag(folder, make) as bag:
             forward(asked.address, make, bag.write, asked.captures)
 
 

@@ -26,7 +26,7 @@ MODELS = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FULL_OPENCV": 6}
 """Numbers of the camera models."""
 
 
-def write(source: ExportSource, folder: Path, options: ExportOptions) -> str:
+def fill(source: ExportSource, folder: Path, options: ExportOptions) -> str:
     """Write images/ and sparse/0/. Raises SceneError and ConfigurationError."""
     pictures, tracks = write_pictures(source, folder, options)
     model = folder / "sparse" / "0"
@@ -102,5 +102,5 @@ KIND = ExportKind(
     readers="COLMAP, gsplat, 3DGS, nerfstudio, Brush, OpenSplat, Metashape",
     loses="splats; poses between the pictures",
     suffix="",
-    write=write,
+    fill=fill,
 )

@@ -16,7 +16,7 @@ __all__ = ["KIND"]
 INDEX = "depth.json"
 
 
-def write(source: ExportSource, folder: Path, options: ExportOptions) -> str:
+def fill(source: ExportSource, folder: Path, options: ExportOptions) -> str:
     """Write depth/, normal/, colour/ and depth.json. Raises SceneError and ConfigurationError."""
     for name in ("depth", "normal", "colour"):
         (folder / name).mkdir(exist_ok=True)
@@ -90,5 +90,5 @@ KIND = ExportKind(
     readers="Nuke, Blender, OpenCV, OpenImageIO",
     loses="what is behind the first surface",
     suffix="",
-    write=write,
+    fill=fill,
 )

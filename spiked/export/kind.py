@@ -8,6 +8,7 @@ from types import ModuleType
 
 from spiked.errors import ConfigurationError
 from spiked.export.source import ExportOptions, ExportSource
+from spiked.export.whole import whole_file, whole_folder
 
 __all__ = ["ExportKind"]
 
@@ -26,15 +27,17 @@ class ExportKind:
     """What of the reconstruction is not in it."""
     suffix: str
     """Of the file that is written, with its dot; empty for a folder."""
-    write: Callable[[ExportSource, Path, ExportOptions], str]
-    """Writes the file, or fills a folder that exists, and says in a few words what is in it.
+    fill: Callable[[ExportSource, Path, ExportOptions], str]
+    """Writes the file, or fills an empty folder, and says in a few words what is in it.
 
-    Raises SpikedError for a source that lacks what the format needs."""
+    Raises SpikedError for a source that lacks what the format needs, and OSError. It need not clean up."""
     packages: tuple[str, ...] = ()
     """Modules that only this format needs."""
     extra: str = "export"
     """That installs them: `pip install 'spiked[EXTRA]'`."""
     media_type: str = "application/octet-stream"
+    replaces: tuple[str, ...] = ()
+    """Patterns of the files of an earlier folder that a new one replaces; the folder may then hold no others."""
 
     @property
     def folder(self) -> bool:
@@ -45,6 +48,16 @@ class ExportKind:
     def sent_as(self) -> str:
         """Media type over HTTP: of the file, or of the ZIP of a folder."""
         return "application/zip" if self.folder else self.media_type
+
+    def write(self, source: ExportSource, path: Path, options: ExportOptions) -> str:
+        """Write the file or folder whole or not at all, and say in a few words what is in it.
+
+        A folder that exists keeps its other files. After an error an earlier file or folder is as it was.
+        Raises SpikedError for a source that lacks what the format needs, SceneError for a folder that holds files of
+        something else, and OSError.
+        """
+        with whole_folder(path, self.replaces) if self.folder else whole_file(path) as part:
+            return self.fill(source, part, options)
 
     def check(self) -> None:
         """Raises ConfigurationError if one of `packages` is not installed."""

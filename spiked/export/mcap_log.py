@@ -21,6 +21,7 @@ from spiked.export.timeline import (
     camera_message,
     read_timeline,
 )
+from spiked.export.whole import KeptErrors
 
 __all__ = ["KIND"]
 
@@ -30,19 +31,20 @@ ORIGIN = (0.0, 0.0, 0.0)
 """No translation, in any unit."""
 
 
-def write(source: ExportSource, path: Path, options: ExportOptions) -> str:
+def fill(source: ExportSource, path: Path, options: ExportOptions) -> str:
     """Write a .mcap. Raises SceneError and ConfigurationError."""
     foxglove = optional("foxglove", "mcap")
     logging.getLogger("foxglove").setLevel(logging.WARNING)
     timeline = read_timeline(source, options)
     context = foxglove.Context()
-    with foxglove.open_mcap(path, allow_overwrite=True, context=context):
+    with KeptErrors(path) as file, foxglove.open_mcap(file, context=context):
         log = _Log(foxglove, context)
         log.begin(timeline)
         for row in range(len(timeline.stamps_ns)):
             log.pose(timeline, row)
         for key in timeline.keys:
             log.key(key)
+            file.check()
     return timeline.said()
 
 
@@ -136,7 +138,7 @@ KIND = ExportKind(
     readers="Foxglove, Lichtblick, Rerun, mcap's libraries",
     loses="splats; transparency",
     suffix=".mcap",
-    write=write,
+    fill=fill,
     packages=("foxglove",),
     extra="mcap",
 )

@@ -143,7 +143,7 @@ PLY = ExportKind(
     readers="MeshLab, Blender, CloudCompare",
     loses="transparency, details smaller than a voxel",
     suffix=".ply",
-    write=lambda source, path, options: _write(source, path, options, "ply"),
+    fill=lambda source, path, options: _write(source, path, options, "ply"),
     packages=("skimage", "trimesh"),
 )
 GLB = ExportKind(
@@ -152,7 +152,7 @@ GLB = ExportKind(
     readers="Blender, Windows, browsers, game engines",
     loses="transparency, details smaller than a voxel",
     suffix=".glb",
-    write=lambda source, path, options: _write(source, path, options, "glb"),
+    fill=lambda source, path, options: _write(source, path, options, "glb"),
     packages=("skimage", "trimesh"),
     media_type="model/gltf-binary",
 )

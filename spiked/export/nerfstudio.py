@@ -18,7 +18,7 @@ POINTS = "sparse.ply"
 _POINT = np.dtype([("position", "<f4", 3), ("colour", "u1", 3)])
 
 
-def write(source: ExportSource, folder: Path, options: ExportOptions) -> str:
+def fill(source: ExportSource, folder: Path, options: ExportOptions) -> str:
     """Write transforms.json, images/ and sparse.ply. Raises SceneError and ConfigurationError."""
     pictures, tracks = write_pictures(source, folder, options)
     views = [picture.view for picture in pictures]
@@ -46,5 +46,5 @@ KIND = ExportKind(
     readers="nerfstudio, instant-ngp, Brush, gsplat",
     loses="splats; poses between the pictures",
     suffix="",
-    write=write,
+    fill=fill,
 )

@@ -12,6 +12,7 @@ import numpy as np
 from spiked.export.kind import ExportKind, optional
 from spiked.export.source import ExportOptions, ExportSource, optics_of
 from spiked.export.timeline import Timeline, read_timeline
+from spiked.export.whole import KeptErrors
 from spiked.recording import Recording
 from spiked.scene import unit_quats
 
@@ -25,11 +26,11 @@ PIXEL_CENTRE = 0.5
 """Coordinate of the first pixel's centre."""
 
 
-def write(source: ExportSource, path: Path, options: ExportOptions) -> str:
+def fill(source: ExportSource, path: Path, options: ExportOptions) -> str:
     """Write a .nxs. Raises SceneError and ConfigurationError."""
     h5py = optional("h5py", "hdf5")
     timeline = read_timeline(source, options)
-    with h5py.File(path, "w") as file:
+    with KeptErrors(path, "w+") as raw, h5py.File(raw, "w") as file:
         file.attrs.update({"NX_class": "NXroot", "default": "entry", "creator": "spiked"})
         entry = _group(file, "entry", "NXentry")
         entry.attrs["default"] = "key_views"
@@ -39,7 +40,7 @@ def write(source: ExportSource, path: Path, options: ExportOptions) -> str:
         _write_views(entry, timeline, source)
         _write_points(entry, timeline, source)
         _write_splats(entry, source)
-        frames = 0 if source.recording is None else _write_frames(entry, detector, source.recording)
+        frames = 0 if source.recording is None else _write_frames(entry, detector, source.recording, raw)
     spikes = f"{frames} frames" if frames else "no frames (the recording is not at hand)"
     return f"{spikes}, {timeline.said()}, {len(source.need_scene())} splats"
 
@@ -120,7 +121,7 @@ def _write_splats(entry: Any, source: ExportSource) -> None:
     splats.attrs["white"] = source.white
 
 
-def _write_frames(entry: Any, detector: Any, recording: Recording) -> int:
+def _write_frames(entry: Any, detector: Any, recording: Recording, raw: KeptErrors) -> int:
     """The spikes, uint8 [frames, H, W] of 0 and 1, upright; their indices in the capture say where frames were lost."""
     height, width = recording.sensor.height, recording.sensor.width
     data = detector.create_dataset(
@@ -133,6 +134,7 @@ def _write_frames(entry: Any, detector: Any, recording: Recording) -> int:
     for first in range(0, recording.frames, CHUNK_FRAMES):
         images = recording.images(first, min(CHUNK_FRAMES, recording.frames - first))
         data[first : first + len(images)] = images
+        raw.check()
     index = np.arange(recording.frames)
     for gap in sorted(recording.gaps, key=lambda gap: gap.first):
         index[index >= gap.first] += gap.count
@@ -163,7 +165,7 @@ KIND = ExportKind(
     readers="h5py, MATLAB, NeXpy, silx, h5web; `spiked convert` reads its spikes",
     loses="nothing",
     suffix=".nxs",
-    write=write,
+    fill=fill,
     packages=("h5py",),
     extra="hdf5",
 )

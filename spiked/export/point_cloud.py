@@ -76,7 +76,7 @@ PLY = ExportKind(
     readers="CloudCompare, MeshLab, Open3D, Blender",
     loses="transparency; surfaces that fewer than three views see",
     suffix=".ply",
-    write=_write_ply,
+    fill=_write_ply,
 )
 PCD = ExportKind(
     name="points-pcd",
@@ -84,5 +84,5 @@ PCD = ExportKind(
     readers="PCL, CloudCompare, Open3D",
     loses="transparency; surfaces that fewer than three views see",
     suffix=".pcd",
-    write=_write_pcd,
+    fill=_write_pcd,
 )

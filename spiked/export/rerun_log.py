@@ -25,20 +25,19 @@ TIME = "time"
 """Name of the time line."""
 
 
-def write(source: ExportSource, path: Path, options: ExportOptions) -> str:
+def fill(source: ExportSource, path: Path, options: ExportOptions) -> str:
     """Write a .rrd. Raises SceneError and ConfigurationError."""
     rr = optional("rerun", "rerun")
     timeline = read_timeline(source, replace(options, undistorted=True))
-    path.unlink(missing_ok=True)
     stream = rr.RecordingStream("spiked", recording_id=source.name)
-    stream.save(str(path))
+    memory = stream.memory_recording()  # its writer of files hangs on a full disk
     try:
         _log_static(rr, stream, source, timeline)
         at = rr.TimeColumn(TIME, **_times(timeline, timeline.stamps_ns))
         poses = rr.Transform3D.columns(translation=timeline.centres, quaternion=timeline.quats_xyzw)
         stream.send_columns("world/camera", indexes=[at], columns=poses)
         _log_keys(rr, stream, timeline)
-        stream.flush()
+        path.write_bytes(memory.drain_as_bytes())
     finally:
         stream.disconnect()
     return f"{timeline.said()}, {len(source.need_scene())} splats"
@@ -101,7 +100,7 @@ KIND = ExportKind(
     readers="the Rerun viewer and its Python reader",
     loses="distortion of the lens (pictures are undistorted); radiance beyond white, colours beyond 8 bits",
     suffix=".rrd",
-    write=write,
+    fill=fill,
     packages=("rerun",),
     extra="rerun",
 )

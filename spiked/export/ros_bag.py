@@ -1,27 +1,31 @@
 """A ROS 2 bag: path, pictures, depth maps and points as standard messages, written without ROS."""
 
+import errno
+import os
+import sqlite3
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
-from spiked.errors import SceneError
 from spiked.export.kind import ExportKind, optional
 from spiked.export.ros_messages import RosMessages
 from spiked.export.source import ExportOptions, ExportSource
 from spiked.export.timeline import CAMERA, MAP, MAP_TO_WORLD_XYZW, WORLD, Timeline, read_timeline
 
-__all__ = ["KIND", "RosBag"]
+__all__ = ["FILES", "KIND", "RosBag"]
 
 VERSION = 8
 """Of bags: Humble to Jazzy read it; SQLite storage is in all of them."""
 LATCHED = ("/tf_static", "/points")
 """Topics whose message is kept for those that subscribe later."""
+FILES = ("*.db3", "metadata.yaml")
+"""Patterns of the files of a bag."""
 ORIGIN = (0.0, 0.0, 0.0)
 """No translation, in any unit."""
 
 
-def write(source: ExportSource, folder: Path, options: ExportOptions) -> str:
+def fill(source: ExportSource, folder: Path, options: ExportOptions) -> str:
     """Write the bag's folder. Raises SceneError and ConfigurationError."""
     timeline = read_timeline(source, options)
     make = RosMessages()
@@ -48,42 +52,49 @@ def _messages(make: RosMessages, timeline: Timeline) -> Iterator[tuple[str, int,
 
 
 class RosBag:
-    """Writes a bag into a folder; an earlier one in it is replaced when the new one is complete."""
+    """Writes a bag into an empty folder, which names its files. After an error the folder is not a bag."""
 
     def __init__(self, folder: Path, make: RosMessages) -> None:
-        """Raises SceneError if the folder holds files of something else."""
-        strange = [file.name for file in folder.glob("*") if file.name != "metadata.yaml" and file.suffix != ".db3"]
-        if strange:
-            raise SceneError(f"{folder} holds {strange[0]}, and a bag has a folder of its own; choose another one")
+        """Raises ConfigurationError if rosbags is not installed."""
         self._rosbag2 = optional("rosbags.rosbag2", "ros")
         self._folder, self._store = folder, make.store
         self._connections: dict[str, Any] = {}
 
     def __enter__(self) -> "RosBag":
-        self._folder.mkdir(parents=True, exist_ok=True)
-        self._made = TemporaryDirectory(dir=self._folder)
-        self._place = Path(self._made.name) / self._folder.resolve().name
-        self._writer = self._rosbag2.Writer(self._place, version=VERSION)
-        self._writer.open()
+        self._folder.rmdir()  # the writer makes it
+        self._writer = self._rosbag2.Writer(self._folder, version=VERSION)
+        with _sqlite_errors():
+            self._writer.open()
         return self
 
     def write(self, topic: str, at_ns: int, message: Any) -> None:
-        """Append a message; the first of a topic decides its type."""
+        """Append a message; the first of a topic decides its type. Raises OSError."""
         kind = message.__msgtype__
-        if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(
-                topic, kind, typestore=self._store, offered_qos_profiles=_latched() if topic in LATCHED else ()
-            )
-        self._writer.write(self._connections[topic], at_ns, self._store.serialize_cdr(message, kind))
+        with _sqlite_errors():
+            if topic not in self._connections:
+                self._connections[topic] = self._writer.add_connection(
+                    topic, kind, typestore=self._store, offered_qos_profiles=_latched() if topic in LATCHED else ()
+                )
+            self._writer.write(self._connections[topic], at_ns, self._store.serialize_cdr(message, kind))
 
     def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
-        self._writer.close()
+        """Finish the bag. Raises OSError."""
         if kind is None:
-            for old in [*self._folder.glob("*.db3"), *self._folder.glob("metadata.yaml")]:
-                old.unlink()
-            for file in self._place.iterdir():
-                file.replace(self._folder / file.name)
-        self._made.cleanup()
+            with _sqlite_errors():
+                self._writer.close()
+        else:
+            with suppress(sqlite3.Error):  # the first error is told
+                self._writer.storage.abort()
+
+
+@contextmanager
+def _sqlite_errors() -> Iterator[None]:
+    """Turn SQLite's errors of the disk into OSError."""
+    try:
+        yield
+    except sqlite3.OperationalError as error:
+        number = errno.ENOSPC if error.sqlite_errorcode == sqlite3.SQLITE_FULL else errno.EIO
+        raise OSError(number, os.strerror(number)) from error
 
 
 def _latched() -> list[Any]:
@@ -111,7 +122,8 @@ KIND = ExportKind(
     readers="ROS 2 from Humble on (RViz, ros2 bag play), Foxglove, rosbags, PlotJuggler",
     loses="splats; transparency",
     suffix="",
-    write=write,
+    fill=fill,
     packages=("rosbags.rosbag2",),
+    replaces=FILES,
     extra="ros",
 )

@@ -17,7 +17,7 @@ def _writer(
 ) -> Callable[[ExportSource, Path, ExportOptions], str]:
     """What writes a scene as `encode` has it, with the radiance of white, and says if it leaves harmonics out."""
 
-    def write(source: ExportSource, path: Path, options: ExportOptions) -> str:
+    def fill(source: ExportSource, path: Path, options: ExportOptions) -> str:
         scene = source.need_scene()
         path.write_bytes(encode(scene, source.white))
         if scene.harmonics is None:
@@ -25,7 +25,7 @@ def _writer(
         degree = f"view-dependent colour of degree {scene.degree}"
         return f"{len(scene)} splats, {degree if harmonics else f'without their {degree}: use ply or spz to keep it'}"
 
-    return write
+    return fill
 
 
 PLY = ExportKind(
@@ -34,7 +34,7 @@ PLY = ExportKind(
     readers="all viewers and trainers of splats",
     loses="nothing",
     suffix=".ply",
-    write=_writer(lambda scene, white: scene.ply()),  # the scene's own white is noted in it
+    fill=_writer(lambda scene, white: scene.ply()),  # the scene's own white is noted in it
 )
 COMPRESSED_PLY = ExportKind(
     name="compressed-ply",
@@ -42,7 +42,7 @@ COMPRESSED_PLY = ExportKind(
     readers="SuperSplat, PlayCanvas, Spark, splat-transform",
     loses="rounding: 1/2048 of a group of 256 splats; the radiance of white",
     suffix=".compressed.ply",
-    write=_writer(compressed_ply.encode),
+    fill=_writer(compressed_ply.encode),
 )
 SPZ = ExportKind(
     name="spz",
@@ -50,7 +50,7 @@ SPZ = ExportKind(
     readers="Scaniverse, Spark, Babylon.js, Cesium",
     loses="rounding (spiked/spz.py has the bounds); the radiance of white",
     suffix=".spz",
-    write=_writer(spz.encode),
+    fill=_writer(spz.encode),
 )
 SOG = ExportKind(
     name="sog",
@@ -58,5 +58,5 @@ SOG = ExportKind(
     readers="SuperSplat, PlayCanvas, Spark, splat-transform",
     loses="rounding: 256 values of scale and of colour; the radiance of white; view-dependent colour",
     suffix=".sog",
-    write=_writer(sog.encode, harmonics=False),
+    fill=_writer(sog.encode, harmonics=False),
 )

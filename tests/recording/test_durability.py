@@ -33,6 +33,8 @@ from spiked.recording import (
 from spiked.recording.index import ENTRY_BYTES
 from spiked.sensor import Layout, Sensor
 
+from ..small_disk import small_disk
+
 SENSOR = Sensor(64, 16, 1000.0)
 INDEXED = Durability(index=True)
 
@@ -182,18 +184,11 @@ def test_an_index_of_another_geometry_is_told(tmp_path: Path) -> None:
         recover(path)
 
 
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
+@pytest.fixture(name="small_disk")
+def make_small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 4 MiB."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=4m", "spiked-test", str(place)], capture_output=True, check=False
-    )
-    if mounted.returncode:
-        pytest.skip("mounting a small file system is not permitted here")
-    yield place
-    subprocess.run(["umount", "--lazy", str(place)], check=True)
+    with small_disk(tmp_path / "disk", 4) as place:
+        yield place
 
 
 def test_a_full_disk_leaves_a_whole_recording_and_room_for_others(small_disk: Path) -> None:

@@ -35,6 +35,7 @@ from spiked.ring import LossCause
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
 
+from ..small_disk import small_disk
 from .survival import (
     SENSOR,
     SMALL,
@@ -427,16 +428,11 @@ def test_a_device_is_disarmed(data_store: DataStore) -> None:
     wait_for(lambda: children() == [], "they have left")
 
 
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
+@pytest.fixture(name="small_disk")
+def make_small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 24 MiB."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=24m", "spiked-test", str(place)]
-    if subprocess.run(command, capture_output=True, check=False).returncode:
-        pytest.skip("mounting a small file system is not permitted here")
-    yield place
-    subprocess.run(["umount", "--lazy", str(place)], check=True)
+    with small_disk(tmp_path / "disk", 24) as place:
+        yield place
 
 
 def lost_on_disk(data_store: DataStore) -> float:

@@ -7,12 +7,13 @@ from pathlib import Path
 
 from fastapi import Request, Response
 
-from spiked.errors import ConfigurationError
+from spiked.errors import ConfigurationError, SpikedError
 from spiked.export import ExportKind, ExportOptions
 from spiked_service.api import files
 from spiked_service.api.results import Result, Results
 from spiked_service.base.limits import OverloadedError
 from spiked_service.captures.captures import Captures
+from spiked_service.store.disk_space import DiskFullError
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import ReconstructionRow
 from spiked_service.workers.messages import ExportCommand, WorkerError, WorkerEvent
@@ -45,8 +46,8 @@ class Exports:
     ) -> Response:
         """The file, or a ZIP of the folder; made now if it is not kept.
 
-        Raises NotReadyError, NothingError, GoneError, OverloadedError while another one is made, and ConfigurationError
-        for what the version lacks.
+        Raises NotReadyError, NothingError, GoneError, OverloadedError while another one is made, DiskFullError, and
+        ConfigurationError for what the version lacks.
         """
         kind.check()
         result = self._results.of(row, version)
@@ -82,28 +83,37 @@ class Exports:
         )
 
     def _make(self, command: ExportCommand) -> None:
-        """Run the worker to its end. Raises OverloadedError and ConfigurationError."""
+        """Run the worker to its end. Raises OverloadedError, DiskFullError and ConfigurationError."""
         if not self._making.acquire(blocking=False):
             raise OverloadedError("another export is being made; try again when it is ready")
         try:
             self._place.mkdir(exist_ok=True)
-            for old in sorted(self._place.iterdir(), key=lambda file: file.stat().st_mtime)[: -KEPT + 1 or None]:
-                old.unlink()
-            reasons: list[str] = []
+            self._tidy()
+            errors: list[SpikedError] = []
             ended = threading.Event()
 
             def on_event(event: WorkerEvent) -> None:
                 if isinstance(event, WorkerError):
-                    reasons.append(event.reason)
+                    errors.append((DiskFullError if event.disk_full else ConfigurationError)(event.reason))
 
             def on_exit(reason: str | None) -> None:
                 if reason is not None:
-                    reasons.append(reason)
+                    errors.append(ConfigurationError(reason))
                 ended.set()
 
             WorkerProcess(command, self._folder.path / "exports.log", on_event, on_exit)
             ended.wait()
-            if reasons:
-                raise ConfigurationError(reasons[0])
+            if errors:
+                raise errors[0]
         finally:
             self._making.release()
+
+    def _tidy(self) -> None:
+        """Remove the oldest files, and what a worker left that was killed."""
+        files = sorted(self._place.iterdir(), key=lambda file: file.stat().st_mtime)
+        kept = [file for file in files if not file.name.startswith(".")][-KEPT + 1 :]
+        for file in files:
+            if file.is_dir():
+                shutil.rmtree(file)
+            elif file not in kept:
+                file.unlink()

@@ -1,5 +1,6 @@
 """Checks of output paths before the work begins, so that a mistyped path does not lose hours of work."""
 
+import errno
 import fcntl
 import os
 import tempfile
@@ -63,7 +64,7 @@ def alone(option: str, folder: Path, what: str) -> Iterator[None]:
 
 @contextmanager
 def writing(option: str, place: Path) -> Iterator[None]:
-    """Turn an error of writing to `place` into one that names the option and the place.
+    """Turn an error of writing to `place` into one that names the option and the place, and says what to do.
 
     Raises ConfigurationError.
     """
@@ -71,6 +72,7 @@ def writing(option: str, place: Path) -> Iterator[None]:
         yield
     except OSError as error:
         why = error.strerror or error
+        advice = "free disk space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "make this one writable"
         raise ConfigurationError(
-            f"{option} {place} cannot be written: {why}; name another place, or make this one writable"
+            f"{option} {place} cannot be written: {why}; name another place, or {advice}"
         ) from error

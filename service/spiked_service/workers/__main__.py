@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from spiked.errors import SpikedError
+from spiked_service.store.disk_space import DiskFullError
 from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.log_forwarding import join_logs
 from spiked_service.workers.messages import Role, WorkerError, commands
@@ -40,7 +41,7 @@ def main() -> int:
         execute(command, channel)
     except (SpikedError, MemoryError) as error:
         reason = str(error) if isinstance(error, SpikedError) else _NO_MEMORY
-        channel.send(WorkerError(reason=reason))
+        channel.send(WorkerError(reason=reason, disk_full=isinstance(error, DiskFullError)))
         print(reason, file=sys.stderr)
         return 2
     return 0

@@ -381,6 +381,8 @@ class WorkerError(BaseModel):
 
     type: Literal["error"] = "error"
     reason: str
+    disk_full: bool = False
+    """Whether there was no room on the disk."""
 
 
 WorkerEvent = Annotated[

@@ -92,8 +92,6 @@ def _export(
     source = _source(result, recording, metric)
     options = ExportOptions(views, undistorted, "expected" if expected else "median", resolution)
     with outputs.writing("--out", place):
-        if kind.folder:
-            place.mkdir(parents=True, exist_ok=True)
         said = kind.write(source, place, options)
     output.print(f"{place}: {said}", markup=False)
 

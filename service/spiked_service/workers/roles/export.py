@@ -8,10 +8,12 @@ from tempfile import TemporaryDirectory
 
 from spiked.errors import SceneError
 from spiked.export import ExportSource, find_kind
+from spiked.export.whole import FULL, whole_file
 from spiked.frame_of_reference import FrameOfReference
 from spiked.poses import PoseFile
 from spiked.recording import open_recording
 from spiked.scene import Scene
+from spiked_service.store.disk_space import DiskFullError
 from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.messages import ExportCommand
 
@@ -20,24 +22,23 @@ _NICE = 10
 
 
 def run_export(command: ExportCommand, channel: WorkerChannel) -> None:
-    """Write the file; a half-written one has another name. Raises SpikedError for what the user can correct."""
+    """Write the file whole or not at all. Raises DiskFullError, and SpikedError for what the user can correct."""
     os.nice(_NICE)
-    kind = find_kind(command.kind)
-    part = command.out.with_name(command.out.name + ".part")
+    kind, source = find_kind(command.kind), source_of(command)
     try:
-        if kind.folder:
-            with TemporaryDirectory(dir=part.parent, prefix=".export-") as name:
-                folder = Path(name) / command.name
-                folder.mkdir()
-                kind.write(source_of(command), folder, command.options)
-                _zip(folder, part)
-        else:
-            kind.write(source_of(command), part, command.options)
-        part.replace(command.out)
+        with whole_file(command.out) as part:
+            if kind.folder:
+                with TemporaryDirectory(dir=part.parent, prefix=".export-") as name:
+                    folder = Path(name) / command.name
+                    kind.write(source, folder, command.options)
+                    _zip(folder, part)
+            else:
+                kind.fill(source, part, command.options)
     except OSError as error:
-        raise SceneError(f"the export cannot be written: {error.strerror or error}; free disk space") from error
-    finally:
-        part.unlink(missing_ok=True)
+        why = f"the export cannot be written: {error.strerror or error}"
+        if error.errno in FULL:
+            raise DiskFullError(f"{why}; free disk space in the data folder, or remove captures") from error
+        raise SceneError(f"{why}; see the state of the disk of the data folder") from error
 
 
 def source_of(command: ExportCommand) -> ExportSource:

@@ -39,6 +39,7 @@ from spiked_service.cli.commands.simulate import simulate
 from spiked_service.cli.commands.token import token
 from spiked_service.cli.commands.verify import verify
 from spiked_service.cli.commands.version import version
+from spiked_service.cli.commands.video import video
 from spiked_service.cli.console import output, report_error
 
 app = typer.Typer(
@@ -76,6 +77,7 @@ for _group, _commands in {
         app.command(rich_help_panel=_group)(_command)
 app.add_typer(config, name="config", rich_help_panel="Live")
 app.add_typer(datasets, name="datasets", rich_help_panel="Scenes")
+app.add_typer(video, name="video", rich_help_panel="Scenes")
 app.add_typer(token, name="token", rich_help_panel="Live")
 
 

@@ -1,7 +1,5 @@
 """`spiked cut`: a range of a recording."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -14,30 +12,8 @@ from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import output, report_warning
 from spiked_service.cli.flag_groups import with_groups
+from spiked_service.cli.ranges import Range, number_range
 from spiked_service.conversion.truth import TRUTH, cut_truth
-
-
-@dataclass(frozen=True)
-class Range:
-    """From `begin` to `end`, exclusive, in frames or seconds; None: the begin or end of the recording."""
-
-    begin: float | None
-    end: float | None
-
-
-def _range(number: Callable[[str], float]) -> Callable[[str], Range]:
-    """Reads `A:B`; None for what is left out."""
-
-    def parse(text: str) -> Range:
-        try:
-            begin, end = (number(part) if part.strip() else None for part in text.split(":"))
-        except ValueError as error:
-            raise typer.BadParameter(f"{text!r} is no range: write A:B, A: or :B") from error
-        if any(one is not None and not one >= 0 for one in (begin, end)):
-            raise typer.BadParameter(f"{text!r}: a range counts from the begin of the recording, so it has no minus")
-        return Range(begin, end)
-
-    return parse
 
 
 @with_groups
@@ -45,10 +21,10 @@ def cut(
     file: Annotated[Path, typer.Argument(help="A recording.", readable=False)],
     out: Annotated[Path, typer.Option("--out", "-o", help="A new file, .dat.")],
     frames: Annotated[
-        Range | None, typer.Option(help="Frames from A to B, B exclusive.", parser=_range(int), metavar="A:B")
+        Range | None, typer.Option(help="Frames from A to B, B exclusive.", parser=number_range(int), metavar="A:B")
     ] = None,
     seconds: Annotated[
-        Range | None, typer.Option(help="The same in seconds.", parser=_range(float), metavar="A:B")
+        Range | None, typer.Option(help="The same in seconds.", parser=number_range(float), metavar="A:B")
     ] = None,
     *,
     geometry: g.GeometryFlags,

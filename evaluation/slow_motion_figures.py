@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from spiked.export.pictures import rate_at
+from spiked.rates import rate_at
 from spiked.recording import open_recording
 from spiked.video.rate_pictures import compensated
 

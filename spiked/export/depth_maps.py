@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from spiked.export.images import LARGEST, levels, read_exr, write_exr, write_png
+from spiked.export.images import LARGEST, read_exr, write_exr, write_png
 from spiked.export.kind import ExportKind
 from spiked.export.source import ExportOptions, ExportSource, optics_of
 from spiked.export.views import RenderedView, rendered_views
+from spiked.rates import levels
 
 __all__ = ["KIND"]
 

@@ -56,8 +56,3 @@ def png(image: NDArray[Any]) -> bytes:
     if not done:
         raise SceneError(f"an image of shape {image.shape} cannot be written as PNG")
     return encoded.tobytes()
-
-
-def levels(image: NDArray[np.float32], white: float) -> NDArray[np.uint8]:
-    """Bytes of linear values, `white` being 255."""
-    return np.asarray(np.rint(255 * np.clip(np.nan_to_num(image) / max(white, 1e-9), 0, 1)), np.uint8)

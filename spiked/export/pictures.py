@@ -6,13 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.blocks import aligned_window
-from spiked.export.images import levels
 from spiked.export.source import ExportOptions, ExportSource
 from spiked.export.views import RenderedView
-from spiked.recon.frontend.demosaic import fill_mosaic
-from spiked.recording import Recording
-from spiked.sensor import Image
+from spiked.rates import WHITE_PERCENTILE, levels, rate_at
 from spiked.trajectory import Trajectory
 from spiked.undistortion import Undistortion
 
@@ -22,10 +18,6 @@ LONGEST, SHORTEST = 32, 4
 """Frames of a picture: 1.5 % noise of a bright pixel, and what even fast motion leaves."""
 BLUR_PX = 1.0
 """Motion of the image within a picture, at most, unless it would be shorter than `SHORTEST`."""
-EDGE_FRAMES = 64
-"""Frames on both sides that are searched for the spikes nearest to the edges."""
-WHITE_PERCENTILE = 99.5
-"""Percentile of the first picture that becomes 255."""
 
 
 @dataclass(frozen=True)
@@ -65,23 +57,6 @@ def key_pictures(
         rate = rate[..., 0] if rate.shape[2] == 1 else rate
         white = white or max(float(np.percentile(rate, WHITE_PERCENTILE)), 1e-6)
         yield KeyPicture(view, levels(rate, white), frames)
-
-
-def rate_at(recording: Recording, time_s: float, frames: int, first_frame: int = 0) -> Image | None:
-    """Spikes a frame [H, W, C] around a time of the capture; None where frames were lost or not recorded."""
-    sensor = recording.sensor
-    middle = int(np.floor(time_s * sensor.frame_rate_hz)) - first_frame
-    last = recording.capture_index(recording.frames - 1) + 1
-    begin = min(max(0, middle - frames // 2), max(0, last - frames))
-    end = min(begin + frames, last)
-    for edge in (EDGE_FRAMES, EDGE_FRAMES // 4, 0):  # fewer beside a gap
-        low, high = max(0, begin - edge), min(end + edge, last)
-        stored = recording.captured(low, high - low) if begin <= middle < end else None
-        if stored is not None:
-            window = aligned_window(np.ascontiguousarray(stored), sensor, low, begin, end)
-            channels = sensor.mosaic.channels(sensor.height, sensor.width) if sensor.mosaic else None
-            return fill_mosaic(window.rate(fill=True), channels)
-    return None
 
 
 def picture_frames(path: Trajectory, view: RenderedView) -> int:

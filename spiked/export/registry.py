@@ -12,6 +12,7 @@ from spiked.export import (
     rerun_log,
     ros_bag,
     splats,
+    video,
 )
 from spiked.export.kind import ExportKind
 
@@ -31,6 +32,7 @@ KINDS: tuple[ExportKind, ...] = (
     mcap_log.KIND,
     ros_bag.KIND,
     nexus.KIND,
+    video.KIND,
 )
 """In the order in which they are listed."""
 

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.export.images import levels
 from spiked.export.kind import ExportKind, optional
 from spiked.export.source import ExportOptions, ExportSource
 from spiked.export.timeline import Timeline, read_timeline
 from spiked.harmonics import COEFFICIENTS
+from spiked.rates import levels
 from spiked.scene import Scene, unit_quats
 
 __all__ = ["KIND"]

@@ -31,6 +31,8 @@ class ExportOptions:
     """Depth of a pixel: see `spiked.export.views`."""
     resolution: int = 256
     """Voxels along the longest side of the volume that a mesh is made in; points are at least half a voxel apart."""
+    seconds: float = 10.0
+    """Length of a video."""
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.errors import SceneError
-from spiked.export.images import levels
 from spiked.export.source import ExportOptions, ExportSource
 from spiked.export.views import Doubles, RenderedView, rendered_views
+from spiked.rates import levels
 
 __all__ = ["SurfacePoints", "surface_points"]
 

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from spiked.distortion import LensModel
 from spiked.errors import SceneError
-from spiked.export.images import levels
 from spiked.export.pictures import key_pictures
 from spiked.export.source import ExportOptions, ExportSource
 from spiked.export.surface import SurfacePoints, fused
 from spiked.export.views import Doubles, RenderedView, rendered_views
 from spiked.pose import quaternion
+from spiked.rates import levels
 from spiked.render import Camera
 
 __all__ = ["CAMERA", "MAP", "WORLD", "CameraMessage", "KeyFrame", "Timeline", "camera_message", "read_timeline"]

@@ -3,7 +3,7 @@
 from spiked.video.camera_path import CameraPath, recorded_path, smoothed_path, waypoint_path
 from spiked.video.mp4 import Mp4Writer
 from spiked.video.rate_pictures import SlowMotion, slow_motion
-from spiked.video.scene_pictures import scene_pictures
+from spiked.video.scene_pictures import scene_pictures, video_camera
 
 __all__ = [
     "CameraPath",
@@ -13,5 +13,6 @@ __all__ = [
     "scene_pictures",
     "slow_motion",
     "smoothed_path",
+    "video_camera",
     "waypoint_path",
 ]

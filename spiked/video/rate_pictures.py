@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.errors import ConfigurationError
-from spiked.export.images import levels
-from spiked.export.pictures import WHITE_PERCENTILE, rate_at
+from spiked.rates import WHITE_PERCENTILE, levels, rate_at
 from spiked.recording import Recording
 from spiked.sensor import Image
 

@@ -42,9 +42,9 @@ def test_a_folder_is_sent_as_zip_with_the_pictures_of_the_recording(service: Any
     assert bag.status_code == 200 and bag.content.startswith(b"\x89HDF")
 
 
-@pytest.mark.parametrize("form", ["mesh-glb", "ply", "sog"])
+@pytest.mark.parametrize("form", ["mesh-glb", "ply", "sog", "video"])
 def test_files_are_sent_as_the_schema_says(service: Any, job: str, form: str) -> None:
-    answer = service.http.get(f"reconstructions/{job}/exports/{form}?views=4&resolution=32", timeout=120)
+    answer = service.http.get(f"reconstructions/{job}/exports/{form}?views=4&resolution=32&seconds=0.2", timeout=120)
     assert answer.status_code == 200, answer.text
     paths = service.http.get(f"{service.daemon.address}openapi.json").json()["paths"]
     told = paths["/api/v1/reconstructions/{reconstruction_id}/exports/{format}"]["get"]["responses"]["200"]["content"]

@@ -1,7 +1,7 @@
 """`exports`: the formats of other programs, and the newest or any version in one of them."""
 
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi import Path as PathParameter
@@ -35,6 +35,7 @@ ExpectedDepth = Annotated[bool, Query(description="Mean depth of what a pixel sh
 Resolution = Annotated[
     int, Query(ge=16, le=512, description="Voxels of a mesh along the longest side of the scene."), IN_DIGITS
 ]
+Seconds = Annotated[float, Query(ge=0.1, le=120, description="Length of a video.")]
 Metric = Annotated[bool, Query(description="In metres, with up along -y; 404 while the scale is not known.")]
 
 _HEADERS: dict[str, Any] = {
@@ -98,7 +99,9 @@ def _add(router: APIRouter, prefix: str, name: str, find: Callable[..., Reconstr
         undistorted: Undistorted = False,
         expected_depth: ExpectedDepth = False,
         resolution: Resolution = 256,
+        seconds: Seconds = 10.0,
         metric: Metric = False,
     ) -> Response:
-        options = ExportOptions(views, undistorted, "expected" if expected_depth else "median", resolution)
+        depth: Literal["median", "expected"] = "expected" if expected_depth else "median"
+        options = ExportOptions(views, undistorted, depth, resolution, seconds)
         return exports.response(request, row, find_kind(format), options, version=version, metric=metric)

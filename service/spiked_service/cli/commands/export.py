@@ -78,6 +78,7 @@ def _export(
     resolution: Annotated[
         int, typer.Option(help="Voxels of a mesh along the longest side of the scene.", min=16, max=1024)
     ] = 256,
+    seconds: Annotated[float, typer.Option(help="Length of a video.", min=0.1, max=3600)] = 10.0,
     metric: Annotated[
         bool, typer.Option("--metric", help="In metres, with up along -y, by the scale of `spiked scale`.")
     ] = False,
@@ -90,7 +91,7 @@ def _export(
             place.parent.mkdir(exist_ok=True)
     (outputs.try_folder if kind.folder else outputs.try_file)("--out", place)
     source = _source(result, recording, metric)
-    options = ExportOptions(views, undistorted, "expected" if expected else "median", resolution)
+    options = ExportOptions(views, undistorted, "expected" if expected else "median", resolution, seconds)
     with outputs.writing("--out", place):
         said = kind.write(source, place, options)
     output.print(f"{place}: {said}", markup=False)

@@ -12,9 +12,7 @@ from rich.progress import track
 
 from spiked.errors import ConfigurationError
 from spiked.export import ExportSource
-from spiked.render import Camera
 from spiked.scene import Scene
-from spiked.sensor import Intrinsics, Sensor
 from spiked.trajectory import Trajectory
 from spiked.video import (
     CameraPath,
@@ -24,6 +22,7 @@ from spiked.video import (
     scene_pictures,
     slow_motion,
     smoothed_path,
+    video_camera,
     waypoint_path,
 )
 from spiked.video.mp4 import QUALITY
@@ -69,7 +68,8 @@ def video_of_scene(
     width: Annotated[int | None, typer.Option(help="Pixels. Default: of the recording, or 1280.", **_SIDE)] = None,
     height: Annotated[int | None, typer.Option(help="Pixels. Default: by the width.", **_SIDE)] = None,
     fov: Annotated[
-        float | None, typer.Option(help="Horizontal field of view, degrees. Default: of the recording, or 60.")
+        float | None,
+        typer.Option(help="Horizontal field of view, degrees. Default: of the recording, or 60.", min=1, max=170),
     ] = None,
     quality: Quality = QUALITY,
 ) -> None:
@@ -90,7 +90,7 @@ def video_of_scene(
     outputs.try_file("--out", place)
     source = _source(result)
     scene = source.need_scene()
-    camera = _camera(source.sensor, width, height, fov)
+    camera = video_camera(source.sensor, width, height, fov)
     count = max(1, round(seconds * fps))
     pictures = scene_pictures(scene, _path(path, source), camera, count, source.white)
     _write(place, fps, quality, pictures, count)
@@ -113,21 +113,6 @@ def _path(named: str, source: ExportSource) -> CameraPath:
         case "smooth" | "recorded":
             return recorded_path(source.path)
     return waypoint_path(Trajectory.read_tum(Path(named)))
-
-
-def _camera(sensor: Sensor | None, width: int | None, height: int | None, fov: float | None) -> Camera:
-    """Of the wanted size, with the field of view of the sensor; even sides, as H.264 has them."""
-    w = width or (sensor.width if sensor else 1280)
-    h = height or (round(w * sensor.height / sensor.width) if sensor else round(w * 9 / 16))
-    w, h = w - w % 2, h - h % 2
-    if fov is None and sensor is not None and sensor.intrinsics is not None:
-        k = sensor.intrinsics
-        larger = w / sensor.width
-        cy = h / 2 + larger * (k.cy - sensor.height / 2)
-        return Camera(Intrinsics(larger * k.fx, larger * k.fy, larger * k.cx, cy), w, h)
-    if fov is not None and not 1 <= fov <= 170:
-        raise typer.BadParameter(f"{fov:g} is not between 1 and 170 degrees", param_hint="--fov")
-    return Camera(Intrinsics.from_fov(w, h, fov or 60.0), w, h)
 
 
 @video.command("recording")

@@ -9469,13 +9469,15 @@ export interface operations {
                 expected_depth?: boolean;
                 /** @description Voxels of a mesh along the longest side of the scene. */
                 resolution?: number;
+                /** @description Length of a video. */
+                seconds?: number;
                 /** @description In metres, with up along -y; 404 while the scale is not known. */
                 metric?: boolean;
             };
             header?: never;
             path: {
                 /** @description Name of a format. */
-                format: "depth" | "points-ply" | "points-pcd" | "mesh-ply" | "mesh-glb" | "colmap" | "nerfstudio" | "ply" | "compressed-ply" | "spz" | "sog" | "rerun" | "mcap" | "ros-bag" | "nexus";
+                format: "depth" | "points-ply" | "points-pcd" | "mesh-ply" | "mesh-glb" | "colmap" | "nerfstudio" | "ply" | "compressed-ply" | "spz" | "sog" | "rerun" | "mcap" | "ros-bag" | "nexus" | "video";
                 reconstruction_id: string;
             };
             cookie?: never;
@@ -9497,6 +9499,7 @@ export interface operations {
                     "application/zip": string;
                     "application/octet-stream": string;
                     "model/gltf-binary": string;
+                    "video/mp4": string;
                 };
             };
             /** @description The requested range. */
@@ -9508,6 +9511,7 @@ export interface operations {
                     "application/zip": string;
                     "application/octet-stream": string;
                     "model/gltf-binary": string;
+                    "video/mp4": string;
                 };
             };
             /** @description The content has not changed. */
@@ -9622,13 +9626,15 @@ export interface operations {
                 expected_depth?: boolean;
                 /** @description Voxels of a mesh along the longest side of the scene. */
                 resolution?: number;
+                /** @description Length of a video. */
+                seconds?: number;
                 /** @description In metres, with up along -y; 404 while the scale is not known. */
                 metric?: boolean;
             };
             header?: never;
             path: {
                 /** @description Name of a format. */
-                format: "depth" | "points-ply" | "points-pcd" | "mesh-ply" | "mesh-glb" | "colmap" | "nerfstudio" | "ply" | "compressed-ply" | "spz" | "sog" | "rerun" | "mcap" | "ros-bag" | "nexus";
+                format: "depth" | "points-ply" | "points-pcd" | "mesh-ply" | "mesh-glb" | "colmap" | "nerfstudio" | "ply" | "compressed-ply" | "spz" | "sog" | "rerun" | "mcap" | "ros-bag" | "nexus" | "video";
                 capture_id: string;
             };
             cookie?: never;
@@ -9650,6 +9656,7 @@ export interface operations {
                     "application/zip": string;
                     "application/octet-stream": string;
                     "model/gltf-binary": string;
+                    "video/mp4": string;
                 };
             };
             /** @description The requested range. */
@@ -9661,6 +9668,7 @@ export interface operations {
                     "application/zip": string;
                     "application/octet-stream": string;
                     "model/gltf-binary": string;
+                    "video/mp4": string;
                 };
             };
             /** @description The content has not changed. */

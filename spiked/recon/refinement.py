@@ -110,7 +110,8 @@ class Refinement:
     def _make_pose_step(self, name: PoseStepName) -> PoseStep:
         if name is PoseStepName.GRADIENT:
             return PoseGradient(self._trainer, self._options.seed)
-        return GaussNewton(self._trainer, None if self._tracker.untracked else self._prior())
+        free = self._options.parts.alternation is not None  # it takes knots of its own
+        return GaussNewton(self._trainer, None if free else self._prior())
 
     def _prior(self) -> TrajectoryPrior | None:
         """The tracked path with its information, as the prior of the alignment."""

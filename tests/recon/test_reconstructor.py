@@ -13,6 +13,7 @@ from spiked.evaluate import psnr, score_trajectory, similarity_of_trajectories
 from spiked.recon import MapOptions, Options, Reconstructor, State
 from spiked.recon.mapping.mapper import Mapper
 from spiked.recon.mapping.schedule import Schedule
+from spiked.recon.methods import Initialisation, MethodName, PoseStepName
 from spiked.sensor import Intrinsics, Mosaic, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
 from spiked.trajectory import Trajectory
@@ -45,6 +46,25 @@ def finite(reconstructor: Reconstructor) -> bool:
     scene, path = reconstructor.scene(), reconstructor.trajectory()
     arrays = (*scene.arrays(), path.rotations, path.centres)
     return all(np.isfinite(a).all() for a in arrays)
+
+
+def test_the_papers_method_goes_on_from_the_tracked_path_by_our_alignment(
+    shaken: tuple[SimulatedCamera, np.ndarray, Trajectory],
+) -> None:
+    """The schedule takes a knot for each view: the prior of the tracked path has others."""
+    _, frames, truth = shaken
+    theirs = Options(
+        steps=60,
+        method=MethodName.NOPE_SGS,
+        initialisation=Initialisation.TRACKS,
+        pose_step=PoseStepName.ALIGNMENT,
+    )
+    reconstructor = Reconstructor(sensor(), theirs)
+    feed(reconstructor, frames)
+    reconstructor.finish()
+    assert len(reconstructor.scene()) > 1000
+    score = score_trajectory(truth=truth, estimate=reconstructor.trajectory(), frame_rate_hz=20000.0)
+    assert score.errors is not None and score.errors.ate_percent < 6.0
 
 
 def test_a_shaken_camera_gives_its_path_and_a_scene_that_looks_right(

@@ -95,6 +95,7 @@ class DataStore:
             self._guarded(self.reconstructions.rows.retry_saving)
             self.reconstructions.wake_queue()  # jobs may have waited for a row
             self._guarded(self.retention.apply)
+            self.catalogue.keep_reserve()
 
     def _guarded(self, work: Callable[[], None]) -> None:
         try:

@@ -273,8 +273,9 @@ class Captures:
         if not snapshot.row.state.over:
             raise BusyError(f"capture {capture_id} is still {snapshot.row.state}: stop it first")
         for row in snapshot.reconstructions:
-            self._reconstructions.cancel(row.id)
-        return self._change(capture_id, deleted_at=snapshot.row.deleted_at or datetime.now(UTC))
+            self._catalogue.freeing(self._reconstructions.cancel, row.id)
+        at = snapshot.row.deleted_at or datetime.now(UTC)
+        return self._catalogue.freeing(self._change, capture_id, deleted_at=at)
 
     def restore(self, capture_id: str) -> Snapshot:
         """Undo `remove`. Raises UnknownIdError."""

@@ -6,11 +6,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, ParamSpec, Protocol, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
 from spiked.errors import SpikedError
+from spiked_service.store.disk_reserve import DiskReserve
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.migrations import MIGRATIONS, copy_before_migration, migrate, schema_of, written_by
 from spiked_service.store.rows import CaptureRow, CaptureState, JobState, ReconstructionRow, UploadRow, VersionRow
@@ -43,6 +44,8 @@ class Row(Protocol):
 
 
 _Row = TypeVar("_Row", bound=Row)
+_Given = ParamSpec("_Given")
+_Done = TypeVar("_Done")
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,8 @@ class Catalogue:
         beside: tuple[_CopyOf | None, ...] = (None, None, None)
         if folder is not None:
             beside = (folder.capture_row, folder.reconstruction_row, folder.upload_row)
+        self._reserve = None if folder is None else DiskReserve(path.with_name(f"{path.name}-reserve"))
+        self.keep_reserve()
         self.captures = Table(self, "captures", CaptureRow, beside[0])
         self.reconstructions = Table(self, "reconstructions", ReconstructionRow, beside[1])
         self.uploads = Table(self, "uploads", UploadRow, beside[2])
@@ -117,6 +122,22 @@ class Catalogue:
                     self._writer.execute("ROLLBACK")
                 raise
             self._writer.execute("COMMIT")
+
+    def keep_reserve(self) -> None:
+        """Keep some space of the disk for `freeing`, if it is not kept yet and there is room."""
+        if self._reserve is not None:
+            self._reserve.keep()
+
+    def freeing(self, work: Callable[_Given, _Done], *args: _Given.args, **fields: _Given.kwargs) -> _Done:
+        """Do work that leads to more free space. On a full disk it is repeated with the space that is kept for it."""
+        try:
+            return work(*args, **fields)
+        except DamagedError:
+            raise
+        except StoreError:
+            if self._reserve is None or not self._reserve.give_up():
+                raise
+        return work(*args, **fields)
 
     def read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         """Result of a query on a read-only connection."""

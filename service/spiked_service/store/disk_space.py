@@ -22,7 +22,7 @@ _SIDECAR_BYTES = 1 << 20
 
 
 class DiskFullError(StoreError):
-    """A capture or upload exceeds the free space that is not reserved."""
+    """A capture, upload or export exceeds the free space, without what is reserved."""
 
 
 class DiskSpace:

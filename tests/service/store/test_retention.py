@@ -1,6 +1,7 @@
 """Retention: what goes, in which order, and what stays."""
 
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -11,8 +12,11 @@ from spiked_service.base.ids import new_id
 from spiked_service.captures.archive import DataStore
 from spiked_service.daemon import open_data_store
 from spiked_service.events.bus import Bus
+from spiked_service.store.catalogue import StoreError
 from spiked_service.store.retention import Policy
 from spiked_service.store.rows import CaptureRow, CaptureState, JobState, Origin, Plan, ReconstructionRow, UploadRow
+
+from ...small_disk import fill, small_disk
 
 NOW = datetime(2026, 11, 21, 12, 0, 0, 0, UTC)
 MIB = 1 << 20
@@ -100,3 +104,27 @@ def test_uploads_that_nobody_goes_on_with_are_dropped(data_store: DataStore) -> 
     data_store.retention.apply(NOW)
     assert [row.id for row in data_store.catalogue.uploads.where()] == [fresh.id]
     assert data_store.folder.contents()[2] == {fresh.id}
+
+
+def test_on_a_full_disk_captures_are_removed_and_purged(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "data", 16) as disk, closing(open_data_store(disk, BusNotifier(Bus()))) as data_store:
+        reserve = disk / "catalogue.sqlite-reserve"
+        assert reserve.stat().st_blocks * 512 == 16 * MIB // 64
+        old, unwanted, young = (capture(data_store, days) for days in (40, 20, 1))
+        others = fill(disk)
+        with pytest.raises(StoreError, match="full"):
+            data_store.catalogue.captures.set(young, notes="x" * 10_000)
+        assert reserve.exists()
+        assert data_store.captures.remove(unwanted).row.deleted_at is not None
+        assert not reserve.exists()
+        data_store.catalogue.keep_reserve()
+        assert not reserve.exists(), "there is no room for it yet"
+        others.unlink()
+        data_store.catalogue.keep_reserve()
+        assert reserve.exists()
+
+        fill(disk)
+        data_store.retention.policy = Policy(days=30, deleted_days=0)
+        data_store.retention.apply(datetime.now(UTC) + timedelta(seconds=1))
+        assert there(data_store, old, unwanted, young) == [True, False, True]
+        assert data_store.catalogue.captures.get(old).deleted_at is not None

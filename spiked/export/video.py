@@ -9,6 +9,7 @@ from spiked.video import Mp4Writer, recorded_path, scene_pictures, smoothed_path
 __all__ = ["KIND"]
 
 PICTURES_A_SECOND = 30
+"""Of the video."""
 LEAST_SMOOTHED = 4
 """Poses that a path needs to be smoothed."""
 

@@ -14,6 +14,7 @@ __all__ = ["CameraPath", "recorded_path", "smoothed_path", "waypoint_path"]
 SPANS_A_SECOND = 4.0
 """Of the spline of a smoothed path: a hand turns within a quarter of a second, and trembles at 8 to 12 Hz."""
 LEAST_SPANS, MOST_SPANS = 4, 400
+"""Fewest and most spans of a smoothed path."""
 
 MOST_FITTED = 2000
 """Poses that a smoothed path is fitted to, at most, evenly chosen."""

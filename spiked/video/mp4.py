@@ -20,6 +20,7 @@ QUALITY = 20
 LARGEST_PX = 8192
 """Longest side."""
 MOST_PICTURES_A_SECOND = 1000
+"""Highest rate of a video."""
 
 
 class Mp4Writer:

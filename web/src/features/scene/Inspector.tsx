@@ -2,20 +2,26 @@
 
 import { type JSX, useState } from "react";
 
+import { revert } from "../../shared/api/calls";
 import type { Capture, Closure, Reconstruction, Version } from "../../shared/api/types";
+import { attempt } from "../../shared/state/attempt";
 import { nameOf, progressText } from "../../shared/state/capture";
 import { count, decibel, duration, percent } from "../../shared/state/format";
+import { isEnded } from "../../shared/state/store";
 import { toast } from "../../shared/state/toasts";
+import { ActionButton } from "../../shared/ui/access";
 import { Icon } from "../../shared/ui/icons";
 import { JobBadge, JobReason, Meter, Segmented, Stat, trackingMeaning, Warnings } from "../../shared/ui/parts";
 import { type Bookmark, readBookmarks, writeBookmarks } from "./bookmarks";
 import type { Colouring } from "./path";
 import { MAX_WIDTH_PX, type LineStyle, SPEED_STYLES, STATE_STYLES, STATES } from "./stateStyles";
 import type { Closures } from "./useClosures";
+import type { Comparison } from "./useComparison";
 import type { Shown } from "./useScene";
 import type { Layers, Steering, Viewer } from "./Viewer";
 import { ViewPanel, type Shows } from "./ViewPanel";
 import { CleanPanel } from "./CleanPanel";
+import { ComparePanel } from "./ComparePanel";
 import { MeasurePanel } from "./MeasurePanel";
 import type { Preset } from "./presets";
 
@@ -64,6 +70,7 @@ export interface InspectorProps {
   onFov: (fov: number) => void;
   onPreset: (preset: Preset) => void;
   onRide: (ride: boolean) => void;
+  comparison: Comparison | null;
   onHome: () => void;
   onScreenshot: () => void;
   currentView: () => { camera: number[]; frame: number | null };
@@ -115,6 +122,7 @@ export function Inspector(props: InspectorProps): JSX.Element {
       <button type="button" aria-pressed={props.ride} onClick={() => props.onRide(!props.ride)}>
         <Icon name="eye" /> Ride along
       </button>
+      <ComparePanel {...props} />
       <fieldset className="layers">
         <legend>Layers</legend>
         {(Object.keys(LAYER_NAMES) as (keyof Layers)[]).map((name) => (
@@ -148,25 +156,44 @@ export function Inspector(props: InspectorProps): JSX.Element {
 function Versions({ job, versions, pinned, onVersion }: InspectorProps): JSX.Element | null {
   if (job.version === 0) return null;
   return (
-    <label className="row version">
-      <span className="dim">Version</span>
-      <select
-        value={pinned?.version ?? ""}
-        onChange={(event) => onVersion(event.target.value === "" ? null : Number(event.target.value))}
-      >
-        <option value="">newest, {job.version}</option>
-        {versions
-          .filter((one) => one.version < job.version || one === pinned)
-          .reverse()
-          .map((one) => (
-            <option key={one.version} value={one.version}>
-              {one.version}: {count(one.splats)} splats, {decibel(one.psnr_db)}
-            </option>
-          ))}
-      </select>
-    </label>
+    <>
+      <label className="row version">
+        <span className="dim">Version</span>
+        <select
+          value={pinned?.version ?? ""}
+          onChange={(event) => onVersion(event.target.value === "" ? null : Number(event.target.value))}
+        >
+          <option value="">newest, {job.version}</option>
+          {versions
+            .filter((one) => one.version < job.version || one === pinned)
+            .reverse()
+            .map((one) => (
+              <option key={one.version} value={one.version}>
+                {one.version}: {count(one.splats)} splats, {decibel(one.psnr_db)}
+              </option>
+            ))}
+        </select>
+      </label>
+      {pinned !== null && pinned.version < job.version && (
+        <ActionButton
+          disabled={!isEnded(job)}
+          title={isEnded(job) ? "Publishes it again, as the newest" : "When the reconstruction has ended"}
+          onClick={() => void goBack(job, pinned.version, () => onVersion(null))}
+        >
+          <Icon name="back" /> Go back to version {pinned.version}
+        </ActionButton>
+      )}
+    </>
   );
 }
+
+/** Publish an earlier version again; the one before is kept as a version, so that this can be undone, too. */
+const goBack = (job: Reconstruction, version: number, after: () => void): Promise<boolean> =>
+  attempt(async () => {
+    await revert(job.id, { version: job.version, to: version });
+    after();
+    toast(`The scene is as version ${version} was`);
+  });
 
 /** Legend of the path; the timeline always shows the states. */
 function Legend({ colouring }: { colouring: Colouring }): JSX.Element {

@@ -1,11 +1,11 @@
 /** The Scene page: splats, path, timeline, and the view of the capture camera. */
 
-import { type JSX, useCallback, useEffect, useState } from "react";
+import { type JSX, useCallback, useEffect, useRef, useState } from "react";
 
 import { capture as askCapture } from "../../shared/api/calls";
-import type { Capture } from "../../shared/api/types";
+import type { Capture, Reconstruction, Version } from "../../shared/api/types";
 import { nameOf } from "../../shared/state/capture";
-import { count } from "../../shared/state/format";
+import { count, when } from "../../shared/state/format";
 import { adjust, go, route, useRoute } from "../../shared/state/route";
 import {
   isEnded,
@@ -18,10 +18,12 @@ import {
 } from "../../shared/state/store";
 import { toast } from "../../shared/state/toasts";
 import { Empty, ErrorMessage, JobReason, Loading, trackingHint } from "../../shared/ui/parts";
+import { CompareStage, type Names } from "./CompareStage";
 import { Inspector } from "./Inspector";
 import { type Colouring, rowAt } from "./path";
 import { type Comparison, RideAlong } from "./RideAlong";
 import { Scrubber } from "./Scrubber";
+import { type Comparison as Compared, useComparison } from "./useComparison";
 import { usePath } from "./usePath";
 import { useClosures } from "./useClosures";
 import { useScene } from "./useScene";
@@ -106,28 +108,34 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   const { shown, loading, problem } = useScene(viewer, job, full, pinned);
 
   const closures = useClosures(jobId, shown?.version ?? 0);
-  const mount = useCallback((canvas: HTMLCanvasElement | null) => {
-    if (canvas === null) return;
-    let timer: ReturnType<typeof setTimeout> | undefined;
-    let made: Viewer;
-    try {
-      made = new Viewer(canvas, () => {
-        clearTimeout(timer);
-        timer = setTimeout(() => adjust({ camera: made.view() }), URL_MS);
-      });
-    } catch {
-      setFault(
-        "This browser has no WebGL 2, which the scene view requires. The pictures of the Live page work without it.",
-      );
-      return;
-    }
-    setViewer(made);
-    return () => {
-      clearTimeout(timer);
-      made.dispose();
-      setViewer(null);
-    };
+  const timer = useRef<ReturnType<typeof setTimeout>>(undefined);
+  const onMoved = useCallback((moved: Viewer) => {
+    clearTimeout(timer.current);
+    timer.current = setTimeout(() => adjust({ camera: moved.view() }), URL_MS);
   }, []);
+  const mount = useCallback(
+    (canvas: HTMLCanvasElement | null) => {
+      if (canvas === null) return;
+      let made: Viewer;
+      try {
+        made = new Viewer(canvas, () => onMoved(made));
+      } catch {
+        setFault(
+          "This browser has no WebGL 2, which the scene view requires. The pictures of the Live page work without it.",
+        );
+        return;
+      }
+      setViewer(made);
+      return () => {
+        clearTimeout(timer.current);
+        made.dispose();
+        setViewer(null);
+      };
+    },
+    [onMoved],
+  );
+  const riding = at.ride && at.against === null;
+  const compared = useComparison({ viewer, job, path, layers, colouring, mode, full, onMoved });
 
   const last = path?.frames.at(-1) ?? null;
   const row = path === null ? -1 : rowAt(path, at.frame ?? last ?? 0);
@@ -145,11 +153,10 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   useEffect(() => {
     if (path !== null) viewer?.setLoops(path, closures.all, closures.fresh);
   }, [viewer, path, closures, shown?.version]);
-  useEffect(() => viewer?.setLayers(layers), [viewer, layers]);
   useEffect(() => viewer?.steer(steering), [viewer, steering]);
-  useEffect(() => viewer?.setRiding(at.ride), [viewer, at.ride]);
-  useEffect(() => viewer?.setMode(at.ride ? "colour" : mode), [viewer, at.ride, mode]);
-  useSceneKeys(viewer, mode, steering === "orbit" && !at.ride);
+  useEffect(() => viewer?.setRiding(riding), [viewer, riding]);
+  useEffect(() => viewer?.setMode(riding ? "colour" : mode), [viewer, riding, mode]);
+  useSceneKeys(viewer, mode, steering === "orbit" && !riding);
   const linked = at.camera;
   useEffect(() => {
     // Only views from a link or the history; the viewer's own updates are in effect already.
@@ -169,8 +176,8 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   };
   return (
     <div className="scene">
-      <div className={at.ride ? "viewport ride" : "viewport"}>
-        <div className="stage">
+      <div className={riding ? "viewport ride" : "viewport"}>
+        <div className={compared?.how === "side" ? "stage side" : "stage"}>
           <canvas
             ref={mount}
             tabIndex={0}
@@ -179,7 +186,10 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
             data-version={shown?.version ?? 0}
             data-splats={shown?.splats ?? 0}
           />
-          {at.ride && sensor !== null && (
+          {compared !== null && viewer !== null && (
+            <CompareStage comparison={compared} names={namesOf(job, pinned, compared)} />
+          )}
+          {riding && sensor !== null && (
             <RideAlong
               capture={capture}
               white={(pinned ?? job).white ?? undefined}
@@ -233,12 +243,15 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
         onColouring={setColouring}
         steering={steering}
         onSteering={setSteering}
-        ride={at.ride}
-        onRide={(ride) => adjust({ ride })}
-        shows={at.ride && comparison === "difference" ? "error" : mode}
+        ride={riding}
+        comparison={compared}
+        onRide={(ride) => adjust(ride ? { ride, against: null, againstVersion: null, how: "" } : { ride })}
+        shows={riding && comparison === "difference" ? "error" : mode}
         onShows={(shows) => {
           setComparison(shows === "error" ? "difference" : "wipe");
-          adjust(shows === "error" ? { ride: true } : { ride: false, show: shows === "colour" ? "" : shows });
+          adjust(
+            shows === "error" ? { ride: true, against: null } : { ride: false, show: shows === "colour" ? "" : shows },
+          );
         }}
         fov={Math.round(at.camera?.[6] ?? viewer?.view()[6] ?? 0)}
         onFov={(fov) => viewer?.setFov(fov)}
@@ -264,4 +277,16 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
       />
     </div>
   );
+}
+
+/** What each side of a comparison is called. */
+function namesOf(job: Reconstruction, pinned: Version | null, compared: Compared): Names {
+  const version = (one: Reconstruction | null, known: number | null): string => `version ${known ?? one?.version ?? 0}`;
+  const first = version(job, pinned?.version ?? null);
+  const second = version(compared.job, compared.version);
+  if (compared.job === null || compared.job.id === job.id) return { first, second };
+  return {
+    first: `of ${when(job.created_at)}, ${first}`,
+    second: `of ${when(compared.job.created_at)}, ${second}`,
+  };
 }

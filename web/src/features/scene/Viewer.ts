@@ -8,6 +8,7 @@ import {
   Color,
   GridHelper,
   Group,
+  type Matrix4,
   PerspectiveCamera,
   Quaternion,
   Raycaster,
@@ -80,6 +81,14 @@ export class Viewer {
   private readonly world = new Scene();
   /** Parent of objects in OpenCV axes. */
   private readonly turned = new Group();
+  /** The splats and the path, which `align` moves. */
+  private readonly content = new Group();
+  /** Lines that others draw over the scene. */
+  readonly overlays = new Group();
+  /** The viewer whose camera this one has; it has the depth of the scene, too. */
+  private lead: Viewer | null = null;
+  /** The viewer that has the camera of this one. */
+  private follower: Viewer | null = null;
   private readonly spark: SparkRenderer;
   private readonly camera = new PerspectiveCamera(55, 1, 0.01, 1000);
   private readonly rider = new PerspectiveCamera();
@@ -129,7 +138,8 @@ export class Viewer {
       enableLod: false,
     });
     this.turned.quaternion.set(1, 0, 0, 0);
-    this.world.add(this.spark, this.turned, this.path, this.loops, this.marks, this.crop, this.frustum, this.axes);
+    this.content.add(this.turned, this.path);
+    this.world.add(this.spark, this.content, this.loops, this.marks, this.overlays, this.crop, this.frustum, this.axes);
     this.frustum.renderOrder = OVERLAY_ORDER;
     this.frustum.frustumCulled = false;
     this.frustum.material.depthTest = false;
@@ -149,7 +159,10 @@ export class Viewer {
     this.axes.add(names);
     this.axes.visible = false;
     this.orbit = new OrbitControls(this.camera, canvas);
-    this.orbit.addEventListener("change", () => this.draw());
+    this.orbit.addEventListener("change", () => {
+      this.lead?.takeCamera(this);
+      this.draw();
+    });
     this.orbit.addEventListener("end", () => {
       this.placed = true;
       this.onMoved();
@@ -167,6 +180,7 @@ export class Viewer {
 
   dispose(): void {
     cancelAnimationFrame(this.scheduled);
+    if (this.lead !== null) this.lead.follower = null;
     this.resizing.disconnect();
     this.orbit.dispose();
     this.fly?.dispose();
@@ -188,7 +202,7 @@ export class Viewer {
   };
 
   private readonly onDoubleClick = (event: MouseEvent): void => {
-    if (!this.riding) this.focus(event.clientX, event.clientY);
+    if (!this.riding && this.lead === null) this.focus(event.clientX, event.clientY);
   };
 
   private readonly onLost = (event: Event): void => event.preventDefault();
@@ -204,6 +218,7 @@ export class Viewer {
       if (this.camera.matrix.elements.some((value, i) => value !== before[i])) this.onMoved();
       this.draw(); // keys are held between events
     }
+    this.follower?.takeCamera(this);
     this.path.dashFor(this.camera, this.canvas.clientHeight);
     this.renderer.render(this.world, this.riding ? this.rider : this.camera);
   };
@@ -278,7 +293,7 @@ export class Viewer {
 
   /** Median distance of the splats from the first pose, 1 before there are any. */
   get depth(): number {
-    return this.extent?.depth ?? 1;
+    return this.lead?.depth ?? this.extent?.depth ?? 1;
   }
 
   /** Give the mesh its new splats: into the textures that it has, and shown when they are sorted. */
@@ -555,6 +570,39 @@ export class Viewer {
     this.camera.updateProjectionMatrix();
     this.placed = true;
     this.orbit.update();
+    this.draw();
+  }
+
+  /** Have the free camera of another viewer from now on, whichever of both is moved. */
+  follow(lead: Viewer): void {
+    this.lead = lead;
+    lead.follower = this;
+    this.takeCamera(lead);
+  }
+
+  private takeCamera(from: Viewer): void {
+    const { camera, orbit } = from;
+    const same =
+      this.camera.matrix.equals(camera.matrix) &&
+      this.orbit.target.equals(orbit.target) &&
+      this.camera.fov === camera.fov &&
+      this.camera.near === camera.near;
+    if (same) return;
+    this.camera.position.copy(camera.position);
+    this.camera.quaternion.copy(camera.quaternion);
+    this.camera.updateMatrix();
+    this.orbit.target.copy(orbit.target);
+    this.camera.fov = camera.fov;
+    this.camera.near = camera.near;
+    this.camera.far = camera.far;
+    this.camera.updateProjectionMatrix();
+    this.placed = true;
+    this.draw();
+  }
+
+  /** Show the scene and its path moved, turned and scaled. */
+  align(by: Matrix4): void {
+    by.decompose(this.content.position, this.content.quaternion, this.content.scale);
     this.draw();
   }
 

@@ -1,13 +1,10 @@
 /** Closed loops in the scene: an arc between the two places of the camera, with a diamond at each. */
 
-import { Color, Group, type Vector3 } from "three";
-import { LineMaterial } from "three/addons/lines/LineMaterial.js";
-import { LineSegments2 } from "three/addons/lines/LineSegments2.js";
-import { LineSegmentsGeometry } from "three/addons/lines/LineSegmentsGeometry.js";
+import type { Vector3 } from "three";
 
 import type { Closure } from "../../shared/api/types";
-import { colour } from "../../shared/state/theme";
 import { pointOf } from "./axes";
+import { OverlayLines } from "./overlayLines";
 import { type Path, rowAtTime } from "./path";
 
 /** Drawn after the path. */
@@ -19,8 +16,10 @@ const ARC_STEPS = 16;
 /** Height of an arc, as a share of the way between its ends, and at least of the size of a diamond. */
 const ARC_HEIGHT = 0.25;
 
-export class LoopLines extends Group {
-  private drawn: LineSegments2[] = [];
+export class LoopLines extends OverlayLines {
+  constructor() {
+    super(ORDER, CASING_PX);
+  }
 
   /** @param size of the diamonds, in units of the scene. @param fresh how many of the last closures are highlighted. */
   set(path: Path, closures: readonly Closure[], size: number, fresh: number): void {
@@ -31,30 +30,9 @@ export class LoopLines extends Group {
     this.draw(path, closures.slice(usual), 1.6 * size, NEWEST_PX);
   }
 
-  override clear(): this {
-    this.drawn.forEach((line, i) => {
-      if (i % 2 === 0) line.geometry.dispose(); // shared by a line and its outline
-      line.material.dispose();
-    });
-    this.drawn = [];
-    return super.clear();
-  }
-
   private draw(path: Path, closures: readonly Closure[], size: number, width_px: number): void {
     const ends = closures.flatMap((one) => edges(placeAt(path, one.earlier_s), placeAt(path, one.later_s), size));
-    if (ends.length === 0) return;
-    const geometry = new LineSegmentsGeometry().setPositions(ends);
-    const outline = new LineMaterial({ linewidth: width_px + 2 * CASING_PX, color: new Color(colour("glass")) });
-    const stroke = new LineMaterial({ linewidth: width_px, color: new Color(colour("mark")) });
-    [outline, stroke].forEach((material, above) => {
-      material.depthTest = false;
-      material.transparent = true;
-      const line = new LineSegments2(geometry, material);
-      line.frustumCulled = false;
-      line.renderOrder = ORDER + above;
-      this.drawn.push(line);
-      this.add(line);
-    });
+    this.stroke(ends, { colour: "mark", width_px, dash_px: null });
   }
 }
 

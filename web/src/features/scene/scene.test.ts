@@ -1,4 +1,4 @@
-import { DataUtils, PerspectiveCamera, Vector3 } from "three";
+import { DataUtils, PerspectiveCamera, Quaternion, Vector3 } from "three";
 import { expect, it } from "vitest";
 
 import type { Trajectory } from "../../shared/api/types";
@@ -7,6 +7,7 @@ import { classes, pathOf, rowAt, runs, stylesBy, speeds, thinned } from "./path"
 import { SPEED_STYLES, STATE_STYLES, STATES } from "./stateStyles";
 import { containing, moved, zoomed } from "./timelineWindow";
 import { distanceAlong } from "./picker";
+import { applied, inverse, pathOfTum, rmsDistance, type Similarity, similarityOf } from "./similarity";
 import { readBookmarks, writeBookmarks } from "./bookmarks";
 
 const straight = (n: number): Trajectory => ({
@@ -151,4 +152,73 @@ it("finds the distance at which half of the light along a ray is stopped", () =>
   slots.held[1] = 0;
   expect(distanceAlong(slots, new Vector3(), ahead)).toBeCloseTo(5, 2);
   expect(distanceAlong(slots, new Vector3(1, 0, 0), ahead)).toBeNull();
+});
+
+/** A path that winds, and the same one seen in other coordinates. */
+function wound(by: Similarity, n = 60): Trajectory {
+  const turnOf = (i: number): Quaternion => new Quaternion().setFromAxisAngle(new Vector3(0, 1, 0), 0.02 * i);
+  return {
+    ...straight(n),
+    positions: Array.from({ length: n }, (_, i) =>
+      applied(by, new Vector3(Math.sin(0.1 * i), 0.3 * Math.cos(0.2 * i), 0.05 * i)).toArray(),
+    ),
+    quaternions_wxyz: Array.from({ length: n }, (_, i) => {
+      const { x, y, z, w } = by.rotation.clone().multiply(turnOf(i));
+      return [w, x, y, z];
+    }),
+  };
+}
+const SOME: Similarity = {
+  scale: 2.5,
+  rotation: new Quaternion(0.1, -0.5, 0.3, 0.8).normalize(),
+  translation: new Vector3(1, -2, 3),
+};
+const NONE: Similarity = { scale: 1, rotation: new Quaternion(), translation: new Vector3() };
+
+it.each(["places", "turns"] as const)("lays a path over another by its %s", (by) => {
+  const [from, to] = [pathOf(wound(NONE)), pathOf(wound(SOME))];
+  const found = similarityOf(from, to, by);
+  expect(found).not.toBeNull();
+  if (found === null) return;
+  expect(found.scale).toBeCloseTo(2.5, 4);
+  expect(found.rotation.angleTo(SOME.rotation)).toBeLessThan(1e-3);
+  expect(found.translation.distanceTo(SOME.translation)).toBeLessThan(1e-3);
+  expect(rmsDistance(from, to, found)).toBeLessThan(1e-4);
+  const point = new Vector3(0.3, 0.1, -2);
+  expect(applied(inverse(found), applied(found, point)).distanceTo(point)).toBeLessThan(1e-6);
+});
+
+it("lays straight paths over each other by their orientations", () => {
+  const turned = new Quaternion().setFromAxisAngle(new Vector3(1, 0, 0), 1.2); // about the path itself
+  const other = straight(50);
+  const { x, y, z, w } = turned;
+  const found = similarityOf(
+    pathOf(straight(50)),
+    pathOf({ ...other, quaternions_wxyz: other.frames.map(() => [w, x, y, z]) }),
+    "turns",
+  );
+  expect(found?.rotation.angleTo(turned)).toBeLessThan(1e-3);
+});
+
+it("measures how far a path is from the truth at its own times", () => {
+  const truth = pathOf(straight(100));
+  const off = straight(100);
+  off.positions = off.positions.map(([px = 0], i) => [px, i % 2 === 0 ? 0.01 : -0.01, 0]);
+  off.times_s = off.times_s.map((time) => time + 0.0001); // between the poses of the truth
+  const distance = rmsDistance(pathOf(off), truth, {
+    ...NONE,
+    translation: new Vector3(0.0025, 0, 0), // 0.1 ms at 25 units a second
+  });
+  expect(distance).toBeCloseTo(0.01, 4);
+  expect(similarityOf(truth, pathOf(straight(2)), "places")).toBeNull();
+});
+
+it("reads a TUM file, and names the line that is none", () => {
+  const path = pathOfTum("# t x y z qx qy qz qw\n0.1 1 2 3 0 0 0 1\n0.2 1 2 4 0 0.6 0 0.8\n0.3 1 2 5 0 0 0 1\n", 1000);
+  expect([...path.frames]).toEqual([100, 200, 300].map((one) => one - 0.5).map(Math.round));
+  expect([...path.positions.subarray(3, 6)]).toEqual([1, 2, 4]);
+  expect(path.quaternions[6]).toBeCloseTo(0.6);
+  expect(path.quaternions[4]).toBeCloseTo(0.8);
+  expect(() => pathOfTum("0.1 1 2 3 0 0 0 1\n0.2 1 2\n", 1000)).toThrow("Line 2 is no pose");
+  expect(() => pathOfTum("0.1 1 2 3 0 0 0 1\n", 1000)).toThrow("has 1 poses");
 });

@@ -1,4 +1,4 @@
-/** Line styles of tracking states and speeds: colour, width and dash; the same on path, timeline and legend. */
+/** Line styles of tracking states, speeds and compared paths: colour, width and dash; the same on path, timeline and legend. */
 
 import type { TrackingState } from "../../shared/api/types";
 
@@ -30,3 +30,10 @@ export const SPEED_STYLES: readonly LineStyle[] = [1.5, 2.5, 3.5, 5, MAX_WIDTH_P
   width_px,
   dash_px: null,
 }));
+
+/** Of a comparison: the thick one is drawn below, so that both are seen where they agree. */
+export const COMPARED_STYLES: Record<"first" | "second" | "truth", LineStyle> = {
+  first: { name: "first", colour: "path-first", width_px: 6, dash_px: null },
+  second: { name: "second", colour: "path-second", width_px: 3, dash_px: null },
+  truth: { name: "truth", colour: "path-truth", width_px: 1.2, dash_px: null },
+};

@@ -122,6 +122,8 @@ export const restoreCapture = (id: string): Promise<Capture> =>
 export const stats = (id: string): Promise<Stats> =>
   answered(client.GET("/api/v1/captures/{capture_id}/stats", ofCapture(id)));
 
+export const reconstruction = (id: string): Promise<Reconstruction> =>
+  answered(client.GET("/api/v1/reconstructions/{reconstruction_id}", ofReconstruction(id)));
 export const reconstructions = async (captureId: string): Promise<Reconstruction[]> =>
   (await answered(client.GET("/api/v1/reconstructions", { params: { query: { capture_id: captureId, limit: 100 } } })))
     .items;

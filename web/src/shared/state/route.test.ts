@@ -14,6 +14,9 @@ it("keeps everything that is looked at in the URL", () => {
     camera: [0.5, 1, -2, 0, 0, -1, 55],
     ride: true,
     show: "depth",
+    against: "01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e12",
+    againstVersion: 3,
+    how: "wipe",
     search: "desk & lamp",
   };
   expect(parseRoute(formatRoute(there).slice(2))).toEqual(there);
@@ -33,12 +36,13 @@ it("takes details into the same entry of the history and pages into a new one", 
   expect(window.location.search).toBe("?page=scene&frame=3");
 });
 
-it("lets go of a version with its reconstruction", () => {
-  go({ page: "scene", reconstruction: "a", version: 3 });
+it("lets go of a version and a comparison with their reconstruction", () => {
+  go({ page: "scene", reconstruction: "a", version: 3, against: "c" });
   go({ page: "captures" });
   expect(route().version).toBe(3);
   go({ page: "scene", reconstruction: "b" });
   expect(route().version).toBeNull();
+  expect(route().against).toBeNull();
 });
 
 it("takes the token out of the address", () => {

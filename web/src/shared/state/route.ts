@@ -21,6 +21,12 @@ export interface Route {
   ride: boolean;
   /** What the splats show. */
   show: string;
+  /** Reconstruction that the scene is compared with; null: none. */
+  against: string | null;
+  /** Its version; null follows the newest. */
+  againstVersion: number | null;
+  /** How they are compared. */
+  how: string;
   /** Search text of the captures table. */
   search: string;
 }
@@ -34,6 +40,9 @@ export const HOME: Route = {
   camera: null,
   ride: false,
   show: "",
+  against: null,
+  againstVersion: null,
+  how: "",
   search: "",
 };
 
@@ -42,6 +51,8 @@ const identifier = (text: string | null): string | null => (text !== null && /^[
 
 const counted = (text: string | null): number | null =>
   text !== null && /^\d{1,15}$/.test(text) ? Number(text) : null;
+
+const word = (text: string | null): string => /^[a-z]{1,16}$/.exec(text ?? "")?.[0] ?? "";
 
 export function parseRoute(search: string): Route {
   const query = new URLSearchParams(search);
@@ -55,7 +66,10 @@ export function parseRoute(search: string): Route {
     frame: counted(query.get("frame")),
     camera: camera?.length === 7 && camera.every(Number.isFinite) ? camera : null,
     ride: query.get("ride") === "1",
-    show: /^[a-z]{1,16}$/.exec(query.get("show") ?? "")?.[0] ?? "",
+    show: word(query.get("show")),
+    against: identifier(query.get("against")),
+    againstVersion: counted(query.get("against-version")),
+    how: word(query.get("how")),
     search: query.get("search") ?? "",
   };
 }
@@ -70,6 +84,9 @@ export function formatRoute(route: Route): string {
   if (route.camera !== null) pairs.set("camera", route.camera.map((x) => Number(x.toPrecision(5))).join(","));
   if (route.ride) pairs.set("ride", "1");
   if (route.show !== "") pairs.set("show", route.show);
+  if (route.against !== null) pairs.set("against", route.against);
+  if (route.againstVersion !== null) pairs.set("against-version", String(route.againstVersion));
+  if (route.how !== "") pairs.set("how", route.how);
   if (route.search !== "") pairs.set("search", route.search);
   const text = pairs.toString().replaceAll("%2C", ",");
   return text === "" ? "./" : `./?${text}`;
@@ -94,9 +111,12 @@ window.addEventListener("popstate", () => {
   for (const listener of listeners) listener();
 });
 
-/** Navigate, with a new history entry. The version is reset when the reconstruction changes. */
+/** What belongs to one reconstruction. */
+const OF_ONE: Partial<Route> = { version: null, against: null, againstVersion: null, how: "" };
+
+/** Navigate, with a new history entry. Version and comparison are reset when the reconstruction changes. */
 export const go = (change: Partial<Route>): void =>
-  set({ ...current, ...("capture" in change || "reconstruction" in change ? { version: null } : {}), ...change }, true);
+  set({ ...current, ...("capture" in change || "reconstruction" in change ? OF_ONE : {}), ...change }, true);
 /** Change parameters without a new history entry. */
 export const adjust = (change: Partial<Route>): void => set({ ...current, ...change }, false);
 export const route = (): Route => current;

@@ -5,7 +5,7 @@ import { join } from "node:path";
 
 import { expect, it } from "vitest";
 
-import { SPEED_STYLES, STATE_STYLES, STATES } from "../../features/scene/stateStyles";
+import { COMPARED_STYLES, SPEED_STYLES, STATE_STYLES, STATES } from "../../features/scene/stateStyles";
 
 type Rgb = [number, number, number];
 type Matrix = readonly [Rgb, Rgb, Rgb];
@@ -122,7 +122,8 @@ it.each(THEMES)("has text with contrast enough on everything it is written on, %
 });
 
 it("draws states, speeds and marks bright enough on their dark ground", () => {
-  const drawn = [...STATES.map((state) => STATE_STYLES[state]), ...SPEED_STYLES].map((style) => style.colour);
+  const styles = [...STATES.map((state) => STATE_STYLES[state]), ...SPEED_STYLES, ...Object.values(COMPARED_STYLES)];
+  const drawn = styles.map((style) => style.colour);
   for (const name of [...drawn, "mark", "axis-x", "axis-y", "axis-z"])
     expect(contrast(colourOf(name, "dark"), colourOf("glass", "dark")), name).toBeGreaterThanOrEqual(GRAPHICS);
 });
@@ -130,6 +131,14 @@ it("draws states, speeds and marks bright enough on their dark ground", () => {
 it("keeps the states apart without red, green or blue cones", () => {
   expectApart(
     STATES.map((state) => STATE_STYLES[state].colour),
+    "dark",
+    STATES_APART,
+  );
+});
+
+it("keeps compared paths apart without red, green or blue cones", () => {
+  expectApart(
+    Object.values(COMPARED_STYLES).map((style) => style.colour),
     "dark",
     STATES_APART,
   );

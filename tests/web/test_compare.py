@@ -1,0 +1,223 @@
+"""Two scenes beside each other, with one camera."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browsing import (
+    PHONE,
+    STEPS,
+    Picture,
+    Studied,
+    address,
+    choose,
+    decoded,
+    keep,
+    picture,
+    shown_version,
+    still,
+    until,
+    violations,
+)
+
+from spiked.evaluate import umeyama
+from spiked.trajectory import Trajectory
+
+SECOND = ".second canvas"
+
+
+@pytest.fixture(scope="module")
+def other_id(studied: Studied) -> str:
+    """Another reconstruction of the studied capture, with half the steps."""
+    plan = {"capture_id": studied.capture_id, "options": {"steps": STEPS // 2}}
+    other: str = studied.http.post("reconstructions", json=plan).json()["id"]
+
+    def ended() -> bool:
+        state = studied.http.get(f"reconstructions/{other}").json()
+        assert state["state"] in ("queued", "running", "complete"), state["reason"]
+        return bool(state["state"] == "complete")
+
+    until(ended, "another reconstruction", 300)
+    return other
+
+
+@pytest.fixture
+def compared(studied: Studied, other_id: str, visit: Callable[..., Any]) -> Callable[..., Any]:
+    """Opens the studied scene beside another one, and waits until both are drawn."""
+
+    def open_scenes(query: str = "", against: str = other_id, **more: Any) -> Any:
+        page = visit(
+            f"{studied.address}?page=scene&capture={studied.capture_id}&reconstruction={studied.reconstruction_id}"
+            f"&against={against}{query}",
+            **more,
+        )
+        for canvas in (".stage > canvas", SECOND):
+            until(lambda: int(page.locator(canvas).get_attribute("data-version") or 0) > 0, canvas)  # noqa: B023
+        still(page)
+        return page
+
+    return open_scenes
+
+
+def stage(page: Any) -> Picture:
+    """What is seen of the stage, all layers of it."""
+    return decoded(page.locator(".stage").screenshot())
+
+
+def apart(a: Picture, b: Picture) -> float:
+    """Mean difference of two pictures, infinite for two sizes."""
+    return float(np.abs(a - b).mean()) if a.shape == b.shape else float("inf")
+
+
+def rms_error(path: Trajectory, truth: Trajectory) -> float:
+    """Root mean square distance of the centres after the best similarity, in units of the truth."""
+    rows = truth.nearest(path.times_s, 1e-4)
+    known = rows >= 0
+    found, true = path.centres[known], truth.centres[rows[known]]
+    away = umeyama(source=found, target=true).points(found) - true
+    return float(np.sqrt((away**2).sum(1).mean()))
+
+
+def drag(page: Any, canvas: str, by: int) -> None:
+    """Drag from the middle of a canvas to the right."""
+    box = page.locator(canvas).bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + by, y, steps=5)
+    page.mouse.up()
+
+
+def test_two_reconstructions_are_chosen_and_turned_together(
+    studied: Studied, other_id: str, visit: Callable[..., Any], pictures_folder: Path
+) -> None:
+    page = visit(
+        f"{studied.address}?page=scene&reconstruction={studied.reconstruction_id}&capture={studied.capture_id}"
+    )
+    until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+    still(page)
+    page.locator("summary").filter(has_text="Compare").click()
+    page.get_by_label("With").select_option(value=f"{other_id}.")
+    until(lambda: page.locator(SECOND).count() == 1, "a second canvas")
+    until(lambda: int(page.locator(SECOND).get_attribute("data-version") or 0) > 0, "the second scene")
+    page.get_by_text("The second is laid over the first by its poses").wait_for()
+    still(page)
+    first, second = picture(page), picture(page, SECOND)
+    assert apart(first, second) < 0.08, "both show the same room from the same place"
+    drag(page, ".stage > canvas", 80)
+    until(lambda: apart(picture(page), first) > 0.01 and apart(picture(page, SECOND), second) > 0.01, "both turn")
+    still(page)
+    first, second = picture(page), picture(page, SECOND)
+    drag(page, SECOND, -120)
+    until(lambda: apart(picture(page), first) > 0.01 and apart(picture(page, SECOND), second) > 0.01, "both turn")
+    still(page)
+    assert apart(picture(page), picture(page, SECOND)) < 0.08
+    assert f"against={other_id}" in address(page)
+    assert violations(page) == []
+    keep(page, pictures_folder / "compare-dark.webp")
+    page.get_by_role("button", name="Stop comparing").click()
+    until(lambda: page.locator(SECOND).count() == 0, "one scene")
+    assert "against" not in address(page)
+
+
+def test_the_divider_is_moved_by_mouse_and_keys(compared: Callable[..., Any], pictures_folder: Path) -> None:
+    page = compared("&how=wipe")
+    before = stage(page)
+    divider = page.get_by_role("slider", name="on the left")
+    divider.focus()
+    for _ in range(30):
+        page.keyboard.press("ArrowRight")
+    assert float(divider.input_value()) == pytest.approx(0.8)
+    until(lambda: apart(stage(page), before) > 1e-3, "another part of the second")
+    box = page.locator(".stage").bounding_box()
+    y = box["y"] + 0.4 * box["height"]
+    page.mouse.move(box["x"] + 0.8 * box["width"], y)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.3 * box["width"], y, steps=5)
+    page.mouse.up()
+    assert float(divider.input_value()) == pytest.approx(0.3, abs=0.03)
+    first = still(page)
+    drag(page, ".stage > canvas", 60)
+    until(lambda: apart(picture(page), first) > 0.01, "the scene beside the divider is turned")
+    assert violations(page) == []
+    keep(page, pictures_folder / "compare-wipe.webp")
+
+
+def test_the_difference_of_a_scene_and_itself_is_black(
+    studied: Studied, other_id: str, compared: Callable[..., Any], pictures_folder: Path
+) -> None:
+    page = compared("&how=difference", against=studied.reconstruction_id)
+    box = page.locator(".stage").bounding_box()
+    clip = {**box, "height": box["height"] - 60}  # the note is below
+
+    def seen() -> float:
+        return float(decoded(page.screenshot(clip=clip)).mean())
+
+    until(lambda: seen() < 2e-3, "black")
+    page = compared("&how=difference", against=other_id)
+    until(lambda: seen() > 1e-2, "what differs")
+    assert violations(page) == []
+    keep(page, pictures_folder / "compare-difference.webp")
+
+
+def test_paths_are_compared_with_the_truth(
+    studied: Studied, other_id: str, room: Path, compared: Callable[..., Any], pictures_folder: Path
+) -> None:
+    page = compared()
+    plain = still(page)
+    choose(page, "Paths")
+    until(lambda: apart(picture(page), plain) > 1e-3, "paths")
+    truth = room.parent / "groundtruth.tum"
+    page.get_by_label("True path").set_input_files(truth)
+    row = page.locator("table.compared tr").filter(has_text="Path error")
+    row.wait_for()
+    shown = re.findall(r"([\d.]+) (mm|m)\b", row.inner_text())
+    assert len(shown) == 2
+    for one, (number, unit) in zip((studied.reconstruction_id, other_id), shown, strict=True):
+        tum = studied.http.get(f"reconstructions/{one}/trajectory?format=tum").text
+        path = truth.with_name(f"{one}.tum")
+        path.write_text(tum)
+        error_m = rms_error(Trajectory.read_tum(path), Trajectory.read_tum(truth))
+        assert float(number) * (1e-3 if unit == "mm" else 1) == pytest.approx(error_m, rel=0.02)
+    assert violations(page) == []
+    keep(page, pictures_folder / "compare-paths.webp")
+    page.get_by_label("True path").set_input_files(
+        {"name": "odd.tum", "mimeType": "text/plain", "buffer": b"0.1 1 2\n"}
+    )
+    page.get_by_text("Line 1 is no pose").wait_for()
+
+
+def test_scenes_are_compared_on_a_phone(compared: Callable[..., Any], pictures_folder: Path) -> None:
+    page = compared(viewport=PHONE, touch=True, theme="light")
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
+    first, second = (page.locator(one).bounding_box() for one in (".stage > canvas", SECOND))
+    assert min(first["width"], second["width"]) > 150 and min(first["height"], second["height"]) > 150
+    assert violations(page) == []
+    keep(page, pictures_folder / "compare-phone.webp")
+    page.get_by_label("With").scroll_into_view_if_needed()
+    keep(page, pictures_folder / "compare-phone-panel.webp")
+
+
+def test_an_earlier_version_is_compared_and_brought_back(studied: Studied, compared: Callable[..., Any]) -> None:
+    before = studied.reconstruction()
+    url = f"reconstructions/{studied.reconstruction_id}"
+    low, high = [-1e6, -1e6, -1e6], [0.0, 1e6, 1e6]
+    cut = {"version": before["version"], "floaters": False, "box": {"low": low, "high": high}}
+    after = studied.http.post(f"{url}:clean", json=cut).json()
+    assert after["splats"] < before["splats"]
+    page = compared(f"&against-version={before['version']}", against=studied.reconstruction_id)
+    table = page.locator("table.compared")
+    numbers = [
+        int("".join(filter(str.isdigit, text)))
+        for text in table.locator("tr", has_text="Splats").locator("td").all_inner_texts()
+    ]
+    assert numbers == [after["splats"], before["splats"]]
+    page.get_by_role("button", name="Stop comparing").click()
+    page.locator(".inspector .version select").select_option(value=str(before["version"]))
+    page.get_by_role("button", name=f"Go back to version {before['version']}").click()
+    until(lambda: studied.reconstruction()["splats"] == before["splats"], "all splats are back")
+    page.get_by_text(f"The scene is as version {before['version']} was").wait_for()
+    assert violations(page) == []

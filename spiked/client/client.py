@@ -252,6 +252,21 @@ class Spiked(MapMethods, ResultMethods):
         body = {"options": plain(options)}
         return self._connection.post(f"reconstructions/{reconstruction_id}:restart", body, ReconstructionOut)
 
+    def change_reconstruction(
+        self,
+        reconstruction_id: str,
+        *,
+        name: str | None = None,
+        notes: str | None = None,
+        held: bool | None = None,
+        queue_place: int | None = None,
+    ) -> ReconstructionOut:
+        """Change what is given: texts, or whether and where (from 1) it waits in the queue."""
+        given = {"name": name, "notes": notes, "held": held, "queue_place": queue_place}
+        body = {key: value for key, value in given.items() if value is not None}
+        answer = self._connection.request("PATCH", f"reconstructions/{reconstruction_id}", json=body)
+        return ReconstructionOut.model_validate_json(answer.content)
+
     def remove_reconstruction(self, reconstruction_id: str) -> None:
         """Remove it for good."""
         self._connection.request("DELETE", f"reconstructions/{reconstruction_id}")

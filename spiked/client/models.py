@@ -733,6 +733,28 @@ class RateHistogram(BaseModel):
     counts: list[int]
 
 
+class ReconstructionChange(BaseModel):
+    """
+    What can be changed of a reconstruction; fields that are not given stay.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    name: str | None = None
+    notes: str | None = None
+    held: Annotated[
+        bool | None,
+        Field(description="Whether it stays in the queue; only while it waits there."),
+    ] = None
+    queue_place: Annotated[
+        int | None,
+        Field(
+            description="Its new place in the queue, 1 is the next; beyond the end: the last. Only while it waits there. It takes the priority of that place."
+        ),
+    ] = None
+
+
 class RecordingOut(BaseModel):
     """
     What lies on disk of a capture.
@@ -1530,6 +1552,8 @@ class ReconstructionOut(BaseModel):
         extra="ignore",
     )
     id: Annotated[str, Field(description="UUID version 7: ids sort by time.")]
+    name: str
+    notes: str
     capture_id: Annotated[
         str,
         Field(description="The capture that its trajectory belongs to; of a merge that of the first map."),
@@ -1587,6 +1611,7 @@ class ReconstructionOut(BaseModel):
         int | None,
         Field(description="1 is the next to begin; null unless it waits in the queue."),
     ]
+    held: Annotated[bool, Field(description="Whether it stays in the queue until it is let go.")]
     eta_s: Annotated[
         float | None,
         Field(description="Seconds to its end, those before its turn included; null where that is not known."),

@@ -239,4 +239,6 @@ def begun_anew(row: ReconstructionRow, options: ReconstructionOptions) -> Recons
         task=row.task,
         maps=row.maps,
         part=row.part,
+        name=row.name,
+        notes=row.notes,
     )

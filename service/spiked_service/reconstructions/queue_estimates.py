@@ -9,7 +9,7 @@ from spiked.recon.time_left import typical_work_s
 from spiked_service.store.catalogue import Catalogue
 from spiked_service.store.rows import JobState, ReconstructionRow, Task
 
-NEXT = "state = ? ORDER BY priority DESC, id"
+NEXT = "state = ? ORDER BY priority DESC, coalesce(nullif(json_extract(document, '$.turn'), ''), id)"
 """SQL condition and order of the queue; the parameter is a state."""
 _RECENT = 8
 """Complete reconstructions that the pace is estimated from."""
@@ -42,6 +42,9 @@ class QueueEstimates:
         pace = statistics.median(paces) if paces else float("inf")
         found = []
         for place, row in enumerate(rows, 1):
+            if row.held:
+                found.append(replace(row, queue_place=place, eta_s=None))
+                continue
             free_s.sort()
             end_s = free_s[0] = free_s[0] + pace * (self._effort(row) or float("inf"))
             found.append(replace(row, queue_place=place, eta_s=end_s if end_s < float("inf") else None))

@@ -13,9 +13,10 @@ _DELAYS_S = (1.0, 5.0)
 class QueuePolicy:
     """Decides which reconstructions run. Not thread-safe; `limit` may be changed at any time.
 
-    The queue is ordered by priority, then by age. At most `limit` reconstructions run at a time; live ones are not
-    limited but count, so none starts from the queue while they reach the limit. When its capture has ended, a live
-    reconstruction refines at once unless others precede it; then it is queued.
+    The queue is ordered by priority, then by turn, which is the age until a user moves one; held ones stay in it. At
+    most `limit` reconstructions run at a time; live ones are not limited but count, so none starts from the queue while
+    they reach the limit. When its capture has ended, a live reconstruction refines at once unless others precede it;
+    then it is queued.
     """
 
     MOST_ATTEMPTS = 6

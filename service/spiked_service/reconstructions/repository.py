@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Unpack
 
 from spiked.errors import ConfigurationError
 from spiked.recon.checkpoint import exists
@@ -20,7 +21,7 @@ from spiked_service.results.timeline_writer import NAME as TIMELINE
 from spiked_service.results.versions import Published, Publisher, newest, version_row
 from spiked_service.store.catalogue import Catalogue, Page, StoreError
 from spiked_service.store.folder import DataFolder
-from spiked_service.store.rows import JobState, MapRef, ReconstructionRow, VersionRow
+from spiked_service.store.rows import JobState, MapRef, ReconstructionEdit, ReconstructionRow, VersionRow
 
 
 class ReconstructionRepository:
@@ -39,6 +40,8 @@ class ReconstructionRepository:
         self._lock = threading.RLock()
         self._running: dict[str, ReconstructionRow] = {}
         self._unsaved: dict[str, ReconstructionRow] = {}
+        self._texts: dict[str, tuple[str, str]] = {}
+        """Name and notes that users have given meanwhile: workers save rows that do not have them yet."""
         self._edited: set[str] = set()
         """Reconstructions of which `publish_edit` writes a version."""
 
@@ -62,10 +65,10 @@ class ReconstructionRepository:
         return tuple(self._current(self._catalogue.reconstructions_of(capture_id)))
 
     def queued(self) -> list[ReconstructionRow]:
-        """Queued reconstructions, the next one first, without those that could not be saved."""
+        """Queued reconstructions that may begin, the next one first, without those that could not be saved."""
         rows = self._catalogue.reconstructions.where(NEXT, (str(JobState.QUEUED),))
         with self._lock:
-            return [row for row in rows if row.id not in self._unsaved]
+            return [row for row in rows if row.id not in self._unsaved and not row.held]
 
     def interrupted(self) -> list[ReconstructionRow]:
         """Reconstructions that an earlier service left running."""
@@ -101,7 +104,7 @@ class ReconstructionRepository:
 
     def save(self, row: ReconstructionRow) -> ReconstructionRow:
         """Save and publish a row. A row that cannot be saved is kept in memory and retried."""
-        row = replace(row, queue_place=None, eta_s=None if row.state.over else row.eta_s)
+        row = replace(self._named(row), queue_place=None, eta_s=None if row.state.over else row.eta_s)
         if row.state.over:  # the maps that it used may go
             for folder in self._folder.maps(row.id, len(row.maps)):
                 shutil.rmtree(folder, ignore_errors=True)
@@ -171,8 +174,41 @@ class ReconstructionRepository:
     def update(self, row: ReconstructionRow) -> None:
         """Publish the row of a running reconstruction without saving it."""
         with self._lock:
+            row = self._named(row)
             self._set_running(row)
             self._notifier.job(row)
+
+    def change(self, reconstruction_id: str, **edit: Unpack[ReconstructionEdit]) -> ReconstructionRow:
+        """Change the fields that are given, and publish the row.
+
+        Raises UnknownIdError, StoreError, and BusyError if one that is not in the queue is to be held or moved.
+        """
+        name, notes, held, place = (edit.get(key) for key in ("name", "notes", "held", "queue_place"))
+        with self._lock:
+            row = self.get(reconstruction_id)
+            if row.state is not JobState.QUEUED and (held, place) != (None, None):
+                raise BusyError(
+                    f"reconstruction {row.id} is {row.state}: only those that wait in the queue can be held or moved"
+                )
+            self._texts[row.id] = (row.name if name is None else f"{name}", row.notes if notes is None else f"{notes}")
+            self.save(row if held is None else replace(row, held=bool(held)))
+            if isinstance(place, int):
+                self._move(row.id, place)
+            return self.get(row.id)
+
+    def _move(self, reconstruction_id: str, place: int) -> None:
+        """Give a queued row a place; those in between take the priorities and turns of their neighbours."""
+        before = self._catalogue.reconstructions.where(NEXT, (str(JobState.QUEUED),))
+        after = [row for row in before if row.id != reconstruction_id]
+        after.insert(place - 1, next(row for row in before if row.id == reconstruction_id))
+        with self._catalogue.transaction():
+            for row, taken in zip(after, before, strict=True):
+                self._catalogue.reconstructions.put(replace(row, priority=taken.priority, turn=taken.turn or taken.id))
+        self._publish_queue()
+
+    def _named(self, row: ReconstructionRow) -> ReconstructionRow:
+        name, notes = self._texts.get(row.id, (row.name, row.notes))
+        return replace(row, name=name, notes=notes)
 
     def retry_saving(self) -> None:
         """Save rows that could not be saved on a full disk."""
@@ -234,6 +270,7 @@ class ReconstructionRepository:
                 self._catalogue.forget_versions(reconstruction_id)
                 self._catalogue.reconstructions.remove(reconstruction_id)
             self._unsaved.pop(reconstruction_id, None)
+            self._texts.pop(reconstruction_id, None)
 
     def _set_running(self, row: ReconstructionRow) -> None:
         if row.state is JobState.RUNNING:

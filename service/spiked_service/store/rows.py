@@ -279,7 +279,7 @@ class ReconstructionRow:
     created_at: datetime
     options: ReconstructionOptions = field(default_factory=ReconstructionOptions)
     priority: int = 0
-    """Higher values run first, equal ones in the order of their ids."""
+    """Higher values run first, equal ones in the order of their turns."""
     stage: Stage = Stage.WAITING
     progress: float = 0.0
     """Progress of the refinement, 0 to 1."""
@@ -312,6 +312,22 @@ class ReconstructionRow:
     """Whether all show one place; None before that is known, and without maps."""
     warnings: tuple[str, ...] = ()
     """What it found out or had to assume, one sentence each."""
+    name: str = ""
+    notes: str = ""
+    held: bool = False
+    """Stays in the queue until it is let go."""
+    turn: str = ""
+    """Its turn among queued ones of its priority; empty: its id."""
+
+
+class ReconstructionEdit(TypedDict, total=False):
+    """What a user changes of a reconstruction; None leaves it."""
+
+    name: str | None
+    notes: str | None
+    held: bool | None
+    queue_place: int | None
+    """Place in the queue, from 1; beyond its end: the last."""
 
 
 @dataclass(frozen=True)

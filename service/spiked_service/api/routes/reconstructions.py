@@ -15,6 +15,7 @@ from spiked_service.api.schemas.base import IN_DIGITS, Cursor, Limit
 from spiked_service.api.schemas.reconstructions import (
     ClosureOut,
     GapOut,
+    ReconstructionChange,
     ReconstructionOut,
     ReconstructionPage,
     ReconstructionRequest,
@@ -67,6 +68,23 @@ def reconstruction_routes(reconstructions: Reconstructions, route_class: type[AP
         """State and progress of a reconstruction."""
         return ReconstructionOut.of(rows.get(reconstruction_id))
 
+    @router.patch("/{reconstruction_id:id}", responses=problems(404, 409, 507))
+    def change_reconstruction(reconstruction_id: str, body: ReconstructionChange) -> ReconstructionOut:
+        """Change its name or notes, hold it in the queue, or move it there."""
+        row = rows.change(
+            reconstruction_id, name=body.name, notes=body.notes, held=body.held, queue_place=body.queue_place
+        )
+        reconstructions.wake_queue()
+        return ReconstructionOut.of(row)
+
+    _add_end_routes(router, reconstructions)
+    return router
+
+
+def _add_end_routes(router: APIRouter, reconstructions: Reconstructions) -> None:
+    """Routes that cancel, restart and remove a reconstruction."""
+    rows = reconstructions.rows
+
     @router.post("/{reconstruction_id:id}:cancel", status_code=HTTPStatus.ACCEPTED, responses=problems(404, 409))
     def cancel_reconstruction(reconstruction_id: str, idempotency_key: IdempotencyKey = None) -> ReconstructionOut:
         """End it; published versions are kept."""
@@ -85,8 +103,6 @@ def reconstruction_routes(reconstructions: Reconstructions, route_class: type[AP
     def remove_reconstruction(reconstruction_id: str) -> None:
         """Delete it with its published versions."""
         reconstructions.remove(reconstruction_id)
-
-    return router
 
 
 def accepted(row: ReconstructionRow, request: Request, response: Response) -> ReconstructionOut:

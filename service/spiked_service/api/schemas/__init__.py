@@ -13,6 +13,7 @@ from spiked_service.api.schemas.captures import (
     VerdictOut,
 )
 from spiked_service.api.schemas.reconstructions import (
+    ReconstructionChange,
     ReconstructionOut,
     ReconstructionRequest,
     RestartRequest,
@@ -36,6 +37,7 @@ __all__ = [
     "IntrinsicsModel",
     "PageOut",
     "PathModel",
+    "ReconstructionChange",
     "ReconstructionOut",
     "ReconstructionRequest",
     "RestartRequest",

@@ -3,7 +3,7 @@
 from datetime import datetime
 from typing import Annotated
 
-from pydantic import Field, StrictInt
+from pydantic import Field, StrictBool, StrictInt
 
 from spiked.recon import State
 from spiked_service.api.schemas.base import (
@@ -12,6 +12,8 @@ from spiked_service.api.schemas.base import (
     Id,
     In,
     IntrinsicsModel,
+    Name,
+    Notes,
     Out,
     PageOut,
     example,
@@ -84,6 +86,23 @@ class RestartRequest(In):
     options: ReconstructionOptions | None = None
 
 
+class ReconstructionChange(In):
+    """What can be changed of a reconstruction; fields that are not given stay."""
+
+    model_config = example(name="2,000 steps", notes="sharper than the first")
+
+    name: Name | None = None
+    notes: Notes | None = None
+    held: StrictBool | None = Field(None, description="Whether it stays in the queue; only while it waits there.")
+    queue_place: StrictInt | None = Field(
+        None,
+        ge=1,
+        le=LARGEST_INTEGER,
+        description="Its new place in the queue, 1 is the next; beyond the end: the last. Only while it waits there. "
+        "It takes the priority of that place.",
+    )
+
+
 class MapRefOut(Out):
     """A version of a reconstruction that is used as a map."""
 
@@ -102,6 +121,8 @@ class ReconstructionOut(Out):
     """A job: a reconstruction, live from a capture or from its recording, an extended or merged map, a localisation."""
 
     id: Id
+    name: str
+    notes: str
     capture_id: str = Field(description="The capture that its trajectory belongs to; of a merge that of the first map.")
     task: Task = Field(description="A localisation has the scene of the map, and the path of the recording in it.")
     maps: list[MapRefOut] = Field(description="What it uses; the result is in the frame of reference of the first.")
@@ -130,6 +151,7 @@ class ReconstructionOut(Out):
     version: int = Field(description="Number of the newest published scene and trajectory; 0: none yet.")
     white: float | None = Field(description="Radiance shown as white in that version, spikes a frame.")
     queue_place: int | None = Field(description="1 is the next to begin; null unless it waits in the queue.")
+    held: bool = Field(description="Whether it stays in the queue until it is let go.")
     eta_s: float | None = Field(
         description="Seconds to its end, those before its turn included; null where that is not known."
     )

@@ -25,6 +25,7 @@ import { Plots } from "./Plots";
 import { ReconstructionsPanel, RerunPanel } from "./ReconstructionsPanel";
 import { RecordingPanel } from "./RecordingPanel";
 import { removeWithUndo } from "./remove";
+import { ReconstructionTexts } from "./ReconstructionTexts";
 import { LogPanel, OptionsPanel, ResultPanel } from "./ResultPanel";
 
 export function CaptureDetail({ id }: { id: string }): JSX.Element {
@@ -117,6 +118,7 @@ function Detail({ capture }: { capture: Capture }): JSX.Element {
         <div>
           <RecordingPanel capture={capture} />
           <Notes key={capture.id} capture={capture} />
+          {job !== null && <ReconstructionTexts key={job.id} job={job} number={nameOfJob(job)} />}
           {job !== null && <ResultPanel job={job} other={other} nameOf={nameOfJob} />}
           {job !== null && <OptionsPanel job={job} />}
         </div>

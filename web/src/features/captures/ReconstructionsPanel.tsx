@@ -133,8 +133,14 @@ function Row({
         />
       </td>
       <td>
-        {name} {when(job.created_at)} {job.live && <span className="dim">live</span>}
+        {name} {job.name !== "" && <b>{job.name}</b>} {when(job.created_at)}{" "}
+        {job.live && <span className="dim">live</span>}
         {job.task !== "reconstruct" && <span className="dim">{TASKS[job.task]}</span>}
+        {job.notes !== "" && (
+          <span className="dim notes" title={job.notes}>
+            {job.notes}
+          </span>
+        )}
       </td>
       <td>
         {job.state === "running" ? (

@@ -3,7 +3,7 @@
 import type { JSX } from "react";
 
 import * as calls from "../../shared/api/calls";
-import type { Reconstruction } from "../../shared/api/types";
+import type { Reconstruction, ReconstructionChange } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
 import { nameOf, progressText } from "../../shared/state/capture";
 import { activeJobs, storeReconstruction, useService } from "../../shared/state/store";
@@ -30,21 +30,55 @@ export function Queue({ shown }: { shown: string | null }): JSX.Element | null {
 
 function Turn({ job }: { job: Reconstruction }): JSX.Element {
   const capture = useService((state) => state.captures[job.capture_id] ?? null);
+  const name = job.name !== "" ? job.name : capture === null ? "an older capture" : nameOf(capture);
+  const change = async (body: ReconstructionChange): Promise<boolean> =>
+    attempt(async () => storeReconstruction(await calls.changeReconstruction(job.id, body)));
+  const place = job.queue_place;
   return (
     <li>
-      <PageLink to={{ page: "captures", capture: job.capture_id, reconstruction: job.id }}>
-        {capture === null ? "an older capture" : nameOf(capture)}
-      </PageLink>
+      <PageLink to={{ page: "captures", capture: job.capture_id, reconstruction: job.id }}>{name}</PageLink>
       <JobBadge job={job} />
       <span className="dim">{progressText(job)}</span>
-      <ActionButton
-        className="bare"
-        aria-label={`Cancel the reconstruction of ${capture === null ? "an older capture" : nameOf(capture)}`}
-        title="Cancel"
-        onClick={() => void attempt(async () => storeReconstruction(await calls.cancel(job.id)))}
-      >
-        <Icon name="close" />
-      </ActionButton>
+      <span className="buttons">
+        {place !== null && (
+          <>
+            <ActionButton
+              className="bare"
+              aria-label={`${job.held ? "Let go of" : "Hold"} the reconstruction of ${name}`}
+              aria-pressed={job.held}
+              title={job.held ? "Let go: it begins in its turn" : "Hold: it stays in the queue"}
+              onClick={() => void change({ held: !job.held })}
+            >
+              <Icon name={job.held ? "start" : "pause"} />
+            </ActionButton>
+            <ActionButton
+              className="bare"
+              aria-label={`Earlier: the reconstruction of ${name}`}
+              title="Earlier"
+              disabled={place === 1}
+              onClick={() => void change({ queue_place: place - 1 })}
+            >
+              <Icon name="up" />
+            </ActionButton>
+            <ActionButton
+              className="bare"
+              aria-label={`Later: the reconstruction of ${name}`}
+              title="Later"
+              onClick={() => void change({ queue_place: place + 1 })}
+            >
+              <Icon name="down" />
+            </ActionButton>
+          </>
+        )}
+        <ActionButton
+          className="bare"
+          aria-label={`Cancel the reconstruction of ${name}`}
+          title="Cancel"
+          onClick={() => void attempt(async () => storeReconstruction(await calls.cancel(job.id)))}
+        >
+          <Icon name="close" />
+        </ActionButton>
+      </span>
     </li>
   );
 }

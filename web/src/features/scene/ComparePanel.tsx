@@ -5,8 +5,8 @@ import { type JSX, useEffect, useState } from "react";
 import * as calls from "../../shared/api/calls";
 import type { Capture, Reconstruction, Version } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
-import { nameOf } from "../../shared/state/capture";
-import { count, decibel, small, when } from "../../shared/state/format";
+import { calledOf, nameOf } from "../../shared/state/capture";
+import { count, decibel, small } from "../../shared/state/format";
 import { adjust } from "../../shared/state/route";
 import { storeReconstruction, useService } from "../../shared/state/store";
 import { Segmented } from "../../shared/ui/parts";
@@ -90,7 +90,7 @@ function Choice({
   const ofOther = useVersions(other?.id === job.id ? null : other);
   const nameOfFar = (one: Reconstruction): string => {
     const from = captures[one.capture_id];
-    return `${from === undefined ? "an older capture" : nameOf(from)}, ${when(one.created_at)}`;
+    return `${from === undefined ? "an older capture" : nameOf(from)}, ${calledOf(one)}`;
   };
   const value = comparison === null ? "" : `${comparison.job?.id ?? ""}.${comparison.version ?? ""}`;
   return (
@@ -116,7 +116,7 @@ function Choice({
                 </option>
               ))}
           </optgroup>
-          <Reconstructions label="Of this capture" jobs={same} nameOf={(one) => when(one.created_at)} />
+          <Reconstructions label="Of this capture" jobs={same} nameOf={calledOf} />
           <Reconstructions label="Of other captures" jobs={far} nameOf={nameOfFar} />
           {other !== null && other.id !== job.id && (
             <optgroup label="Versions of the other reconstruction">

@@ -4,8 +4,8 @@ import { type JSX, useCallback, useEffect, useRef, useState } from "react";
 
 import { capture as askCapture } from "../../shared/api/calls";
 import type { Capture, Reconstruction, Version } from "../../shared/api/types";
-import { nameOf } from "../../shared/state/capture";
-import { count, when } from "../../shared/state/format";
+import { calledOf, nameOf } from "../../shared/state/capture";
+import { count } from "../../shared/state/format";
 import { adjust, go, route, useRoute } from "../../shared/state/route";
 import {
   isEnded,
@@ -286,7 +286,7 @@ function namesOf(job: Reconstruction, pinned: Version | null, compared: Compared
   const second = version(compared.job, compared.version);
   if (compared.job === null || compared.job.id === job.id) return { first, second };
   return {
-    first: `of ${when(job.created_at)}, ${first}`,
-    second: `of ${when(compared.job.created_at)}, ${second}`,
+    first: `${calledOf(job)}, ${first}`,
+    second: `${calledOf(compared.job)}, ${second}`,
   };
 }

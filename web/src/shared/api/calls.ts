@@ -17,6 +17,7 @@ import type {
   PreviewKind,
   Profile,
   Reconstruction,
+  ReconstructionChange,
   RevertRequest,
   Scale,
   ScaleRequest,
@@ -159,6 +160,14 @@ export const merge = (first: string, other: string): Promise<Reconstruction> =>
     client.POST("/api/v1/reconstructions/{reconstruction_id}:merge", {
       body: { other },
       params: { path: { reconstruction_id: first }, header: idempotent() },
+    }),
+  );
+/** Change its name or notes, or hold or move it in the queue. */
+export const changeReconstruction = (id: string, body: ReconstructionChange): Promise<Reconstruction> =>
+  answered(
+    client.PATCH("/api/v1/reconstructions/{reconstruction_id}", {
+      body,
+      params: { path: { reconstruction_id: id } },
     }),
   );
 export const removeReconstruction = (id: string): Promise<unknown> =>

@@ -621,7 +621,13 @@ export interface paths {
         delete: operations["remove_reconstruction_api_v1_reconstructions__reconstruction_id__delete"];
         options?: never;
         head?: never;
-        patch?: never;
+        /**
+         * Change Reconstruction
+         * @description Change its name or notes, hold it in the queue, or move it there.
+         *
+         *     Scope of a token: `operate`.
+         */
+        patch: operations["change_reconstruction_api_v1_reconstructions__reconstruction_id__patch"];
         trace?: never;
     };
     "/api/v1/reconstructions/{reconstruction_id}:cancel": {
@@ -3169,6 +3175,30 @@ export interface components {
             counts: number[];
         };
         /**
+         * ReconstructionChange
+         * @description What can be changed of a reconstruction; fields that are not given stay.
+         * @example {
+         *       "name": "2,000 steps",
+         *       "notes": "sharper than the first"
+         *     }
+         */
+        ReconstructionChange: {
+            /** Name */
+            name?: string | null;
+            /** Notes */
+            notes?: string | null;
+            /**
+             * Held
+             * @description Whether it stays in the queue; only while it waits there.
+             */
+            held?: boolean | null;
+            /**
+             * Queue Place
+             * @description Its new place in the queue, 1 is the next; beyond the end: the last. Only while it waits there. It takes the priority of that place.
+             */
+            queue_place?: number | null;
+        };
+        /**
          * ReconstructionOptions
          * @description A reconstruction's options; the defaults suit a hand-held camera.
          * @example {
@@ -3242,6 +3272,10 @@ export interface components {
              * @example 01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10
              */
             id: string;
+            /** Name */
+            name: string;
+            /** Notes */
+            notes: string;
             /**
              * Capture Id
              * @description The capture that its trajectory belongs to; of a merge that of the first map.
@@ -3327,6 +3361,11 @@ export interface components {
              * @description 1 is the next to begin; null unless it waits in the queue.
              */
             queue_place: number | null;
+            /**
+             * Held
+             * @description Whether it stays in the queue until it is let go.
+             */
+            held: boolean;
             /**
              * Eta S
              * @description Seconds to its end, those before its turn included; null where that is not known.
@@ -7872,6 +7911,122 @@ export interface operations {
             };
             /** @description The service is overloaded, or stops. */
             503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    change_reconstruction_api_v1_reconstructions__reconstruction_id__patch: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["ReconstructionChange"];
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["ReconstructionOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It conflicts with the current state. */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
                 headers: {
                     [name: string]: unknown;
                 };

@@ -1,13 +1,16 @@
 /** Texts for captures and jobs. */
 
 import type { Capture, Reconstruction } from "../api/types";
-import { count, duration, percent } from "./format";
+import { count, duration, percent, when } from "./format";
 
 /** The source without folders and options, which are in the tooltip. */
 export const sourceOf = (capture: Capture): string =>
   capture.origin === "upload" ? "uploaded" : capture.source.replace(/\?.*$/, "").replace(/^(\w+:).*\//, "$1");
 
 export const nameOf = (capture: Capture): string => (capture.name === "" ? sourceOf(capture) : capture.name);
+
+/** The name of a reconstruction, else when it was begun. */
+export const calledOf = (job: Reconstruction): string => (job.name === "" ? `of ${when(job.created_at)}` : job.name);
 
 export function lengthOf(capture: Capture): string {
   const frames = capture.recording?.frames ?? capture.counters?.next_frame ?? capture.frames_planned;
@@ -18,6 +21,7 @@ export function lengthOf(capture: Capture): string {
 /** Progress, or place in the queue; empty for ended reconstructions. */
 export function progressText(job: Reconstruction): string {
   const left = job.eta_s === null ? "" : `, about ${duration(job.eta_s)} left`;
+  if (job.state === "queued" && job.held) return "held: others go before it until it is let go";
   if (job.state === "queued")
     return `${job.queue_place === null ? "waiting" : `place ${job.queue_place} in the queue`}${left}`;
   if (job.state !== "running") return "";

@@ -1,0 +1,62 @@
+"""The queue on the Live page, and names of reconstructions."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from browsing import PHONE, finished, keep, until, violations
+
+SOURCE = "sim:?width=160&height=100&pace=0"
+
+
+def test_queued_ones_are_moved_held_named_and_cancelled(
+    daemon: Callable[..., Any], visit: Callable[..., Any], pictures_folder: Path
+) -> None:
+    one = daemon("--device", SOURCE, "--no-capture")
+    plan = {"source": SOURCE, "frames": 256, "name": "desk", "reconstruct": False}
+    capture = one.http.post("captures", json=plan).json()["id"]
+    assert finished(one.http, capture)["state"] == "complete"
+    job = {"capture_id": capture, "options": {"steps": 60_000}}
+    ids = [one.http.post("reconstructions", json=job).json()["id"] for _ in range(4)]
+    for which, number in zip(ids, ("first", "second", "third", "fourth"), strict=True):
+        one.http.patch(f"reconstructions/{which}", json={"name": number})
+    other = {"source": SOURCE, "frames": 64, "name": "another", "reconstruct": False}
+    one.http.post("captures", json=other)
+    page = visit(one.address)
+
+    def names() -> list[str]:
+        return page.locator("ol.queue a").all_inner_texts()
+
+    until(lambda: names() == ["first", "second", "third", "fourth"], "all are listed")
+    earlier = page.get_by_role("button", name="Earlier: the reconstruction of fourth")
+    earlier.focus()
+    page.keyboard.press("Enter")
+    until(lambda: names() == ["first", "second", "fourth", "third"], "it has moved up")
+    page.get_by_role("button", name="Later: the reconstruction of second").click()
+    until(lambda: names() == ["first", "fourth", "second", "third"], "it has moved down")
+    page.get_by_role("button", name="Hold the reconstruction of fourth").click()
+    page.get_by_text("held: others go before it").wait_for()
+    assert one.http.get(f"reconstructions/{ids[3]}").json()["held"]
+    assert violations(page) == []
+    page.locator("ol.queue").scroll_into_view_if_needed()
+    keep(page, pictures_folder / "queue-dark.webp")
+    page.get_by_role("button", name="Cancel the reconstruction of second").click()
+    page.get_by_role("button", name="Cancel the reconstruction of first").click()
+    until(lambda: one.http.get(f"reconstructions/{ids[2]}").json()["state"] == "running", "the third, not the held one")
+    page.get_by_role("button", name="Let go of the reconstruction of fourth").click()
+    until(lambda: not one.http.get(f"reconstructions/{ids[3]}").json()["held"], "let go")
+
+    page = visit(
+        f"{one.address}?page=captures&capture={capture}&reconstruction={ids[3]}", viewport=PHONE, theme="light"
+    )
+    page.get_by_label("Name of the reconstruction").fill("sharp")
+    page.get_by_label("Name of the reconstruction").press("Enter")
+    page.get_by_label("Notes on the reconstruction").fill("with 60,000 steps")
+    page.keyboard.press("Tab")
+    row = page.locator("table.jobs tr").filter(has_text="sharp")
+    row.get_by_text("with 60,000 steps").wait_for()
+    noted = one.http.get(f"reconstructions/{ids[3]}").json()
+    assert (noted["name"], noted["notes"]) == ("sharp", "with 60,000 steps")
+    assert violations(page) == []
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
+    keep(page, pictures_folder / "named-phone.webp")

@@ -24,7 +24,7 @@ from websockets.sync.client import connect
 from spiked.export.ros_bag import FILES, RosBag
 from spiked.export.ros_messages import RosMessages
 from spiked.export.timeline import CAMERA, WORLD
-from spiked.export.whole import whole_folder
+from spiked.whole_files import whole_folder
 
 Send = Callable[[str, int, Any], None]
 """Takes topic, time in ns and message."""

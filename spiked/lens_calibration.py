@@ -15,8 +15,9 @@ from spiked.board import Board
 from spiked.camera import Pinhole
 from spiked.distortion import Distortion, LensModel
 from spiked.errors import CalibrationError, ConfigurationError
+from spiked.rates import white_of
 from spiked.recon.frontend.windowing import luminance
-from spiked.recon.statistics import WHITE_PERCENTILE, evenly
+from spiked.recon.statistics import evenly
 from spiked.recording import Recording
 from spiked.sensor import Intrinsics, Sensor
 
@@ -136,8 +137,7 @@ def board_views(
 
 def _picture(rate: NDArray[np.float32], sensor: Sensor) -> NDArray[np.uint8]:
     grey = luminance(rate, sensor.mosaic)
-    white = max(float(np.percentile(grey, WHITE_PERCENTILE)), 1e-6)
-    return np.asarray(np.round(255 * np.sqrt(np.clip(grey / white, 0, 1))), np.uint8)
+    return np.asarray(np.round(255 * np.sqrt(np.clip(grey / white_of(grey), 0, 1))), np.uint8)
 
 
 def calibrate_lens(

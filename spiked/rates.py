@@ -5,15 +5,14 @@ from numpy.typing import NDArray
 
 from spiked.blocks import aligned_window
 from spiked.recon.frontend.demosaic import fill_mosaic
+from spiked.recon.statistics import WHITE_PERCENTILE
 from spiked.recording import Recording
 from spiked.sensor import Image
 
-__all__ = ["levels", "rate_at"]
+__all__ = ["levels", "rate_at", "white_of"]
 
 EDGE_FRAMES = 64
 """Frames on both sides that are searched for the spikes nearest to the edges."""
-WHITE_PERCENTILE = 99.5
-"""Percentile of the first picture of several that becomes 255 in all of them."""
 
 
 def rate_at(recording: Recording, time_s: float, frames: int, first_frame: int = 0) -> Image | None:
@@ -35,6 +34,11 @@ def rate_at(recording: Recording, time_s: float, frames: int, first_frame: int =
             channels = sensor.mosaic.channels(sensor.height, sensor.width) if sensor.mosaic else None
             return fill_mosaic(window.rate(fill=True), channels)
     return None
+
+
+def white_of(image: NDArray[np.float32]) -> float:
+    """The value of [H, W] or [H, W, C] that is shown as white: `WHITE_PERCENTILE` of them, above 0."""
+    return max(float(np.percentile(image, WHITE_PERCENTILE)), 1e-6)
 
 
 def levels(image: NDArray[np.float32], white: float) -> NDArray[np.uint8]:

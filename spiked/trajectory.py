@@ -29,6 +29,11 @@ class Trajectory:
     rotations: Array
     centres: Array
 
+    @classmethod
+    def empty(cls) -> "Trajectory":
+        """Without poses."""
+        return cls(np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+
     def __len__(self) -> int:
         return len(self.times_s)
 

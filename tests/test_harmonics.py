@@ -22,7 +22,7 @@ from spiked.trajectory import Trajectory
 from .test_spz import random_scene
 
 DEGREES = (1, 2, 3)
-NO_PATH = Trajectory(np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+NO_PATH = Trajectory.empty()
 
 
 def shiny(degree: int, count: int = 500, channels: int = 3) -> Scene:

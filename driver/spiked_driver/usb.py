@@ -3,7 +3,6 @@
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +107,7 @@ class UsbSource:
         if isinstance(item, Gap):
             return self._gaps.attributed(item)
         self._connection.frame_delivered()
-        return replace(item, seen_ns=self._seen_ns)
+        return Chunk(item.first, item.frames, self._seen_ns)
 
     def _receive(self, connection: UsbConnection) -> bool:
         """Feed the next bytes to the framing; false when the caller should get control back."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from spiked.blocks import Window, aligned_window
 from spiked.errors import ConfigurationError
+from spiked.rates import white_of
 from spiked.recording import Recording
 from spiked.sensor import Image, Intrinsics, Sensor
 
@@ -24,9 +25,6 @@ LEAST_PICTURES = 35
 PICTURES = 60
 """Pictures of a recording unless their number is chosen; if it is short, windows overlap by up to half: on 1,280 frames
 COLMAP's error is a quarter smaller than with 40 pictures (decision 34)."""
-WHITE_PERCENTILE = 99.5
-"""Percentile of the first picture that becomes 255. Values are linear: a tone curve raises the noise in the shadows,
-and COLMAP then finds a wrong path (decision 34)."""
 
 
 class ImageKind(StrEnum):
@@ -100,7 +98,8 @@ def spike_pictures(recording: Recording, options: PictureOptions) -> Iterator[Sp
         low, high = max(0, begin - SEARCH_FRAMES), min(recording.frames, end + SEARCH_FRAMES)
         frames = recording.read(low, high - low)
         rate = _binned(_rate(frames, recording.sensor, options.kind, (low, begin, end)), bin_pixels(recording.sensor))
-        white = white or max(float(np.percentile(rate, WHITE_PERCENTILE)), 1e-6)
+        white = white or white_of(rate)
+        # Linear: a tone curve raises the noise in the shadows, and COLMAP then finds a wrong path (decision 34).
         yield SpikePicture(0.5 * (begin + end), np.rint(255 * np.clip(rate / white, 0, 1)).astype(np.uint8))
 
 

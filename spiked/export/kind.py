@@ -8,7 +8,7 @@ from types import ModuleType
 
 from spiked.errors import ConfigurationError
 from spiked.export.source import ExportOptions, ExportSource
-from spiked.export.whole import whole_file, whole_folder
+from spiked.whole_files import whole_file, whole_folder
 
 __all__ = ["ExportKind"]
 

@@ -21,7 +21,7 @@ from spiked.export.timeline import (
     camera_message,
     read_timeline,
 )
-from spiked.export.whole import KeptErrors
+from spiked.whole_files import KeptErrors
 
 __all__ = ["KIND"]
 

@@ -12,9 +12,9 @@ import numpy as np
 from spiked.export.kind import ExportKind, optional
 from spiked.export.source import ExportOptions, ExportSource, optics_of
 from spiked.export.timeline import Timeline, read_timeline
-from spiked.export.whole import KeptErrors
 from spiked.recording import Recording
 from spiked.scene import unit_quats
+from spiked.whole_files import KeptErrors
 
 __all__ = ["KIND"]
 

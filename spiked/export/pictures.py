@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from spiked.export.source import ExportOptions, ExportSource
 from spiked.export.views import RenderedView
-from spiked.rates import WHITE_PERCENTILE, levels, rate_at
+from spiked.rates import levels, rate_at, white_of
 from spiked.trajectory import Trajectory
 from spiked.undistortion import Undistortion
 
@@ -55,7 +55,7 @@ def key_pictures(
             continue
         rate = rate if lens is None else lens.straighten(rate)
         rate = rate[..., 0] if rate.shape[2] == 1 else rate
-        white = white or max(float(np.percentile(rate, WHITE_PERCENTILE)), 1e-6)
+        white = white or white_of(rate)
         yield KeyPicture(view, levels(rate, white), frames)
 
 

@@ -51,6 +51,11 @@ class ExportSource:
     unit: str = "scene"
     """Of lengths: `m` once it is in metres."""
 
+    @classmethod
+    def of_splats(cls, scene: Scene, name: str) -> "ExportSource":
+        """A scene without a path and a camera."""
+        return cls(Trajectory.empty(), None, scene, name=name)
+
     def in_frame(self, frame: FrameOfReference) -> "ExportSource":
         """The same in metres and upright axes."""
         scene = None if self.scene is None else frame.scene(self.scene)

@@ -4,23 +4,20 @@ from pathlib import Path
 
 from spiked.export.kind import ExportKind
 from spiked.export.source import ExportOptions, ExportSource
-from spiked.video import Mp4Writer, recorded_path, scene_pictures, smoothed_path, video_camera
+from spiked.video import Mp4Writer, calm_path, scene_pictures, video_camera
 
 __all__ = ["KIND"]
 
 PICTURES_A_SECOND = 30
 """Of the video."""
-LEAST_SMOOTHED = 4
-"""Poses that a path needs to be smoothed."""
 
 
 def write(source: ExportSource, file: Path, options: ExportOptions) -> str:
     """Write the file. Raises SceneError, ConfigurationError and OSError."""
     scene, path, camera = source.need_scene(), source.need_path(), video_camera(source.need_sensor())
-    shown = smoothed_path(path) if len(path) >= LEAST_SMOOTHED else recorded_path(path)
     count = max(1, round(options.seconds * PICTURES_A_SECOND))
     with Mp4Writer(file, PICTURES_A_SECOND) as video:
-        for picture in scene_pictures(scene, shown, camera, count, source.white):
+        for picture in scene_pictures(scene, calm_path(path), camera, count, source.white):
             video.write(picture)
     return f"{count} pictures of {camera.width} x {camera.height}, {options.seconds:g} s"
 

@@ -58,7 +58,7 @@ class Results:
 
     def _poses_at(self, frames: Array) -> Trajectory:
         if (path := self._refinement.path) is None:
-            return Trajectory(np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+            return Trajectory.empty()
         rotations, centres = path.poses(frames)
         return Trajectory(frames / self._rate_hz, rotations, centres * self._tracker.unit)
 

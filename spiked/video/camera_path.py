@@ -6,16 +6,19 @@ import numpy as np
 
 from spiked.errors import SceneError
 from spiked.pose import Array
+from spiked.recon.statistics import evenly
 from spiked.spline import Path, Spline, Waypoints
 from spiked.trajectory import Trajectory
 
-__all__ = ["CameraPath", "recorded_path", "smoothed_path", "waypoint_path"]
+__all__ = ["CameraPath", "calm_path", "recorded_path", "smoothed_path", "waypoint_path"]
 
 SPANS_A_SECOND = 4.0
 """Of the spline of a smoothed path: a hand turns within a quarter of a second, and trembles at 8 to 12 Hz."""
 LEAST_SPANS, MOST_SPANS = 4, 400
 """Fewest and most spans of a smoothed path."""
 
+LEAST_SMOOTHED = 4
+"""Poses that a path needs to be smoothed."""
 MOST_FITTED = 2000
 """Poses that a smoothed path is fitted to, at most, evenly chosen."""
 MOST_WAYPOINTS = 500
@@ -42,16 +45,21 @@ def recorded_path(recorded: Trajectory) -> CameraPath:
     return CameraPath(Waypoints(times, recorded.rotations, recorded.centres), float(times[-1]))
 
 
+def calm_path(recorded: Trajectory) -> CameraPath:
+    """Smoothed, or as recorded if that has too few poses. Raises SceneError without poses."""
+    return smoothed_path(recorded) if len(recorded) >= LEAST_SMOOTHED else recorded_path(recorded)
+
+
 def smoothed_path(recorded: Trajectory) -> CameraPath:
     """The nearest cubic spline of `SPANS_A_SECOND`: without what is faster, such as tremor.
 
     Raises SceneError with fewer than four poses, or without a time between them.
     """
-    _need(recorded, 4)
+    _need(recorded, LEAST_SMOOTHED)
     times = recorded.times_s - recorded.times_s[0]
     if times[-1] <= 0:
         raise SceneError("a path whose poses are all of one time cannot be smoothed")
-    some = np.unique(np.linspace(0, len(recorded) - 1, MOST_FITTED).astype(int))
+    some = evenly(len(recorded), MOST_FITTED)
     spans = min(np.clip(round(SPANS_A_SECOND * times[-1]), LEAST_SPANS, MOST_SPANS), len(some) - 3)
     ticks = times[some] * (spans / times[-1])
     return CameraPath(Spline.fit(ticks, recorded.rotations[some], recorded.centres[some], 1.0), float(ticks[-1]))

@@ -1,7 +1,7 @@
 """An MP4 file of H.264, which browsers and players show."""
 
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from fractions import Fraction
 from importlib import import_module
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.errors import ConfigurationError, SceneError
+from spiked.whole_files import whole_file
 
 __all__ = ["Mp4Writer"]
 
@@ -44,7 +45,7 @@ class Mp4Writer:
         except ImportError as error:
             raise ConfigurationError("a video needs the Python package av: pip install 'spiked[video]'") from error
         self._path = path
-        self._part = path.with_name(f".{path.name}.part")
+        self._whole = ExitStack()
         self._rate = Fraction(pictures_a_second).limit_denominator(1000)
         self._quality = quality
         self._file: Any = None
@@ -80,7 +81,9 @@ class Mp4Writer:
         if not 2 <= width <= LARGEST_PX or not 2 <= height <= LARGEST_PX:
             raise SceneError(f"a video has sides of 2 to {LARGEST_PX} pixels, not {width} x {height}")
         options = {"movflags": "+faststart"}  # a browser shows it before it has all
-        self._file = self._checked(lambda: self._av.open(str(self._part), "w", format="mp4", options=options))
+        part = self._whole.enter_context(whole_file(self._path))
+        self._file = self._checked(lambda: self._av.open(str(part), "w", format="mp4", options=options))
+        self._whole.push(self._end)
         codec = "libx264" if "libx264" in self._av.codecs_available else "h264"
         self._stream = self._file.add_stream(codec, rate=self._rate, options={"crf": str(self._quality)})
         self._stream.width, self._stream.height = width, height
@@ -96,22 +99,18 @@ class Mp4Writer:
                 raise OSError(error.errno, error.strerror, str(self._path)) from error
             raise SceneError(f"{self._path} cannot be encoded: {error}") from error
 
+    def _end(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Close the file; after an error it is given up, and what closing says of it no longer matters."""
+        if kind is not None:
+            with suppress(self._av.error.FFmpegError):
+                self._file.close()
+            return
+        try:
+            self._checked(lambda: self._file.mux(self._stream.encode(None)))
+        finally:
+            self._checked(self._file.close)
+
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        try:
-            if kind is None and self._stream is not None:
-                self._checked(lambda: self._file.mux(self._stream.encode(None)))
-                self._checked(self._file.close)
-                self._file = None
-                self._part.replace(self._path)
-        finally:
-            if self._file is not None:
-                self._abandon()
-            self._part.unlink(missing_ok=True)
-
-    def _abandon(self) -> None:
-        """Close a file that is given up; what closing says of it no longer matters."""
-        with suppress(self._av.error.FFmpegError):
-            self._file.close()
-        self._file = None
+        self._whole.__exit__(kind, error, trace)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.errors import ConfigurationError
-from spiked.rates import WHITE_PERCENTILE, levels, rate_at
+from spiked.rates import levels, rate_at, white_of
 from spiked.recording import Recording
 from spiked.sensor import Image
 
@@ -96,7 +96,7 @@ def slow_motion(recording: Recording, how: SlowMotion) -> Iterator[NDArray[np.ui
         if rate is None:
             yield None
             continue
-        white = white or max(float(np.percentile(rate, WHITE_PERCENTILE)), 1e-6)
+        white = white or white_of(rate)
         if how.compensated:
             rate = compensated(recording, float(time_s), how.window, rate, white)
         yield levels(rate[..., 0] if rate.shape[2] == 1 else rate, white)

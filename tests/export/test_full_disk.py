@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from spiked.errors import SceneError
 from spiked.export import KINDS, ExportKind, ExportOptions, ExportSource, find_kind
-from spiked.export.whole import KeptErrors, whole_file, whole_folder
+from spiked.whole_files import KeptErrors, whole_file, whole_folder
 
 from ..room_map import room_map
 from ..small_disk import fill, small_disk

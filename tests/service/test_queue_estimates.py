@@ -13,7 +13,7 @@ from spiked_service.daemon import open_data_store
 from spiked_service.events.bus import Bus, Message, Topic
 from spiked_service.reconstructions.queue_estimates import QueueEstimates
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
-from spiked_service.store.catalogue import Catalogue
+from spiked_service.store.catalogue import Catalogue, StoreError
 from spiked_service.store.rows import (
     CaptureRow,
     CaptureState,
@@ -141,3 +141,27 @@ def test_times_left_follow_from_those_that_run_and_those_that_are_over(tmp_path:
     first = estimates.queued([], 1)[0]
     assert first.eta_s is not None and 0 < first.eta_s < 10, "no step to take"
     catalogue.close()
+
+
+def test_an_edit_that_cannot_be_saved_changes_nothing(data_store: DataStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    catalogue = data_store.catalogue
+    capture = CaptureRow(
+        "01a20000-0000-7000-8000-000000000001", Origin.LIVE, Plan(CAMERA), CaptureState.COMPLETE, BEGAN
+    )
+    catalogue.captures.put(capture)
+    ids = [f"01a20000-0000-7000-8000-00000000001{n}" for n in range(2)]
+    for each in ids:
+        catalogue.reconstructions.put(ReconstructionRow(each, capture.id, False, JobState.QUEUED, BEGAN, held=True))
+    rows = data_store.reconstructions.rows
+
+    def full(_: ReconstructionRow) -> None:
+        raise StoreError("the disk is full")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(catalogue.reconstructions, "put", full)
+        for edit in ({"name": "a"}, {"held": False}, {"queue_place": 1}):
+            with pytest.raises(StoreError, match="disk is full"):
+                rows.change(ids[1], **edit)  # type: ignore[arg-type]
+    assert (rows.get(ids[1]).name, rows.get(ids[1]).held, rows.get(ids[1]).queue_place) == ("", True, 2)
+    assert rows.change(ids[1], name="b", queue_place=1).name == "b"
+    assert [rows.get(each).queue_place for each in ids] == [2, 1]

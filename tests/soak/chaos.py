@@ -11,8 +11,8 @@ import sqlite3
 import struct
 import subprocess
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -61,21 +61,6 @@ class Clock:
     def jump_to(self, offset_s: int) -> None:
         """From now on it is wrong by so much."""
         self._memory[:] = struct.pack("q", offset_s)
-
-
-@contextmanager
-def small_disk(folder: Path, size_mib: int) -> Iterator[None]:
-    """A disk of its own below a folder. Skips the test where that is not permitted."""
-    folder.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"size={size_mib}m", "tmpfs", str(folder)], capture_output=True, check=False
-    )
-    if mounted.returncode:
-        pytest.skip(f"may not mount: {mounted.stderr.decode().strip()}")
-    try:
-        yield
-    finally:
-        subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
 class Victim:

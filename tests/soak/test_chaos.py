@@ -13,7 +13,9 @@ from typing import Any
 import pytest
 
 sys.path.append(str(Path(__file__).parent))
-from chaos import OVER, Clock, Victim, fill, small_disk, wait_for
+from chaos import OVER, Clock, Victim, fill, wait_for
+
+from ..small_disk import small_disk
 
 FIRST_SEED = int(os.environ.get("CHAOS_SEED", "0"))
 ACTIONS = [

@@ -1,6 +1,5 @@
 """MP4 files, read back by PyAV: what was written, and nothing after an error."""
 
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +9,8 @@ import pytest
 
 from spiked.errors import ConfigurationError, SceneError
 from spiked.video import Mp4Writer
+
+from ..small_disk import small_disk
 
 
 def read(path: Path) -> tuple[list[np.ndarray], float]:
@@ -88,23 +89,18 @@ def test_a_size_that_no_video_has_is_refused(shape: tuple[int, int], tmp_path: P
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
+def full_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 1 MiB."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=1m", "spiked-test", str(place)]
-    if subprocess.run(command, capture_output=True, check=False).returncode:
-        pytest.skip("mounting a small file system is not permitted here")
-    yield place
-    subprocess.run(["umount", "--lazy", str(place)], check=True)
+    with small_disk(tmp_path / "disk", 1) as place:
+        yield place
 
 
-def test_a_full_disk_is_told_and_leaves_the_earlier_file(small_disk: Path) -> None:
-    place = small_disk / "a.mp4"
+def test_a_full_disk_is_told_and_leaves_the_earlier_file(full_disk: Path) -> None:
+    place = full_disk / "a.mp4"
     place.write_bytes(b"earlier")
     noise = np.random.default_rng(0)
     with pytest.raises(OSError, match="No space left on device"), Mp4Writer(place, 30, quality=0) as file:
         for _ in range(60):
             file.write(noise.integers(0, 256, (256, 256, 3), np.uint8))
     assert place.read_bytes() == b"earlier"
-    assert list(small_disk.iterdir()) == [place]
+    assert list(full_disk.iterdir()) == [place]

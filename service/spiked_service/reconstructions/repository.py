@@ -190,8 +190,15 @@ class ReconstructionRepository:
                 raise BusyError(
                     f"reconstruction {row.id} is {row.state}: only those that wait in the queue can be held or moved"
                 )
-            self._texts[row.id] = (row.name if name is None else f"{name}", row.notes if notes is None else f"{notes}")
-            self.save(row if held is None else replace(row, held=bool(held)))
+            edited = replace(
+                row,
+                name=row.name if name is None else f"{name}",
+                notes=row.notes if notes is None else f"{notes}",
+                held=row.held if held is None else bool(held),
+            )
+            self._catalogue.reconstructions.put(replace(edited, queue_place=None))  # or nothing has changed
+            self._texts[row.id] = edited.name, edited.notes
+            self.save(edited)
             if isinstance(place, int):
                 self._move(row.id, place)
             return self.get(row.id)

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from spiked.errors import ConfigurationError
@@ -11,7 +10,6 @@ from spiked.export import KINDS, ExportKind, ExportOptions, ExportSource, find_k
 from spiked.export.source import KEY_VIEWS
 from spiked.scene import Scene
 from spiked.spz import decode
-from spiked.trajectory import Trajectory
 from spiked_service.cli import outputs
 from spiked_service.cli.console import output
 from spiked_service.results.report.folder import FolderReport
@@ -103,8 +101,7 @@ def _source(result: Path, recording: Path | None, metric: bool) -> ExportSource:
         if metric:
             raise ConfigurationError(f"--metric: {result} is a file, and no scale is known of it; name a folder")
         scene = decode(result.read_bytes()) if result.suffix == ".spz" else Scene.read_ply(result)
-        path = Trajectory(np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
-        return ExportSource(path, None, scene, name=result.name)
+        return ExportSource.of_splats(scene, result.name)
     source = FolderReport(result, recording).export_source()
     return source.in_frame(known_frame(result)) if metric else source
 

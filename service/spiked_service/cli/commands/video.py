@@ -18,10 +18,10 @@ from spiked.video import (
     CameraPath,
     Mp4Writer,
     SlowMotion,
+    calm_path,
     recorded_path,
     scene_pictures,
     slow_motion,
-    smoothed_path,
     video_camera,
     waypoint_path,
 )
@@ -100,17 +100,16 @@ def video_of_scene(
 def _source(result: Path) -> ExportSource:
     if result.is_dir():
         return FolderReport(result).export_source()
-    nothing = Trajectory(np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
-    return ExportSource(nothing, None, Scene.read_ply(result), name=result.name)
+    return ExportSource.of_splats(Scene.read_ply(result), result.name)
 
 
 def _path(named: str, source: ExportSource) -> CameraPath:
     match named:
         case "smooth" | "recorded" if not len(source.path):
             raise ConfigurationError(f"{source.name} has no path: name one with --path FILE.tum")
-        case "smooth" if len(source.path) >= 4:
-            return smoothed_path(source.path)
-        case "smooth" | "recorded":
+        case "smooth":
+            return calm_path(source.path)
+        case "recorded":
             return recorded_path(source.path)
     return waypoint_path(Trajectory.read_tum(Path(named)))
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from spiked.blocks import aligned_window
 from spiked.evaluate import best_gain
+from spiked.rates import white_of
 from spiked.recon.frontend.demosaic import fill_mosaic
 from spiked.recording import Recording
 from spiked.render import Camera, Rasteriser
@@ -25,8 +26,6 @@ SEARCH_FRAMES = 64
 """Frames on both sides that are searched for the spikes at its edges."""
 TIMES = (0.25, 0.75)
 """Of the observed pictures, as shares of the recording."""
-WHITE_PERCENTILE = 99.5
-"""Percentile of an observed picture that is shown as white."""
 WIDTH_PX = 480
 """Largest width of a picture in the page."""
 _QUALITY = 85
@@ -79,7 +78,7 @@ def rendered(recording: Recording, result: Path, frame: int) -> Image | None:
 
 def _observed_strip(recording: Recording, frame: int, cells: dict[str, Path]) -> Strip:
     seen = observed(recording, frame)
-    white = max(float(np.percentile(seen, WHITE_PERCENTILE)), 1e-6)
+    white = white_of(seen)
     pictures = {"observed": _webp(seen / white)}
     for name, folder in cells.items():
         image = rendered(recording, folder / RESULT, frame)

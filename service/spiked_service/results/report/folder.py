@@ -128,7 +128,7 @@ class FolderReport:
         except SceneError:
             if not file.exists() or any(not line.startswith("#") for line in file.read_text().splitlines()):
                 raise
-            return Trajectory(np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))  # none was found
+            return Trajectory.empty()  # none was found
 
     def _at(self) -> datetime:
         files = [file for file in (self._files / REPORT, self._files / LOCALISATION) if file.exists()]

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from spiked.errors import RecordingError
 from spiked.poses import PoseFile
 from spiked.recon.report import machine, versions
@@ -170,7 +168,7 @@ def _json(path: Path) -> dict[str, Any]:
 
 def _part(poses: PoseFile, rows: range) -> Trajectory:
     if not rows:
-        return Trajectory(np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+        return Trajectory.empty()
     return poses.trajectory(rows)
 
 

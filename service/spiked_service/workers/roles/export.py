@@ -8,11 +8,11 @@ from tempfile import TemporaryDirectory
 
 from spiked.errors import SceneError
 from spiked.export import ExportSource, find_kind
-from spiked.export.whole import FULL, whole_file
 from spiked.frame_of_reference import FrameOfReference
 from spiked.poses import PoseFile
 from spiked.recording import open_recording
 from spiked.scene import Scene
+from spiked.whole_files import FULL, whole_file
 from spiked_service.store.disk_space import DiskFullError
 from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.messages import ExportCommand

@@ -4,6 +4,7 @@ The volume is dense and cubic; only voxels near a surface point are computed.
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+import spiked.native._dense as _dense
 from spiked.errors import SceneError
 from spiked.export.kind import ExportKind, optional
 from spiked.export.source import ExportOptions, ExportSource
 from spiked.export.surface import SurfacePoints, fused
 from spiked.export.views import Doubles, Floats, RenderedView, rendered_views
+from spiked.render.cpu import usable_cores
 
 __all__ = ["GLB", "PLY", "Mesh", "mesh_of"]
 
@@ -29,6 +32,8 @@ BLOCK = 8
 """Voxels along an edge of the blocks that are computed or not."""
 LEAST_WEIGHT = 2
 """Views that have to see a voxel."""
+SHARE = 64
+"""Blocks that a thread takes at a time."""
 SMALLEST_PART = 1e-3
 """Triangles of a connected part over those of the whole mesh, at least."""
 
@@ -49,12 +54,16 @@ class Mesh:
 class _Volume:
     origin: Doubles
     step: float
-    shape: tuple[int, int, int]
-    voxels: NDArray[np.int64]
-    """Those near a surface, [m, 3]."""
+    blocks: tuple[int, int, int]
+    near: NDArray[np.bool_]
+    """Blocks near a surface, `blocks`."""
 
-    def positions(self) -> Doubles:
-        return np.asarray(self.origin + (self.voxels + 0.5) * self.step)
+    def dense(self, values: NDArray[Any], elsewhere: float | bool) -> NDArray[Any]:
+        """Values [n, BLOCK**3] of the blocks near a surface as a volume."""
+        whole = np.full((*self.blocks, BLOCK**3), elsewhere, values.dtype)
+        whole[self.near] = values
+        whole = whole.reshape(*self.blocks, BLOCK, BLOCK, BLOCK).transpose(0, 3, 1, 4, 2, 5)
+        return whole.reshape([side * BLOCK for side in self.blocks])
 
 
 def mesh_of(source: ExportSource, options: ExportOptions) -> Mesh:
@@ -63,11 +72,8 @@ def mesh_of(source: ExportSource, options: ExportOptions) -> Mesh:
     views = list(rendered_views(source, options))
     points = fused(source, views, options.resolution)
     volume = _volume(points, options.resolution)
-    distance, weight = _integrated(volume, views)
-    dense = np.ones(volume.shape, np.float32)
-    known = np.zeros(volume.shape, bool)
-    at = tuple(volume.voxels.T)
-    dense[at], known[at] = distance, weight >= LEAST_WEIGHT
+    distance, seen = _integrated(volume, views)
+    dense, known = volume.dense(distance, 1), volume.dense(seen >= LEAST_WEIGHT, False)
     try:
         vertices, faces, _, _ = measure.marching_cubes(dense, 0.0, mask=known)
     except (ValueError, RuntimeError) as error:
@@ -92,28 +98,35 @@ def _volume(points: SurfacePoints, resolution: int) -> _Volume:
     filled = np.zeros(tuple(blocks), bool)
     filled[tuple(np.floor((inside - low) / (step * BLOCK)).astype(int).T)] = True
     filled = binary_dilation(filled, np.ones((3, 3, 3), bool))
-    corners = np.argwhere(filled) * BLOCK
-    within = np.stack(np.meshgrid(*(np.arange(BLOCK),) * 3, indexing="ij"), -1).reshape(-1, 3)
-    shape = tuple(int(side) for side in blocks * BLOCK)
-    return _Volume(low, step, (shape[0], shape[1], shape[2]), (corners[:, None] + within).reshape(-1, 3))
+    return _Volume(low, step, (int(blocks[0]), int(blocks[1]), int(blocks[2])), filled)
 
 
 def _integrated(volume: _Volume, views: Sequence[RenderedView]) -> tuple[Floats, NDArray[np.int32]]:
-    """Mean distance over the truncation, positive in front of the surface, and the number of views, both [m]."""
-    positions = volume.positions()
-    total = np.zeros(len(positions), np.float32)
-    weight = np.zeros(len(positions), np.int32)
-    reach = TRUNCATION * volume.step
-    for view in views:
-        local = view.in_camera(positions)
-        rows = np.flatnonzero(local[:, 2] > 0)
-        depth = view.sampled_depth(view.camera.intrinsics.project(local[rows]))
-        signed = depth - local[rows, 2]
-        seen = (depth > 0) & (signed > -reach)
-        rows = rows[seen]
-        total[rows] += np.minimum(signed[seen] / reach, 1).astype(np.float32)
-        weight[rows] += 1
-    return np.where(weight > 0, total / np.maximum(weight, 1), 1).astype(np.float32), weight
+    """Mean distance over the truncation, positive in front of the surface, and the number of views, [n, BLOCK**3]."""
+    corners = volume.origin + np.argwhere(volume.near) * (BLOCK * volume.step)
+    total = np.zeros((len(corners), BLOCK**3), np.float32)
+    seen = np.zeros(total.shape, np.int32)
+
+    def add(rows: slice) -> None:
+        for view in views:
+            optics = view.camera.intrinsics
+            _dense.add_distances(
+                corners[rows],
+                volume.step,
+                BLOCK,
+                view.depth,
+                view.rotation,
+                view.centre,
+                np.array([optics.fx, optics.fy, optics.cx, optics.cy]),
+                None if optics.distortion is None else optics.distortion.arguments(),
+                TRUNCATION * volume.step,
+                total[rows],
+                seen[rows],
+            )
+
+    with ThreadPoolExecutor(usable_cores()) as threads:
+        list(threads.map(add, (slice(first, first + SHARE) for first in range(0, len(corners), SHARE))))
+    return np.where(seen > 0, total / np.maximum(seen, 1), 1).astype(np.float32), seen
 
 
 def _cleaned(vertices: Doubles, faces: NDArray[np.int64], points: SurfacePoints) -> Mesh:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from spiked_driver import FaultySource
 from spiked_driver.spec import open_source
-from spiked_service.cli.commands.fault_flags import with_faults
+from spiked_service.cli.fault_flags import with_faults
 
 from spiked.errors import ConfigurationError
 

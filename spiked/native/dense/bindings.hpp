@@ -6,5 +6,6 @@ namespace spiked {
 
 void bind_photometric(nanobind::module_& m);
 void bind_plane_sweep(nanobind::module_& m);
+void bind_signed_distance(nanobind::module_& m);
 
 }  // namespace spiked

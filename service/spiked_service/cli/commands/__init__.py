@@ -1,1 +1,1 @@
-"""The commands of `spiked`, one per file; `cli.main` registers them."""
+"""The commands of `spiked`, one per file; `cli.command_table` lists them."""

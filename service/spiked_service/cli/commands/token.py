@@ -7,14 +7,11 @@ from typing import Annotated
 import typer
 
 from spiked_service.cli.console import messages, output
-from spiked_service.settings.settings import MOST_DAYS, load_settings
+from spiked_service.cli.data_folder import Config, Data, data_folder
+from spiked_service.settings.settings import MOST_DAYS
 from spiked_service.settings.tokens import Scope, Tokens
-from spiked_service.store.folder import default_folder
 
 token = typer.Typer(help="Access tokens of the service.", no_args_is_help=True)
-
-_Data = Annotated[Path | None, typer.Option("--data", help="Data folder of the service.")]
-_Config = Annotated[Path | None, typer.Option("--config", help="TOML file, instead of the default files.")]
 
 
 @token.command()
@@ -29,8 +26,8 @@ def create(
             help="read: view and download. operate: also start, change and remove captures. admin: also settings."
         ),
     ] = Scope.ADMIN,
-    data: _Data = None,
-    config: _Config = None,
+    data: Data = None,
+    config: Config = None,
 ) -> None:
     """Create a token and print it. Only its hash is stored, so it cannot be printed again."""
     secret = _tokens(data, config).create(name, None if days is None else timedelta(days=days), scope)
@@ -39,7 +36,7 @@ def create(
 
 
 @token.command(name="list")
-def list_(data: _Data = None, config: _Config = None) -> None:
+def list_(data: Data = None, config: Config = None) -> None:
     """List the tokens: name, scope, creation and expiry. Secrets are not stored."""
     for one in _tokens(data, config).all():
         until = f"until {one.expires_at:%Y-%m-%d %H:%M}" if one.expires_at else "until revoked"
@@ -47,10 +44,10 @@ def list_(data: _Data = None, config: _Config = None) -> None:
 
 
 @token.command()
-def revoke(name: str, data: _Data = None, config: _Config = None) -> None:
+def revoke(name: str, data: Data = None, config: Config = None) -> None:
     """Revoke a token. A running service closes its streams within a second."""
     _tokens(data, config).revoke(name)
 
 
 def _tokens(data: Path | None, config: Path | None) -> Tokens:
-    return Tokens(load_settings({"data": data}, config).settings.data or default_folder())
+    return Tokens(data_folder(data, config))

@@ -1,0 +1,30 @@
+"""The table of commands: all there are, each loaded when it is asked for."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import spiked_service.cli.commands
+from spiked_service.cli.command_table import PANELS, LazyGroup
+from spiked_service.cli.main import app
+from typer.main import get_command
+
+
+def test_every_command_is_in_a_panel_and_is_called_as_its_module() -> None:
+    modules = {file.stem for file in Path(spiked_service.cli.commands.__path__[0]).glob("[a-z]*.py")}
+    names = [name for panel in PANELS.values() for name in panel]
+    assert sorted(names) == sorted(module.replace("_", "-") for module in modules)
+    group = get_command(app)
+    assert isinstance(group, LazyGroup)
+    assert [(command.name, command.help is not None) for command in group.commands.values()] == [
+        (name, True) for name in names
+    ]
+
+
+def test_a_command_loads_no_other() -> None:
+    """The libraries of all of them take seconds."""
+    code = "import sys\nfrom spiked_service.cli.main import main\ntry:\n    main()\nfinally:\n    print(*sys.modules)"
+    for words, lacks in ((["--version"], "numpy"), (["verify", "--help"], "fastapi"), (["none"], "numpy")):
+        done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
+        loaded = done.stdout.splitlines()[-1].split()
+        assert "typer" in loaded and lacks not in loaded

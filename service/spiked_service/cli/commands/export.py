@@ -1,5 +1,6 @@
 """`spiked export`: a result in the format of another program."""
 
+import inspect
 from pathlib import Path
 from typing import Annotated
 
@@ -16,31 +17,6 @@ from spiked_service.results.report.folder import FolderReport
 from spiked_service.results.scene_scale import known_frame
 
 _FORMATS = "\n\n".join(f"- `{kind.name}`: {kind.title}. For {kind.readers}." for kind in KINDS)
-_HELP = f"""Write a result in the format of another program.
-
-Pictures, depth maps and points are made at key views, evenly spaced along the path. Poses are camera to world with
-OpenCV's axes unless a format has its own; lengths are in the unit of the scene, or with --metric in metres.
-docs/exports.md says what each format loses and who reads it. A format whose package is not installed says how to
-get it.
-
-Formats:
-
-{_FORMATS}
-
-OUT may also be a file of splats, .ply or .spz, of this or another program: the formats of splats are made of it.
-
-Examples:
-
-- `spiked export out colmap -o project`
-
-- `spiked export out mesh-glb -o room.glb --resolution 384`
-
-- `spiked export out depth --views 200 --undistorted`
-
-- `spiked export garden.ply spz -o garden.spz`
-
-- `spiked scale out --length 3.0 1.42 && spiked export out mesh-glb --metric`
-"""
 
 
 def _kind(name: str) -> ExportKind:
@@ -50,7 +26,7 @@ def _kind(name: str) -> ExportKind:
         raise typer.BadParameter(str(error)) from error
 
 
-def _export(
+def export(
     result: Annotated[
         Path,
         typer.Argument(metavar="OUT", help="Output folder of `spiked reconstruct` or `merge`, or a file of splats."),
@@ -81,6 +57,31 @@ def _export(
         bool, typer.Option("--metric", help="In metres, with up along -y, by the scale of `spiked scale`.")
     ] = False,
 ) -> None:
+    """Write a result in the format of another program.
+
+    Pictures, depth maps and points are made at key views, evenly spaced along the path. Poses are camera to world with
+    OpenCV's axes unless a format has its own; lengths are in the unit of the scene, or with --metric in metres.
+    docs/exports.md says what each format loses and who reads it. A format whose package is not installed says how to
+    get it.
+
+    Formats:
+
+    (formats)
+
+    OUT may also be a file of splats, .ply or .spz, of this or another program: the formats of splats are made of it.
+
+    Examples:
+
+    - `spiked export out colmap -o project`
+
+    - `spiked export out mesh-glb -o room.glb --resolution 384`
+
+    - `spiked export out depth --views 200 --undistorted`
+
+    - `spiked export garden.ply spz -o garden.spz`
+
+    - `spiked scale out --length 3.0 1.42 && spiked export out mesh-glb --metric`
+    """
     kind.check()
     name = f"{kind.name}{'-metric' if metric else ''}{kind.suffix}"
     place = out or (result.with_name(f"{result.stem}-{name}") if result.is_file() else result / "export" / name)
@@ -95,6 +96,9 @@ def _export(
     output.print(f"{place}: {said}", markup=False)
 
 
+export.__doc__ = (inspect.getdoc(export) or "").replace("(formats)", _FORMATS)
+
+
 def _source(result: Path, recording: Path | None, metric: bool) -> ExportSource:
     """What is exported: a folder of results, or the splats of a file."""
     if result.is_file():
@@ -104,8 +108,3 @@ def _source(result: Path, recording: Path | None, metric: bool) -> ExportSource:
         return ExportSource.of_splats(scene, result.name)
     source = FolderReport(result, recording).export_source()
     return source.in_frame(known_frame(result)) if metric else source
-
-
-_export.__doc__ = _HELP
-_export.__name__ = "export"
-export = _export

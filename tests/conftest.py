@@ -34,8 +34,9 @@ class Daemon:
         seen: VirtualCameras | None = None,
         under: tuple[str, ...] = (),
     ) -> None:
+        self.data = folder / "data"
         command = [*under, sys.executable, "-m", "spiked_service", "serve", "--port", "0"]
-        command += ["--runtime", str(folder / "runtime"), "--data", str(folder / "data")]
+        command += ["--runtime", str(folder / "runtime"), "--data", str(self.data)]
         command += ["--set", f"source_folders={folder.parent}"]
         self.process = subprocess.Popen(
             [*command, *arguments], stdout=subprocess.PIPE, text=True, env=seen and seen.environment

@@ -191,6 +191,10 @@ class Spiked(MapMethods, ResultMethods):
         """Undo its removal."""
         return self._connection.post(f"captures/{capture_id}:restore", None, CaptureOut)
 
+    def purge_capture(self, capture_id: str) -> None:
+        """Delete a removed capture with its files for good, before retention does."""
+        self._connection.request("POST", f"captures/{capture_id}:purge")
+
     def wait_for_capture(self, capture_id: str, timeout_s: float = 600.0) -> CaptureOut:
         """The capture when it is over. Raises SpikedError if it is not in time."""
         over = (CaptureState.complete, CaptureState.failed)

@@ -128,6 +128,33 @@ def test_deleted_and_brought_back(studied: Studied, visit: Callable[..., Any]) -
     studied.http.delete(f"captures/{capture_id}")
 
 
+def test_deleted_ones_are_listed_restored_and_deleted_for_good(studied: Studied, visit: Callable[..., Any]) -> None:
+    plan = {"source": "sim:?width=64&height=48", "frames": 64, "reconstruct": False}
+    ids = []
+    for name in ("first waste", "second waste"):
+        ids.append(studied.http.post("captures", json=plan | {"name": name}).json()["id"])
+        until(lambda: studied.http.get(f"captures/{ids[-1]}").json()["state"] == "complete", "a capture more")
+        studied.http.delete(f"captures/{ids[-1]}")
+    page = visit(f"{studied.address}?page=captures")
+    page.get_by_label("Filter").select_option("deleted")
+    first, second = (page.get_by_role("row").filter(has_text=name) for name in ("first waste", "second waste"))
+    first.wait_for()
+    page.get_by_role("button", name="Restore first waste").click()
+    first.wait_for(state="detached")
+    assert studied.http.get(f"captures/{ids[0]}").json()["deleted_at"] is None
+    page.get_by_label("Select second waste").check()
+    bar = page.get_by_role("group", name="Selected captures")
+    bar.get_by_role("button", name="Delete for good").click()
+    bar.get_by_role("button", name="No").click()
+    bar.get_by_role("button", name="Delete for good").click()
+    bar.get_by_role("button", name="Yes, free the disk space").click()
+    second.wait_for(state="detached")
+    assert studied.http.get(f"captures/{ids[1]}").status_code == 404
+    page.get_by_label("Filter").select_option("")
+    first.wait_for()
+    studied.http.delete(f"captures/{ids[0]}")
+
+
 def test_set_up_tells_where_each_setting_comes_from(studied: Studied, visit: Callable[..., Any]) -> None:
     page = visit(f"{studied.address}?page=setup")
     row = page.locator(".configuration tr:has(th > code:text-is('port'))")

@@ -130,7 +130,7 @@ _WHAT_TO_DO: dict[int, str] = {
     422: "fix the field named in detail; see /openapi.json or /docs",
     429: "wait for the time in Retry-After",
     503: "repeat the request after the time in Retry-After",
-    507: "free disk space in the data folder, or remove captures",
+    507: "free disk space in the data folder, or remove and purge captures",
 }
 
 _MORE: dict[str, str] = {

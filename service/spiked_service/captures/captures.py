@@ -268,10 +268,8 @@ class Captures:
         return self._change(capture_id, **{key: value for key, value in edit.items() if value is not None})
 
     def remove(self, capture_id: str) -> Snapshot:
-        """Mark a capture as deleted, until `restore` or retention. Raises UnknownIdError, BusyError."""
-        snapshot = self.get(capture_id)
-        if not snapshot.row.state.over:
-            raise BusyError(f"capture {capture_id} is still {snapshot.row.state}: stop it first")
+        """Mark a capture as deleted, until `restore` or `purge`. Raises UnknownIdError, BusyError."""
+        snapshot = self._ended(capture_id)
         for row in snapshot.reconstructions:
             self._catalogue.freeing(self._reconstructions.cancel, row.id)
         at = snapshot.row.deleted_at or datetime.now(UTC)
@@ -282,15 +280,18 @@ class Captures:
         return self._change(capture_id, deleted_at=None)
 
     def purge(self, capture_id: str) -> None:
-        """Delete a capture with its files and reconstructions. Raises UnknownIdError, BusyError."""
+        """Delete a capture with its files and reconstructions, for good. Raises UnknownIdError, BusyError."""
+        for row in self._ended(capture_id).reconstructions:
+            self._catalogue.freeing(self._reconstructions.remove, row.id)
+        self._folder.remove(self._folder.capture(capture_id))
+        self._catalogue.freeing(self._catalogue.captures.remove, capture_id)
+        self._recent.drop_picture(capture_id)
+
+    def _ended(self, capture_id: str) -> Snapshot:
         snapshot = self.get(capture_id)
         if not snapshot.row.state.over:
             raise BusyError(f"capture {capture_id} is still {snapshot.row.state}: stop it first")
-        for row in snapshot.reconstructions:
-            self._reconstructions.remove(row.id)
-        self._folder.remove(self._folder.capture(capture_id))
-        self._catalogue.captures.remove(capture_id)
-        self._recent.drop_picture(capture_id)
+        return snapshot
 
     def processes(self) -> dict[str, dict[str, int]]:
         """Process ids of the running workers by capture and role, without reconstructions."""

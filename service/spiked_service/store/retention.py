@@ -86,7 +86,7 @@ class Retention:
             total -= used.get(row.id, 0)
 
     def _purge(self, row: CaptureRow, why: str) -> None:
-        self._catalogue.freeing(self._captures.purge, row.id)
+        self._captures.purge(row.id)
         self._log(f"capture {row.id} is gone: {why}")
 
     def _drop_uploads(self, now: datetime) -> None:

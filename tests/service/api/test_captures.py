@@ -144,6 +144,23 @@ def test_removal_can_be_undone(service: Any) -> None:
     assert capture.id in [one.id for one in service.client.captures(query="TO BE rem")]
 
 
+def test_what_is_removed_can_be_purged(service: Any) -> None:
+    capture = service.capture(reconstruct=False, name="to be purged")
+    folder = service.daemon.data / "captures" / capture.id
+    assert folder.is_dir()
+    refused = service.http.post(f"captures/{capture.id}:purge")
+    assert refused.status_code == 409 and "remove it first" in refused.json()["detail"]
+    service.client.remove_capture(capture.id)
+    service.client.purge_capture(capture.id)
+    assert not folder.exists()
+    for answer in (
+        service.http.get(f"captures/{capture.id}"),
+        service.http.post(f"captures/{capture.id}:restore"),
+        service.http.post(f"captures/{capture.id}:purge"),
+    ):
+        assert answer.status_code == 404
+
+
 def test_lists_come_in_pages(service: Any, done: CaptureOut) -> None:
     for _ in range(3):
         service.capture(reconstruct=False)

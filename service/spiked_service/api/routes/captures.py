@@ -11,6 +11,7 @@ from spiked_service.api.problems import problems
 from spiked_service.api.schemas.base import Cursor, Limit
 from spiked_service.api.schemas.captures import CaptureChange, CaptureOut, CapturePage, CaptureRequest
 from spiked_service.api.sources import Sources
+from spiked_service.base.errors import BusyError
 from spiked_service.captures.captures import Captures
 from spiked_service.store.rows import CaptureState, Plan
 
@@ -65,12 +66,19 @@ def capture_routes(captures: Captures, sources: Sources, route_class: type[APIRo
 
 
 def _add_end_routes(router: APIRouter, captures: Captures) -> None:
-    """Routes that stop, remove and restore a capture."""
+    """Routes that stop, remove, restore and purge a capture."""
 
     @router.delete("/{capture_id:id}", status_code=HTTPStatus.NO_CONTENT, responses=problems(404, 409))
     def remove_capture(capture_id: str) -> None:
-        """Remove it with its files and reconstructions; `:restore` undoes it for some days."""
+        """Remove it with its files and reconstructions; `:restore` undoes it for some days, `:purge` frees the disk."""
         captures.remove(capture_id)
+
+    @router.post("/{capture_id:id}:purge", status_code=HTTPStatus.NO_CONTENT, responses=problems(404, 409))
+    def purge_capture(capture_id: str, idempotency_key: IdempotencyKey = None) -> None:
+        """Delete a removed capture with its files for good, before retention does."""
+        if captures.get(capture_id).row.deleted_at is None:
+            raise BusyError(f"capture {capture_id} has not been removed: remove it first, then it can be purged")
+        captures.purge(capture_id)
 
     @router.post("/{capture_id:id}:restore", responses=problems(404, 409))
     def restore_capture(capture_id: str, idempotency_key: IdempotencyKey = None) -> CaptureOut:

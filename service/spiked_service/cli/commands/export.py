@@ -26,12 +26,15 @@ def _kind(name: str) -> ExportKind:
         raise typer.BadParameter(str(error)) from error
 
 
+_Kind = Annotated[ExportKind, typer.Argument(metavar="FORMAT", help="One of those above.", parser=_kind)]
+
+
 def export(
     result: Annotated[
         Path,
         typer.Argument(metavar="OUT", help="Output folder of `spiked reconstruct` or `merge`, or a file of splats."),
     ],
-    kind: Annotated[ExportKind, typer.Argument(metavar="FORMAT", help="One of those above.", parser=_kind)],
+    kind: _Kind,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="File or folder to write. Default: OUT/export/FORMAT with the usual ending."),
@@ -61,33 +64,24 @@ def export(
 
     Pictures, depth maps and points are made at key views, evenly spaced along the path. Poses are camera to world with
     OpenCV's axes unless a format has its own; lengths are in the unit of the scene, or with --metric in metres.
-    docs/exports.md says what each format loses and who reads it. A format whose package is not installed says how to
-    get it.
+    docs/exports.md says what each format loses. A format whose package is not installed says how to get it.
 
     Formats:
 
     (formats)
 
-    OUT may also be a file of splats, .ply or .spz, of this or another program: the formats of splats are made of it.
+    OUT may also be a file of splats, .ply or .spz, of any program: the formats of splats are made of it.
 
     Examples:
 
     - `spiked export out colmap -o project`
 
-    - `spiked export out mesh-glb -o room.glb --resolution 384`
-
-    - `spiked export out depth --views 200 --undistorted`
-
     - `spiked export garden.ply spz -o garden.spz`
 
-    - `spiked scale out --length 3.0 1.42 && spiked export out mesh-glb --metric`
+    - `spiked scale out --length 3.0 1.42 && spiked export out mesh-glb --metric --resolution 384`
     """
     kind.check()
-    name = f"{kind.name}{'-metric' if metric else ''}{kind.suffix}"
-    place = out or (result.with_name(f"{result.stem}-{name}") if result.is_file() else result / "export" / name)
-    if out is None and result.is_dir():
-        with outputs.writing("OUT", place.parent):
-            place.parent.mkdir(exist_ok=True)
+    place = out or _place(result, f"{kind.name}{'-metric' if metric else ''}{kind.suffix}")
     (outputs.try_folder if kind.folder else outputs.try_file)("--out", place)
     source = _source(result, recording, metric)
     options = ExportOptions(views, undistorted, "expected" if expected else "median", resolution, seconds)
@@ -97,6 +91,16 @@ def export(
 
 
 export.__doc__ = (inspect.getdoc(export) or "").replace("(formats)", _FORMATS)
+
+
+def _place(result: Path, name: str) -> Path:
+    """Where the export of a result is written by default: in a folder of results, or beside a file of splats."""
+    if result.is_file():
+        return result.with_name(f"{result.stem}-{name}")
+    if result.is_dir():
+        with outputs.writing("OUT", result / "export"):
+            (result / "export").mkdir(exist_ok=True)
+    return result / "export" / name
 
 
 def _source(result: Path, recording: Path | None, metric: bool) -> ExportSource:

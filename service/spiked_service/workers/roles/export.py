@@ -37,7 +37,7 @@ def run_export(command: ExportCommand, channel: WorkerChannel) -> None:
     except OSError as error:
         why = f"the export cannot be written: {error.strerror or error}"
         if error.errno in FULL:
-            raise DiskFullError(f"{why}; free disk space in the data folder, or remove captures") from error
+            raise DiskFullError(f"{why}; free disk space in the data folder, or remove and purge captures") from error
         raise SceneError(f"{why}; see the state of the disk of the data folder") from error
 
 

@@ -13,9 +13,9 @@ import { Icon } from "../../shared/ui/icons";
 import { PageLink } from "../../shared/ui/PageLink";
 import { CaptureBadge, Empty, ErrorMessage, JobBadge, JobReason, Loading } from "../../shared/ui/parts";
 import { Table } from "../../shared/ui/Table";
-import { filtered, type GradeFilter, type Order, sorted } from "./listing";
-import { ListControls, SelectionBar } from "./SelectionBar";
-import { removeWithUndo } from "./remove";
+import { filtered, type Filter, type Order, sorted } from "./listing";
+import { DeletedBar, ListControls, SelectionBar } from "./SelectionBar";
+import { removeWithUndo, restored } from "./remove";
 import { UploadPanel } from "./UploadPanel";
 
 const ROWS = 50;
@@ -35,6 +35,7 @@ const COLUMNS = [
 
 interface Listed {
   search: string;
+  deleted: boolean;
   items: Capture[];
   cursor: string | null;
 }
@@ -46,18 +47,19 @@ export function CapturesTable(): JSX.Element {
   const [round, setRound] = useState(0);
   const [uploads, setUploads] = useState(false);
   const [selected, setSelected] = useState<ReadonlySet<string>>(new Set());
-  const [grade, setGrade] = useState<GradeFilter>("");
+  const [filter, setFilter] = useState<Filter>("");
   const [order, setOrder] = useState<Order>("newest");
   const known = useService((state) => state.captures);
   const newest = Object.keys(known).sort().at(-1);
+  const deleted = filter === "deleted";
 
   useEffect(() => {
     let current = true;
     const timer = setTimeout(() => {
-      fetchCaptures({ limit: ROWS, q: search }).then(
+      fetchCaptures({ limit: ROWS, q: search, deleted }).then(
         (page) => {
           if (!current) return;
-          setListed({ search, items: page.items, cursor: page.next_cursor });
+          setListed({ search, deleted, items: page.items, cursor: page.next_cursor });
           setProblem(null);
         },
         (error: unknown) => current && setProblem(errorText(error)),
@@ -67,19 +69,25 @@ export function CapturesTable(): JSX.Element {
       current = false;
       clearTimeout(timer);
     };
-  }, [search, round, newest]);
+  }, [search, deleted, round, newest]);
 
   const more = async (): Promise<void> => {
     if (listed?.cursor == null) return;
     try {
-      const page = await fetchCaptures({ limit: ROWS, q: listed.search, cursor: listed.cursor });
+      const page = await fetchCaptures({
+        limit: ROWS,
+        q: listed.search,
+        deleted: listed.deleted,
+        cursor: listed.cursor,
+      });
       setListed({ ...listed, items: [...listed.items, ...page.items], cursor: page.next_cursor });
     } catch (error) {
       setProblem(errorText(error));
     }
   };
 
-  const shown = listed === null ? [] : sorted(filtered(listed.items, grade), order);
+  const Bar = deleted ? DeletedBar : SelectionBar;
+  const shown = listed === null ? [] : sorted(filtered(listed.items, filter), order);
   return (
     <div className="captures">
       <header className="head">
@@ -94,7 +102,15 @@ export function CapturesTable(): JSX.Element {
             onChange={(event) => adjust({ search: event.target.value })}
           />
         </label>
-        <ListControls grade={grade} onGrade={setGrade} order={order} onOrder={setOrder} />
+        <ListControls
+          filter={filter}
+          onFilter={(wanted) => {
+            setFilter(wanted);
+            setSelected(new Set());
+          }}
+          order={order}
+          onOrder={setOrder}
+        />
         {!uploads && (
           <ActionButton className="opens-upload" onClick={() => setUploads(true)}>
             Upload
@@ -103,7 +119,8 @@ export function CapturesTable(): JSX.Element {
       </header>
       {uploads && <UploadPanel onClose={() => setUploads(false)} />}
       {selected.size > 0 && (
-        <SelectionBar
+        <Bar
+          key={filter}
           chosen={shown.filter((one) => selected.has(one.id)).map((one) => known[one.id] ?? one)}
           onDone={() => {
             setSelected(new Set());
@@ -116,7 +133,11 @@ export function CapturesTable(): JSX.Element {
       {listed === null && problem === null && <Loading what="captures" />}
       {listed !== null &&
         (listed.items.length === 0 ? (
-          listed.search === "" ? (
+          listed.deleted && listed.search === "" ? (
+            <Empty icon="trash" title="Nothing is deleted">
+              <button onClick={() => setFilter("")}>Show all</button>
+            </Empty>
+          ) : listed.search === "" ? (
             <Empty icon="captures" title="No captures yet">
               <button onClick={() => go({ page: "live" })}>Start one</button>
             </Empty>
@@ -209,7 +230,10 @@ function Row({
           </span>
         )}
       </th>
-      <td>{when(capture.started_at)}</td>
+      <td>
+        {when(capture.started_at)}
+        {capture.deleted_at !== null && <span className="dim">deleted {when(capture.deleted_at)}</span>}
+      </td>
       <td className="number">{lengthOf(capture)}</td>
       <td className="number">{capture.recording === null ? "–" : bytes(capture.recording.bytes)}</td>
       <td>
@@ -221,14 +245,20 @@ function Row({
         {job !== null && <JobReason job={job} />}
       </td>
       <td className="number">
-        <ActionButton
-          className="bare"
-          aria-label={`Delete ${nameOf(capture)}`}
-          title="Delete"
-          onClick={() => void removeWithUndo(capture, onRemoved, onRestored)}
-        >
-          <Icon name="trash" />
-        </ActionButton>
+        {capture.deleted_at === null ? (
+          <ActionButton
+            className="bare"
+            aria-label={`Delete ${nameOf(capture)}`}
+            title="Delete"
+            onClick={() => void removeWithUndo(capture, onRemoved, onRestored)}
+          >
+            <Icon name="trash" />
+          </ActionButton>
+        ) : (
+          <ActionButton aria-label={`Restore ${nameOf(capture)}`} onClick={() => void restored(capture, onRestored)}>
+            Restore
+          </ActionButton>
+        )}
       </td>
     </tr>
   );

@@ -5,30 +5,32 @@ import { type JSX, useState } from "react";
 import * as calls from "../../shared/api/calls";
 import type { Capture } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
+import { bytes } from "../../shared/state/format";
 import { removeFromStore, storeCapture, storeReconstruction } from "../../shared/state/store";
 import { toast } from "../../shared/state/toasts";
 import { ActionButton } from "../../shared/ui/access";
-import type { GradeFilter, Order } from "./listing";
+import type { Filter, Order } from "./listing";
 
 export function ListControls({
-  grade,
-  onGrade,
+  filter,
+  onFilter,
   order,
   onOrder,
 }: {
-  grade: GradeFilter;
-  onGrade: (grade: GradeFilter) => void;
+  filter: Filter;
+  onFilter: (filter: Filter) => void;
   order: Order;
   onOrder: (order: Order) => void;
 }): JSX.Element {
   return (
     <>
-      <select aria-label="Filter" value={grade} onChange={(event) => onGrade(event.target.value as GradeFilter)}>
+      <select aria-label="Filter" value={filter} onChange={(event) => onFilter(event.target.value as Filter)}>
         <option value="">all</option>
         <option value="good">good</option>
         <option value="degraded">degraded</option>
         <option value="bad">bad</option>
         <option value="kept">kept</option>
+        <option value="deleted">deleted</option>
       </select>
       <select aria-label="Order" value={order} onChange={(event) => onOrder(event.target.value as Order)}>
         <option value="newest">newest first</option>
@@ -97,6 +99,60 @@ export function SelectionBar({
       <button type="button" onClick={onNone}>
         Select none
       </button>
+    </div>
+  );
+}
+
+/** Of deleted captures: bring them back, or free their disk space. */
+export function DeletedBar({
+  chosen,
+  onDone,
+  onNone,
+}: {
+  chosen: readonly Capture[];
+  onDone: () => void;
+  onNone: () => void;
+}): JSX.Element {
+  const [busy, setBusy] = useState(false);
+  const [asked, setAsked] = useState(false);
+  const each = async (change: (id: string) => Promise<unknown>): Promise<void> => {
+    setBusy(true);
+    await attempt(async () => {
+      for (const one of chosen) await change(one.id);
+    });
+    setBusy(false);
+    onDone();
+  };
+  const size = chosen.reduce((sum, one) => sum + (one.recording?.bytes ?? 0), 0);
+  return (
+    <div className="selection" role="group" aria-label="Selected captures">
+      <strong>{asked ? `Delete ${chosen.length} for good?` : `${chosen.length} selected`}</strong>
+      <span className="dim">{bytes(size)} of recordings</span>
+      {asked ? (
+        <>
+          <ActionButton disabled={busy} onClick={() => void each(calls.purgeCapture)}>
+            Yes, free the disk space
+          </ActionButton>
+          <button type="button" onClick={() => setAsked(false)}>
+            No
+          </button>
+        </>
+      ) : (
+        <>
+          <ActionButton
+            disabled={busy}
+            onClick={() => void each(async (id) => storeCapture(await calls.restoreCapture(id)))}
+          >
+            Restore
+          </ActionButton>
+          <ActionButton disabled={busy} onClick={() => setAsked(true)}>
+            Delete for good
+          </ActionButton>
+          <button type="button" onClick={onNone}>
+            Select none
+          </button>
+        </>
+      )}
     </div>
   );
 }

@@ -3,11 +3,14 @@
 import type { Capture, Grade } from "../../shared/api/types";
 import { nameOf } from "../../shared/state/capture";
 
-export type GradeFilter = Grade | "" | "kept";
+/** What is shown: `deleted` are listed by the service, the others are chosen among those that it lists. */
+export type Filter = Grade | "" | "kept" | "deleted";
 export type Order = "newest" | "oldest" | "name" | "size" | "length";
 
-export const filtered = (captures: readonly Capture[], grade: GradeFilter): Capture[] =>
-  captures.filter((one) => grade === "" || (grade === "kept" ? one.keep : one.verdict?.grade === grade));
+export const filtered = (captures: readonly Capture[], filter: Filter): Capture[] => {
+  if (filter === "deleted") return captures.filter((one) => one.deleted_at !== null);
+  return captures.filter((one) => filter === "" || (filter === "kept" ? one.keep : one.verdict?.grade === filter));
+};
 
 const ORDERS: Record<Order, (a: Capture, b: Capture) => number> = {
   newest: (a, b) => (a.id < b.id ? 1 : -1),

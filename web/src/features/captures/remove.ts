@@ -11,9 +11,12 @@ export async function removeWithUndo(capture: Capture, onRemoved: () => void, on
   if (!(await attempt(() => removeCapture(capture.id)))) return;
   removeFromStore(capture.id);
   onRemoved();
-  const undo = async (): Promise<void> => {
+  toast(`Deleted ${nameOf(capture)}`, { action: { label: "Undo", run: () => void restored(capture, onRestored) } });
+}
+
+export async function restored(capture: Capture, onRestored: () => void): Promise<void> {
+  await attempt(async () => {
     storeCapture(await restoreCapture(capture.id));
     onRestored();
-  };
-  toast(`Deleted ${nameOf(capture)}`, { action: { label: "Undo", run: () => void attempt(undo) } });
+  });
 }

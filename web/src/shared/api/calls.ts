@@ -106,8 +106,12 @@ export const completeUpload = (upload_id: string): Promise<Capture> =>
     }),
   );
 
-export const captures = (wanted: { limit?: number; cursor?: string; q?: string }): Promise<CapturePage> =>
-  answered(client.GET("/api/v1/captures", { params: { query: wanted } }));
+export const captures = (wanted: {
+  limit?: number;
+  cursor?: string;
+  q?: string;
+  deleted?: boolean;
+}): Promise<CapturePage> => answered(client.GET("/api/v1/captures", { params: { query: wanted } }));
 export const capture = (id: string): Promise<Capture> =>
   answered(client.GET("/api/v1/captures/{capture_id}", ofCapture(id)));
 export const startCapture = (plan: CaptureRequest): Promise<Capture> =>
@@ -120,6 +124,8 @@ export const removeCapture = (id: string): Promise<unknown> =>
   answered(client.DELETE("/api/v1/captures/{capture_id}", ofCapture(id)));
 export const restoreCapture = (id: string): Promise<Capture> =>
   answered(client.POST("/api/v1/captures/{capture_id}:restore", ofCapture(id)));
+export const purgeCapture = (id: string): Promise<unknown> =>
+  answered(client.POST("/api/v1/captures/{capture_id}:purge", ofCapture(id)));
 export const stats = (id: string): Promise<Stats> =>
   answered(client.GET("/api/v1/captures/{capture_id}/stats", ofCapture(id)));
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from spiked.errors import SceneError
 
-__all__ = ["FULL", "KeptErrors", "whole_file", "whole_folder"]
+__all__ = ["FULL", "KeptErrors", "whole_file", "whole_folder", "write_atomically"]
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a full disk, and of a quota."""
@@ -182,3 +182,17 @@ def _move(folder: Path, path: Path, replaces: Sequence[str]) -> None:
         for file in path.glob(pattern):
             if file not in moved:
                 file.unlink()
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file in one step: readers see the old or the new content, also after a power cut. Raises OSError."""
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fdatasync(file.fileno())
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)  # of a full disk: what is left of it is not taken, too
+        raise

@@ -1,7 +1,7 @@
 """Results in the formats of other programs: `KINDS` lists them, `find_kind(name).write(...)` writes one."""
 
-from spiked.export.kind import ExportKind
-from spiked.export.registry import KINDS, find_kind
-from spiked.export.source import ExportOptions, ExportSource
+import lazy_loader
 
-__all__ = ["KINDS", "ExportKind", "ExportOptions", "ExportSource", "find_kind"]
+# The names are those of __init__.pyi. A module is imported when one of its names is asked for: many processes need only
+# options and states, and all modules take a second.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -4,41 +4,8 @@
 map and a reconstruction.
 """
 
-from spiked.recon.extension import extend
-from spiked.recon.localisation.localiser import Localisation, LocalisedView, Localiser
-from spiked.recon.localisation.map_index import MapIndex
-from spiked.recon.merging.known_map import KnownMap
-from spiked.recon.merging.merger import Merged, merge
-from spiked.recon.merging.registration import NotOnePlaceError, Registration
-from spiked.recon.methods import METHODS, Alternation, Initialisation, Method, MethodName, PoseStepName
-from spiked.recon.odometry.tracking_state import State
-from spiked.recon.options import LossName, MapOptions, Options
-from spiked.recon.reconstructor import Reconstructor
-from spiked.recon.report import Sample, Status, Tracked
+import lazy_loader
 
-__all__ = [
-    "METHODS",
-    "Alternation",
-    "Initialisation",
-    "KnownMap",
-    "Localisation",
-    "LocalisedView",
-    "Localiser",
-    "LossName",
-    "MapIndex",
-    "MapOptions",
-    "Merged",
-    "Method",
-    "MethodName",
-    "NotOnePlaceError",
-    "Options",
-    "PoseStepName",
-    "Reconstructor",
-    "Registration",
-    "Sample",
-    "State",
-    "Status",
-    "Tracked",
-    "extend",
-    "merge",
-]
+# The names are those of __init__.pyi. A module is imported when one of its names is asked for: many processes need only
+# options and states, and all modules take a second.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -23,15 +23,13 @@ from numpy.typing import NDArray
 import spiked
 from spiked.errors import CheckpointError, SpikedError
 from spiked.recon import report
-from spiked.recon.checkpoint_file import CheckpointFolder, Place, State, exists, read
+from spiked.recon.checkpoint_file import CheckpointFolder, Place, State, read
 from spiked.recon.frontend.recorded_views import RecordedFrames
 from spiked.recon.reconstructor import Reconstructor
 from spiked.recording import Recording
 
-__all__ = ["CHECKPOINT", "CheckpointSaver", "Interrupted", "exists"]
+__all__ = ["CheckpointSaver", "Interrupted"]
 
-CHECKPOINT = "checkpoint"
-"""Name of the folder of a checkpoint, among the results."""
 PERIOD_S, LONGEST_PERIOD_S = 3.0, 6.0
 """Seconds from one checkpoint to the next, at least and at most: with the time of the longest step, and of writing, a
 kill loses less than 10 s of work."""

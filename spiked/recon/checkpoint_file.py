@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 
 from spiked.errors import CheckpointError
 
+CHECKPOINT = "checkpoint"
+"""Name of the folder of a checkpoint, among the results."""
 FORMAT = 1
 """Number of the layout described above; a program reads its own only."""
 RESERVE_BYTES = 256 << 20

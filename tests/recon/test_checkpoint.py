@@ -300,7 +300,7 @@ def test_checkpoints_are_some_seconds_apart_and_go_at_the_end(room: Recording, t
     assert saver.saved == 0
     saver.save(reconstructor, now=True)
     assert saver.saved == 1
-    assert checkpoint.exists(folder)
+    assert checkpoint_file.exists(folder)
     saver.remove()
     assert not folder.exists()
 

@@ -18,7 +18,8 @@ from spiked_service.captures.archive import DataStore
 from spiked_service.events.bus import Bus
 from spiked_service.operations.metrics import Metrics
 from spiked_service.operations.metrics_sources import metrics_source_of
-from spiked_service.results.versions import Published, pose_file, versions
+from spiked_service.results.published import Published
+from spiked_service.results.versions import pose_file, versions
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.catalogue import StoreError, UnknownIdError
 from spiked_service.store.disk_space import DiskFullError

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from spiked_service.cli.main import app
-from spiked_service.conversion.reading import Form, read_content
+from spiked_service.conversion.form import Form
+from spiked_service.conversion.reading import read_content
 from spiked_service.conversion.writing import write_content
 from typer.testing import CliRunner
 

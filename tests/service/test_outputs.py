@@ -1,12 +1,14 @@
 """Every command that writes tries its outputs before it works: the error comes first, and nothing is left behind."""
 
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import get_type_hints
 
 import pytest
 import typer
 from spiked_service.cli import outputs
+from spiked_service.cli.command_table import PANELS
 from spiked_service.cli.main import app
 
 from spiked.errors import ConfigurationError
@@ -82,9 +84,12 @@ OF_THE_SERVICE = {"data", "runtime", "config"}
 
 def paths() -> Iterator[tuple[str, str]]:
     """The options of all commands that are paths and not read."""
-    for command in app.registered_commands:
-        assert command.callback is not None
-        for name, kind in get_type_hints(command.callback, include_extras=True).items():
+    for command in (name for names in PANELS.values() for name in names):
+        module = command.replace("-", "_")
+        function = getattr(import_module(f"spiked_service.cli.commands.{module}"), module)
+        if isinstance(function, typer.Typer):
+            continue
+        for name, kind in get_type_hints(function, include_extras=True).items():
             if "pathlib.Path" in str(kind) and name not in READS | OF_THE_SERVICE:
                 (declared,) = (part for part in kind.__metadata__ if hasattr(part, "param_decls"))
                 names = [
@@ -92,7 +97,7 @@ def paths() -> Iterator[tuple[str, str]]:
                 ]
                 option = next(iter(names), f"--{name}")
                 argument = isinstance(declared, typer.models.ArgumentInfo)
-                yield command.callback.__name__.replace("_", "-"), name.upper() if argument else option
+                yield command, name.upper() if argument else option
 
 
 def told(command: str, *arguments: str) -> str:

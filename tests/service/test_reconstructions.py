@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 from spiked_service.base.errors import BusyError
 from spiked_service.captures.archive import DataStore
+from spiked_service.results.published import Published
 from spiked_service.results.scene_scale import SceneScale, read_scale, write_scale
 from spiked_service.results.timeline import Timeline
-from spiked_service.results.versions import Published, Publisher, at, newest
+from spiked_service.results.versions import Publisher, at, newest
 from spiked_service.settings.reconstruction_options import IntrinsicsOption, ReconstructionOptions
 from spiked_service.store.catalogue import UnknownIdError
 from spiked_service.store.rows import CaptureState, JobState, Plan, ReconstructionRow, Stage

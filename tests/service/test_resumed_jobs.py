@@ -19,7 +19,8 @@ from spiked_service.store.rows import JobState, Plan, ReconstructionRow, Stage
 
 from spiked.poses import PoseFile
 from spiked.recon import Reconstructor
-from spiked.recon.checkpoint import CheckpointSaver, Interrupted, exists
+from spiked.recon.checkpoint import CheckpointSaver, Interrupted
+from spiked.recon.checkpoint_file import exists
 from spiked.recording import open_recording
 
 from .survival import ended, kept, moving_recording, over, wait_for

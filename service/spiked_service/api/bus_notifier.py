@@ -7,7 +7,7 @@ from spiked_service.api.schemas import CaptureOut, ReconstructionOut
 from spiked_service.events.bus import Bus, Topic
 from spiked_service.events.logging import logger
 from spiked_service.events.payloads import PosePayload, PreviewPayload, ScenePayload
-from spiked_service.results.versions import Published
+from spiked_service.results.published import Published
 from spiked_service.store.rows import ReconstructionRow
 from spiked_service.store.snapshot import Snapshot
 from spiked_service.workers.messages import PreviewKind, PreviewTaken

@@ -25,9 +25,10 @@ from spiked_service.api.trajectories import Range, TrajectoryFormat, open_poses,
 from spiked_service.base.limits import ConcurrencyLimit
 from spiked_service.captures.captures import Captures
 from spiked_service.reconstructions.repository import ReconstructionRepository
+from spiked_service.results.published import Published
 from spiked_service.results.scene_scale import MetricPoses, read_scale
 from spiked_service.results.shown_scene import ShownScene
-from spiked_service.results.versions import Published, at
+from spiked_service.results.versions import at
 from spiked_service.store.catalogue import UnknownIdError
 from spiked_service.store.rows import ReconstructionRow, Task
 

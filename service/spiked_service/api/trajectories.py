@@ -28,10 +28,11 @@ from spiked_service.api import files
 from spiked_service.api.problems import GoneError, NoPoseError
 from spiked_service.api.streams import GuardedStream
 from spiked_service.base.limits import ConcurrencyLimit
+from spiked_service.results.published import Published
 from spiked_service.results.report.zip_stream import Part, zip_pieces
 from spiked_service.results.scene_scale import MetricPoses
 from spiked_service.results.timeline import Timeline, frames_at
-from spiked_service.results.versions import Published, pose_file
+from spiked_service.results.versions import pose_file
 
 _PIECE = 4096
 """Poses of a piece: between pieces other requests run and a disconnect of the client is noticed."""

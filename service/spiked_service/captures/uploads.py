@@ -17,10 +17,10 @@ from spiked.camera import StoredCameraOptions
 from spiked.errors import RecordingError, SpikedError
 from spiked.recording import sidecar_path
 from spiked.recording.sidecar import Sidecar
+from spiked.whole_files import write_atomically
 from spiked_service.base.ids import new_id
 from spiked_service.captures.captures import Captures
-from spiked_service.conversion.reading import Form
-from spiked_service.results.versions import write_atomically
+from spiked_service.conversion.form import Form
 from spiked_service.store.catalogue import Catalogue, StoreError
 from spiked_service.store.disk_space import DiskFullError, DiskSpace
 from spiked_service.store.folder import UPLOAD_SUFFIXES, DataFolder

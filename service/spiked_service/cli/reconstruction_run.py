@@ -10,7 +10,8 @@ from pydantic import TypeAdapter
 
 from spiked.errors import ConfigurationError
 from spiked.recon import Reconstructor
-from spiked.recon.checkpoint import CHECKPOINT, CheckpointSaver, Interrupted, exists
+from spiked.recon.checkpoint import CheckpointSaver, Interrupted
+from spiked.recon.checkpoint_file import CHECKPOINT, exists
 from spiked.recording import Recording, RecordingGeometry, open_recording
 from spiked_service.cli import outputs
 from spiked_service.cli.console import messages, report_warning

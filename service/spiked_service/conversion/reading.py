@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -18,32 +17,13 @@ from spiked.recording import ClockPair, Gap, Recording, RecordingGeometry, open_
 from spiked.recording.arrays import SpikeArray, is_array, open_array, open_bits
 from spiked.recording.geometry import DEFAULT_RATE_HZ, Assumable
 from spiked.sensor import Layout, Response, Sensor
+from spiked_service.conversion.form import Form
 
 _BLOCK_BYTES = 1 << 20
 """Bytes read at a time."""
 _CHUNK_FRAMES = 64
 """Frames read at a time."""
 
-
-class Form(StrEnum):
-    """How frames are stored in a file."""
-
-    COMPACT = "compact"
-    ROW_TAGGED = "row_tagged"
-    USB = "usb"
-    PCIE = "pcie"
-    ARRAY = "array"
-    """An array of NumPy or HDF5; read only."""
-    BITS = "bits"
-    """The bits of a frame one after the other, without an end of a row; read only."""
-
-
-READ_ONLY = (Form.ARRAY, Form.BITS)
-"""Forms that are not written."""
-
-
-RECORDINGS = (Form.COMPACT, Form.ROW_TAGGED)
-"""Forms that are recordings as they are."""
 
 Warn = Callable[[str], None]
 """Takes a sentence for the user."""

@@ -16,7 +16,8 @@ from spiked_driver.pcie import PCIE_SIZE, encode_pcie
 from spiked.errors import ConfigurationError, RecordingError
 from spiked.recording import Gap, RecordingWriter, sidecar_path
 from spiked.sensor import Layout, Sensor
-from spiked_service.conversion.reading import Content, Form, Warn
+from spiked_service.conversion.form import Form
+from spiked_service.conversion.reading import Content, Warn
 
 
 class Writer(Protocol):

@@ -3,7 +3,7 @@
 from typing import Protocol
 
 from spiked_service.events.payloads import PosePayload
-from spiked_service.results.versions import Published
+from spiked_service.results.published import Published
 from spiked_service.store.rows import ReconstructionRow
 from spiked_service.store.snapshot import Snapshot
 from spiked_service.workers.messages import PreviewTaken

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Unpack
 
 from spiked.errors import ConfigurationError
-from spiked.recon.checkpoint import exists
+from spiked.recon.checkpoint_file import exists
 from spiked.render import Camera
 from spiked.sensor import Sensor
 from spiked_service.base.errors import BusyError
@@ -16,9 +16,10 @@ from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue_estimates import NEXT, QueueEstimates
 from spiked_service.reconstructions.queue_policy import QueuePolicy
 from spiked_service.results.pinned_map import pin
+from spiked_service.results.published import Published
 from spiked_service.results.scene_scale import forget_scale
 from spiked_service.results.timeline_writer import NAME as TIMELINE
-from spiked_service.results.versions import Published, Publisher, newest, version_row
+from spiked_service.results.versions import Publisher, newest, version_row
 from spiked_service.store.catalogue import Catalogue, Page, StoreError
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import JobState, MapRef, ReconstructionEdit, ReconstructionRow, VersionRow

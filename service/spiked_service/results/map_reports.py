@@ -12,8 +12,8 @@ from pydantic import TypeAdapter
 from spiked.recon import Localisation
 from spiked.recording import Recording, RecordingGeometry
 from spiked.sensor import Sensor
+from spiked.whole_files import write_atomically
 from spiked_service.results.timeline import frames_at
-from spiked_service.results.versions import write_atomically
 
 LOCALISATION, REGISTRATION, REPORT = "localisation.json", "registration.json", "report.json"
 """Names of the files in the folder of a job."""

@@ -14,7 +14,8 @@ from spiked.recon import KnownMap
 from spiked.render import Camera
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
-from spiked_service.results.versions import OtherPath, Published, RecordedPath, pose_file
+from spiked_service.results.published import OtherPath, Published
+from spiked_service.results.versions import RecordedPath, pose_file
 from spiked_service.store.rows import ReconstructionRow
 
 _ABOUT = "map.json"

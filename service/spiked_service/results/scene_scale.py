@@ -12,8 +12,8 @@ from spiked.errors import ConfigurationError, SceneError
 from spiked.frame_of_reference import FrameOfReference
 from spiked.pose import quaternion, rotation_of
 from spiked.poses import PoseFile, Records
+from spiked.whole_files import write_atomically
 from spiked_service.base.errors import BusyError
-from spiked_service.results.versions import write_atomically
 
 SCALE = "scale.json"
 """Its file, in the folder of a reconstruction or of `spiked reconstruct`."""

@@ -1,6 +1,5 @@
 """Versions of a scene and its trajectory: one process publishes them, others read them at any time."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -11,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from spiked.errors import ConfigurationError
-from spiked.lens import Lens, distortion_of, lens_of
+from spiked.lens import lens_of
 from spiked.poses import PoseAppender
 from spiked.scene import Scene
-from spiked.sensor import Intrinsics, Sensor
+from spiked.sensor import Intrinsics
 from spiked.trajectory import Trajectory
+from spiked.whole_files import write_atomically
+from spiked_service.results.published import OtherPath, Published
 from spiked_service.results.shown_scene import TOLERANCE, ShownScene
 from spiked_service.store.rows import VersionRow
 
@@ -27,73 +27,9 @@ _EARLIER = 16
 _INDEX = "published.json"
 
 
-class OtherPath(BaseModel):
-    """The path of another recording through the scene of a version."""
-
-    capture_id: str
-    """Its capture, which may have been removed since."""
-    frame_rate_hz: float
-    trajectory: str
-    """Name of a pose file."""
-    poses: int
-
-
-class Published(BaseModel):
-    """Metadata of a version, whose files are beside the index."""
-
-    version: int
-    white: float
-    """Radiance shown as white, spikes per frame."""
-    scene: str
-    trajectory: str
-    """Name of a pose file; of a TUM file in folders of older releases."""
-    at: datetime
-    splats: int
-    poses: int
-    """Frames with a pose. The trajectory of a long path that is still tracked has a pose a view, fewer than these."""
-    scene_bytes: int
-    psnr_db: float | None = None
-    intrinsics: tuple[float, float, float, float] | None = None
-    """fx, fy, cx, cy (px), given or estimated."""
-    distortion: Lens | None = None
-    """Of the lens, with `intrinsics`."""
-    slots: str | None = None
-    """Name of the file of `ShownScene`, which only the newest versions have."""
-    slots_began: int = 0
-    """First version of these slots."""
-    paths: list[OtherPath] = []
-    """Of a map of several recordings: the paths of the others."""
-
-    def optics(self, sensor: Sensor) -> Intrinsics:
-        """The lens of the camera `sensor` that made it. Raises ConfigurationError for a version of an old release."""
-        found = self.camera or sensor.intrinsics
-        if found is None:
-            raise ConfigurationError(f"version {self.version} was published without a lens: :restart makes a new one")
-        return found
-
-    @property
-    def camera(self) -> Intrinsics | None:
-        """The intrinsics with the distortion."""
-        return None if self.intrinsics is None else Intrinsics(*self.intrinsics, distortion_of(self.distortion))
-
-
 class _Index(BaseModel):
     versions: list[Published]
     """Oldest first; never empty."""
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file in one step: readers see the old or the new content, also after a power cut. Raises OSError."""
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fdatasync(file.fileno())
-        part.replace(path)
-    except OSError:
-        part.unlink(missing_ok=True)  # of a full disk: what is left of it is not taken, too
-        raise
 
 
 @dataclass(frozen=True)

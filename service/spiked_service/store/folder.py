@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from spiked.errors import ConfigurationError
-from spiked.recon.checkpoint import CHECKPOINT
+from spiked.recon.checkpoint_file import CHECKPOINT
 from spiked.sensor import Sensor
 from spiked_service.base.ids import is_id
 

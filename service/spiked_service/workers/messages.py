@@ -13,9 +13,9 @@ from spiked.recon import State
 from spiked.recording.geometry import Assumable
 from spiked.recording.sidecar import Sidecar
 from spiked.sensor import Intrinsics, Sensor
-from spiked_service.conversion.reading import Form
+from spiked_service.conversion.form import Form
 from spiked_service.events.payloads import PosePayload
-from spiked_service.results.versions import Published
+from spiked_service.results.published import Published
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.rows import FrameRange, Stage
 

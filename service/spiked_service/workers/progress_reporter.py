@@ -15,10 +15,11 @@ from spiked.scene import Scene
 from spiked.trajectory import Trajectory
 from spiked_service.events.payloads import PosePayload
 from spiked_service.results.map_reports import REGISTRATION, REPORT, write_report
+from spiked_service.results.published import Published
 from spiked_service.results.shown_scene import TOLERANCE
 from spiked_service.results.timeline import frames_at
 from spiked_service.results.timeline_writer import TimelineWriter
-from spiked_service.results.versions import Published, Publisher, RecordedPath, pose_file
+from spiked_service.results.versions import Publisher, RecordedPath, pose_file
 from spiked_service.store.rows import Stage
 from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.messages import (

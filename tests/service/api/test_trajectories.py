@@ -14,7 +14,7 @@ import pytest
 from fastapi import Request
 from spiked_service.api.trajectories import Range, TrajectoryFormat, open_poses, trajectory_response
 from spiked_service.base.limits import ConcurrencyLimit, OverloadedError
-from spiked_service.results.versions import Published
+from spiked_service.results.published import Published
 
 from spiked.poses import PoseAppender, PoseFile, Records
 from spiked.sensor import Intrinsics, Sensor

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from spiked_service.results.versions import Publisher, RecordedPath, at, newest, versions, write_atomically
+from spiked_service.results.versions import Publisher, RecordedPath, at, newest, versions
 
 from spiked.scene import Scene
 from spiked.trajectory import Trajectory
+from spiked.whole_files import write_atomically
 
 
 def test_files_of_the_last_three_versions_are_kept_and_old_versions_thinned(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from fastapi.routing import APIRoute
 
 from spiked.errors import ConfigurationError
 from spiked.recording import open_recording
+from spiked.whole_files import write_atomically
 from spiked_service.api import files
 from spiked_service.api.problems import NotReadyError, problems
 from spiked_service.api.results import Result, Results
@@ -20,7 +21,6 @@ from spiked_service.api.views import image_format, views_response
 from spiked_service.captures.captures import Captures
 from spiked_service.results.frame_images import FrameWindow, Picture, PictureKind, frame_window_at, picture, statistics
 from spiked_service.results.image_encoding import ImageFormat, encode, thumbnail
-from spiked_service.results.versions import write_atomically
 from spiked_service.results.view_renderer import ViewRenderer
 from spiked_service.store.folder import DataFolder
 from spiked_service.workers.messages import PreviewKind

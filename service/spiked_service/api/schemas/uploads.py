@@ -19,7 +19,7 @@ from spiked_service.api.schemas.base import (
     examples,
 )
 from spiked_service.api.schemas.captures import ProfileModel
-from spiked_service.conversion.reading import Form
+from spiked_service.conversion.form import Form
 
 MAX_UPLOAD_BYTES = 1 << 42
 """Upper bound of the schema, 4 TiB; `limit_upload_bytes` is the limit in effect."""

@@ -13,6 +13,7 @@ import typer
 
 from spiked.errors import ConfigurationError, SpikedError
 from spiked.recording import open_recording
+from spiked.whole_files import write_atomically
 from spiked_service.base.signals import handling
 from spiked_service.base.version import installed_version
 from spiked_service.cli import outputs
@@ -23,7 +24,6 @@ from spiked_service.cli.comparison.pictures import Strip, strips
 from spiked_service.cli.comparison.rows import GROUPS, chosen, rows
 from spiked_service.cli.comparison.tables import csv_text, markdown
 from spiked_service.cli.console import messages, output, report_warning
-from spiked_service.results.versions import write_atomically
 
 TABLE, FIGURES, PAGE = "comparison.md", "comparison.csv", "comparison.html"
 """Files in OUT."""

@@ -10,7 +10,8 @@ from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import output, report_warning
 from spiked_service.cli.flag_groups import with_groups
-from spiked_service.conversion.reading import READ_ONLY, Form, read_content
+from spiked_service.conversion.form import READ_ONLY, Form
+from spiked_service.conversion.reading import read_content
 from spiked_service.conversion.writing import write_content
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from spiked.recon.checkpoint import CHECKPOINT, exists
+from spiked.recon.checkpoint_file import CHECKPOINT, exists
 from spiked_service.cli import outputs
 from spiked_service.cli.console import output
 from spiked_service.results.map_reports import REPORT

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 from spiked.datasets import Clip, Dataset, DatasetKind, PictureScene
 from spiked.errors import ConfigurationError, DatasetError, SpikedError
 from spiked.recording import open_recording
+from spiked.whole_files import write_atomically
 from spiked_service.cli import outputs
 from spiked_service.cli.commands.reconstruct import reconstruct
 from spiked_service.cli.commands.simulate import simulate
@@ -20,7 +21,6 @@ from spiked_service.cli.dataset_runs.children import INTERRUPTED, run_spiked
 from spiked_service.cli.dataset_runs.pictures import simulation_arguments
 from spiked_service.cli.dataset_runs.scores import score
 from spiked_service.cli.dataset_runs.table import Row, Table, write_zip
-from spiked_service.results.versions import write_atomically
 
 _DONE = "done.json"
 """In the folder of a result: its row, written when all else is."""

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from spiked.errors import CheckpointError, SceneError, SpikedError
 from spiked.export import ExportSource
-from spiked.recon.checkpoint import CHECKPOINT, Interrupted, exists
+from spiked.recon.checkpoint import Interrupted
+from spiked.recon.checkpoint_file import CHECKPOINT, exists
 from spiked.recording import Recording, open_recording, sidecar_path
 from spiked.render.cpu import Rasteriser
 from spiked.scene import Scene

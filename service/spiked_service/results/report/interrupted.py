@@ -8,7 +8,8 @@ from tempfile import TemporaryDirectory
 
 from pydantic import TypeAdapter
 
-from spiked.recon.checkpoint import CHECKPOINT, Interrupted
+from spiked.recon.checkpoint import Interrupted
+from spiked.recon.checkpoint_file import CHECKPOINT
 from spiked.recording import RecordingGeometry, open_recording
 from spiked_service.results.map_reports import REPORT, recording_section
 

@@ -14,10 +14,10 @@ from spiked.recording import Recording, open_recording, sidecar_path
 from spiked.sensor import Sensor
 from spiked.trajectory import Trajectory
 from spiked_service.results.map_reports import LOCALISATION, REGISTRATION, REPORT
+from spiked_service.results.published import Published
 from spiked_service.results.report.figures import Figures
 from spiked_service.results.report.source import Pieces, Render, ReportSource, pairs, thinned, without_folders
 from spiked_service.results.timeline import STATES, Timeline, known
-from spiked_service.results.versions import Published
 from spiked_service.store.rows import CaptureRow, JobState, ReconstructionRow, Task
 
 _PIECE = 4096

@@ -13,8 +13,8 @@ from spiked.recon.frontend.demosaic import fill_mosaic
 from spiked.recon.frontend.mosaic_check import layout_warnings
 from spiked.ring import End, Frames, Gap, Policy, RingReader
 from spiked.sensor import Sensor
+from spiked.whole_files import write_atomically
 from spiked_service.results.image_encoding import display_white, thumbnail
-from spiked_service.results.versions import write_atomically
 from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.messages import PreviewCommand, PreviewKind, PreviewTaken, Warned
 

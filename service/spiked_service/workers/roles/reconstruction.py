@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from spiked.calibration import Calibration
 from spiked.errors import CheckpointError, SceneError
 from spiked.recon import NotOnePlaceError, Options, Reconstructor, State, extend
-from spiked.recon.checkpoint import CHECKPOINT, CheckpointSaver, Interrupted, exists
+from spiked.recon.checkpoint import CheckpointSaver, Interrupted
+from spiked.recon.checkpoint_file import CHECKPOINT, exists
 from spiked.recon.frontend.windowing import SEARCH_FRAMES
 from spiked.recording import Recording, open_recording, recorded_calibration
 from spiked.ring import End, Frames, Gap, Policy, RingReader

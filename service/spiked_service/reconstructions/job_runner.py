@@ -33,8 +33,8 @@ _SAVE_S = 5.0
 class JobRunner:
     """A reconstruction with its worker: applies the events of the worker to the row and determines the outcome.
 
-    Events and the exit arrive on one thread of the worker. `cancel`, `finish_early`, `dismiss` and `kill_after` may be
-    called from any thread.
+    Events and the exit arrive on one thread of the worker. `cancel`, `finish_early`, `hold`, `dismiss` and `kill_after`
+    may be called from any thread.
     """
 
     def __init__(
@@ -58,6 +58,7 @@ class JobRunner:
         self._worker: WorkerProcess | None = None
         self._cancelled = False
         self._early = False
+        self._held = False
         self._yielded = False
         self._error: str | None = None
         self._mismatch = ""
@@ -96,6 +97,11 @@ class JobRunner:
         self._early = True
         self._stop()
 
+    def hold(self) -> None:
+        """Stop the worker for now: the job returns to the queue, held there, and goes on from its checkpoint."""
+        self._held = True
+        self.dismiss()
+
     def dismiss(self) -> None:
         """Ask the worker to exit at once."""
         if self._worker is not None:
@@ -111,6 +117,9 @@ class JobRunner:
         row = replace(self.row, ended_at=datetime.now(UTC), eta_s=None)
         if self._cancelled:
             return replace(row, state=JobState.CANCELLED, stage=Stage.DONE if trouble is None else row.stage, reason="")
+        if self._held and not (trouble is None and row.stage is Stage.DONE):
+            held = replace(row, held=True, attempts=row.attempts - 1)
+            return replace(queued_again(held, ""), progress=row.progress)
         if trouble is not None:
             return None if self._error is None else replace(row, state=JobState.FAILED, reason=self._error)
         if self._frames_skipped is not None and not self._early:

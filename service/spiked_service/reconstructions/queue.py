@@ -4,20 +4,31 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from typing import Unpack
 
 from spiked.recording.geometry import orientation_questions
 from spiked_service.base.errors import BusyError
 from spiked_service.base.ids import new_id
 from spiked_service.reconstructions.admission import check, intrinsics_of
+from spiked_service.reconstructions.interruption import after_crash, requeue_interrupted
 from spiked_service.reconstructions.job_commands import command_of
-from spiked_service.reconstructions.job_runner import JobRunner, begun_anew, queued_again
+from spiked_service.reconstructions.job_runner import JobRunner, begun_anew
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue_policy import QueuePolicy
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.catalogue import Catalogue, StoreError
 from spiked_service.store.folder import DataFolder
-from spiked_service.store.rows import CaptureRow, FrameRange, JobState, MapRef, ReconstructionRow, Stage, Task
+from spiked_service.store.rows import (
+    CaptureRow,
+    FrameRange,
+    JobState,
+    MapRef,
+    ReconstructionEdit,
+    ReconstructionRow,
+    Stage,
+    Task,
+)
 from spiked_service.workers.messages import JobCommand, ReconstructionCommand, RingOpened
 from spiked_service.workers.process import StandbyWorker
 
@@ -51,7 +62,7 @@ class Reconstructions:
         """Poses of the published trajectory of a queued reconstruction, which a restart has to reach."""
         self._closing = False
         self._thread: threading.Thread | None = None
-        self._requeue_interrupted()
+        requeue_interrupted(rows)
 
     def start(self) -> None:
         """Start the queue. Call once, after interrupted recordings have been recovered."""
@@ -136,6 +147,24 @@ class Reconstructions:
             self._wake.notify_all()
         return added
 
+    def change(self, reconstruction_id: str, **edit: Unpack[ReconstructionEdit]) -> ReconstructionRow:
+        """Change the fields that are given. One that runs is held by ending its worker, which takes a second.
+
+        Raises UnknownIdError, StoreError, and BusyError for one that can be neither held nor moved.
+        """
+        with self._lock:
+            job = self._jobs.get(reconstruction_id)
+            if job is not None and edit.get("held"):
+                if job.row.live:
+                    raise BusyError(f"reconstruction {job.row.id} follows its capture: stop that, or wait for its end")
+                edit["held"] = None
+                row = self.rows.change(reconstruction_id, **edit)
+                job.hold()
+            else:
+                row = self.rows.change(reconstruction_id, **edit)
+            self._wake.notify_all()
+            return row
+
     def cancel(self, reconstruction_id: str) -> ReconstructionRow:
         """End a queued or running reconstruction; published versions are kept. Does nothing to one that has ended."""
         with self._lock:
@@ -208,24 +237,6 @@ class Reconstructions:
             job.kill_after(timeout_s)
         if thread is not None:
             thread.join()
-
-    def _requeue_interrupted(self) -> None:
-        """Queue the jobs that an earlier service left running; they go on from their checkpoints or begin anew."""
-        for row in self.rows.interrupted():
-            if row.attempts >= QueuePolicy.MOST_ATTEMPTS:
-                reason = (
-                    f"failed after {row.attempts} attempts, the last of which was interrupted by the end of the service"
-                )
-                self.rows.drop_checkpoint(row.id)
-                self.rows.save(replace(row, state=JobState.FAILED, reason=reason, ended_at=datetime.now(UTC)))
-                continue
-            self.rows.save(queued_again(row, f"{self._next_start(row)}, because the service ended while it ran"))
-
-    def _next_start(self, row: ReconstructionRow) -> str:
-        """How an interrupted job goes on, for users."""
-        if self.rows.has_checkpoint(row.id):
-            return "resumed from its checkpoint"
-        return "restarted from the recording" if row.task.reads_recording else "restarted"
 
     def _run_queue(self) -> None:
         while True:
@@ -310,18 +321,7 @@ class Reconstructions:
     def _outcome(self, job: JobRunner, trouble: str | None) -> ReconstructionRow:
         row = job.outcome(trouble)
         if row is None:
-            return self._after_crash(job.row, f"{trouble}")
+            return after_crash(job.row, f"{trouble}", self.rows, self._catalogue, self.policy)
         if row.state is JobState.QUEUED:
             self._least_poses[row.id] = row.poses
         return row
-
-    def _after_crash(self, row: ReconstructionRow, trouble: str) -> ReconstructionRow:
-        """The row of a job whose worker died: queued again while retries are left and there is a recording."""
-        row = replace(row, ended_at=datetime.now(UTC), eta_s=None)
-        capture = self._catalogue.captures.find(row.capture_id)
-        again = capture is not None and (capture.plan.record or not row.task.reads_recording)
-        if again and self.policy.retry(row.id):
-            return queued_again(row, f"{trouble}; {self._next_start(row)} (attempt {row.attempts + 1})")
-        self.rows.drop_checkpoint(row.id)
-        tried = f", the last of {row.attempts} attempts" if row.attempts > 1 else ""
-        return replace(row, state=JobState.FAILED, reason=f"{trouble}{tried}")

@@ -89,7 +89,37 @@ def test_names_and_notes_stay_whatever_becomes_of_it(service: Any, waiting: list
     found = client.change_reconstruction(waiting[0], notes="")
     assert (found.name, found.notes) == ("sharp", "")
     with pytest.raises(ApiError, match="only those that wait in the queue") as refused:
-        client.change_reconstruction(waiting[0], held=True)
+        client.change_reconstruction(waiting[0], queue_place=1)
     assert refused.value.status == 409
     answer = service.http.patch(f"reconstructions/{waiting[0]}", json={"queue_place": 0})
     assert answer.status_code == 422
+
+
+def test_one_that_runs_is_paused_and_goes_on_where_it_was(service: Any, waiting: list[str]) -> None:
+    client = service.client
+    running = next(one.id for one in client.reconstructions() if one.state == "running")
+    until(lambda: client.reconstruction(running).progress > 0.001, "it refines")
+    client.change_reconstruction(running, held=True, notes="later")
+    until(lambda: client.reconstruction(running).state == "queued", "it is back in the queue")
+    paused = client.reconstruction(running)
+    assert paused.held and paused.notes == "later" and paused.progress > 0.001 and paused.reason == ""
+    until(lambda: client.reconstruction(waiting[0]).state == "running", "the next one runs meanwhile")
+    for one in waiting:
+        client.cancel_reconstruction(one)
+    client.change_reconstruction(running, held=False)
+    until(lambda: client.reconstruction(running).state == "running", "it goes on")
+    until(lambda: client.reconstruction(running).stage == "refining", "where it was")
+    assert client.reconstruction(running).progress >= paused.progress / 2, "a checkpoint is some seconds old at most"
+    client.cancel_reconstruction(running)
+
+
+def test_one_that_follows_its_capture_cannot_be_paused(service: Any) -> None:
+    capture = service.client.start_capture("sim:?width=64&height=48", record=False)
+    until(lambda: service.client.capture(capture.id).reconstruction_ids, "its reconstruction has begun")
+    (live,) = service.client.capture(capture.id).reconstruction_ids
+    with pytest.raises(ApiError, match="follows its capture") as refused:
+        service.client.change_reconstruction(live, held=True)
+    assert refused.value.status == 409
+    service.client.stop_capture(capture.id)
+    service.client.stop_capture(capture.id)
+    service.client.wait_for_capture(capture.id, 120)

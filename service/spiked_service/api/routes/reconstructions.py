@@ -70,11 +70,13 @@ def reconstruction_routes(reconstructions: Reconstructions, route_class: type[AP
 
     @router.patch("/{reconstruction_id:id}", responses=problems(404, 409, 507))
     def change_reconstruction(reconstruction_id: str, body: ReconstructionChange) -> ReconstructionOut:
-        """Change its name or notes, hold it in the queue, or move it there."""
-        row = rows.change(
+        """Change its name or notes, hold it in the queue, or move it there.
+
+        One that runs returns to the queue within a second when it is held, and goes on from its checkpoint later.
+        """
+        row = reconstructions.change(
             reconstruction_id, name=body.name, notes=body.notes, held=body.held, queue_place=body.queue_place
         )
-        reconstructions.wake_queue()
         return ReconstructionOut.of(row)
 
     _add_end_routes(router, reconstructions)

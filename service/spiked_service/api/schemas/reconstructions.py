@@ -93,7 +93,9 @@ class ReconstructionChange(In):
 
     name: Name | None = None
     notes: Notes | None = None
-    held: StrictBool | None = Field(None, description="Whether it stays in the queue; only while it waits there.")
+    held: StrictBool | None = Field(
+        None, description="Whether it stays in the queue; one that runs returns there, unless it follows its capture."
+    )
     queue_place: StrictInt | None = Field(
         None,
         ge=1,

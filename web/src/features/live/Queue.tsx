@@ -40,17 +40,25 @@ function Turn({ job }: { job: Reconstruction }): JSX.Element {
       <JobBadge job={job} />
       <span className="dim">{progressText(job)}</span>
       <span className="buttons">
+        {(place !== null || !job.live) && (
+          <ActionButton
+            className="bare"
+            aria-label={`${job.held ? "Let go of" : place === null ? "Pause" : "Hold"} the reconstruction of ${name}`}
+            aria-pressed={job.held}
+            title={
+              job.held
+                ? "Let go: it begins in its turn"
+                : place === null
+                  ? "Pause: it returns to the queue, and goes on from here later"
+                  : "Hold: it stays in the queue"
+            }
+            onClick={() => void change({ held: !job.held })}
+          >
+            <Icon name={job.held ? "start" : "pause"} />
+          </ActionButton>
+        )}
         {place !== null && (
           <>
-            <ActionButton
-              className="bare"
-              aria-label={`${job.held ? "Let go of" : "Hold"} the reconstruction of ${name}`}
-              aria-pressed={job.held}
-              title={job.held ? "Let go: it begins in its turn" : "Hold: it stays in the queue"}
-              onClick={() => void change({ held: !job.held })}
-            >
-              <Icon name={job.held ? "start" : "pause"} />
-            </ActionButton>
             <ActionButton
               className="bare"
               aria-label={`Earlier: the reconstruction of ${name}`}

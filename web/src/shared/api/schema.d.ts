@@ -647,6 +647,8 @@ export interface paths {
          * Change Reconstruction
          * @description Change its name or notes, hold it in the queue, or move it there.
          *
+         *     One that runs returns to the queue within a second when it is held, and goes on from its checkpoint later.
+         *
          *     Scope of a token: `operate`.
          */
         patch: operations["change_reconstruction_api_v1_reconstructions__reconstruction_id__patch"];
@@ -3211,7 +3213,7 @@ export interface components {
             notes?: string | null;
             /**
              * Held
-             * @description Whether it stays in the queue; only while it waits there.
+             * @description Whether it stays in the queue; one that runs returns there, unless it follows its capture.
              */
             held?: boolean | null;
             /**

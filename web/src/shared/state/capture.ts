@@ -21,6 +21,8 @@ export function lengthOf(capture: Capture): string {
 /** Progress, or place in the queue; empty for ended reconstructions. */
 export function progressText(job: Reconstruction): string {
   const left = job.eta_s === null ? "" : `, about ${duration(job.eta_s)} left`;
+  if (job.state === "queued" && job.held && job.progress > 0)
+    return `paused at ${percent(job.progress)}: it goes on from there when it is let go`;
   if (job.state === "queued" && job.held) return "held: others go before it until it is let go";
   if (job.state === "queued")
     return `${job.queue_place === null ? "waiting" : `place ${job.queue_place} in the queue`}${left}`;

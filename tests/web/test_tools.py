@@ -1,6 +1,7 @@
 """Tools of the Scene page: what the splats show, from where, and help."""
 
 import re
+import zipfile
 from collections.abc import Callable
 from typing import Any
 
@@ -149,3 +150,15 @@ def test_many_captures_are_kept_and_deleted_at_once(studied: Studied, visit: Cal
         page.get_by_role("checkbox", name=f"Select {name}").check()
     page.get_by_role("group", name="Selected captures").get_by_role("button", name="Delete").click()
     until(lambda: all(studied.http.get(f"captures/{one}").json()["deleted_at"] for one in ids), "both are deleted")
+
+
+def test_the_results_of_selected_captures_are_downloaded(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit(f"{studied.address}?page=captures&search=desk")
+    page.get_by_role("checkbox", name="Select desk, loose cable").check()
+    bar = page.get_by_role("group", name="Selected captures")
+    assert bar.get_by_role("button", name="Results").is_disabled(), "it was not reconstructed"
+    page.get_by_role("checkbox", name="Select desk, by hand").check()
+    with page.expect_download() as download:
+        bar.get_by_role("button", name="Results").click()
+    with zipfile.ZipFile(download.value.path()) as bundle:
+        assert any(name.endswith("scene.ply") for name in bundle.namelist())

@@ -6,7 +6,13 @@ import * as calls from "../../shared/api/calls";
 import type { Capture } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
 import { bytes } from "../../shared/state/format";
-import { removeFromStore, storeCapture, storeReconstruction } from "../../shared/state/store";
+import {
+  newestReconstruction,
+  removeFromStore,
+  storeCapture,
+  storeReconstruction,
+  useService,
+} from "../../shared/state/store";
 import { toast } from "../../shared/state/toasts";
 import { ActionButton } from "../../shared/ui/access";
 import type { Filter, Order } from "./listing";
@@ -74,6 +80,11 @@ export function SelectionBar({
     toast(`Deleted ${before.length} captures`, { action: { label: "Undo", run: () => void attempt(undo) } });
   };
   const recorded = chosen.filter((one) => one.recording !== null);
+  const jobs = useService((state) => state.reconstructions);
+  const results = chosen.flatMap((one) => {
+    const job = newestReconstruction(jobs, one.id);
+    return job !== null && job.version > 0 ? [job.id] : [];
+  });
   return (
     <div className="selection" role="group" aria-label="Selected captures">
       <strong>{chosen.length} selected</strong>
@@ -90,8 +101,20 @@ export function SelectionBar({
       >
         Re-run
       </ActionButton>
-      <button type="button" disabled={recorded.length === 0} onClick={() => download(recorded)}>
+      <button
+        type="button"
+        disabled={recorded.length === 0}
+        onClick={() => download(recorded.map((one) => calls.address.recording(one.id)))}
+      >
         Download
+      </button>
+      <button
+        type="button"
+        disabled={results.length === 0}
+        title="All files of the newest reconstruction of each, as ZIP"
+        onClick={() => download(results.map(calls.address.bundle))}
+      >
+        Results
       </button>
       <ActionButton disabled={busy} onClick={() => void remove()}>
         Delete
@@ -157,12 +180,12 @@ export function DeletedBar({
   );
 }
 
-/** Recordings, one after the other: browsers ask once whether a page may do that. */
-function download(captures: readonly Capture[]): void {
-  captures.forEach((one, i) => {
+/** Files, one after the other: browsers ask once whether a page may do that. */
+function download(addresses: readonly string[]): void {
+  addresses.forEach((address, i) => {
     setTimeout(() => {
       const link = document.createElement("a");
-      link.href = calls.address.recording(one.id);
+      link.href = address;
       link.download = "";
       link.click();
     }, 400 * i);

@@ -232,7 +232,7 @@ function Row({
       </th>
       <td>
         {when(capture.started_at)}
-        {capture.deleted_at !== null && <span className="dim">deleted {when(capture.deleted_at)}</span>}
+        {capture.deleted_at !== null && <span className="dim"> · deleted {when(capture.deleted_at)}</span>}
       </td>
       <td className="number">{lengthOf(capture)}</td>
       <td className="number">{capture.recording === null ? "–" : bytes(capture.recording.bytes)}</td>

@@ -49,15 +49,11 @@ export function ListControls({
   );
 }
 
-export function SelectionBar({
-  chosen,
-  onDone,
-  onNone,
-}: {
-  chosen: readonly Capture[];
-  onDone: () => void;
-  onNone: () => void;
-}): JSX.Element {
+/** Whether a change is under way, and what makes one of all chosen captures, one after the other. */
+function useEach(
+  chosen: readonly Capture[],
+  onDone: () => void,
+): [boolean, (change: (capture: Capture) => Promise<unknown>) => Promise<void>] {
   const [busy, setBusy] = useState(false);
   const each = async (change: (capture: Capture) => Promise<unknown>): Promise<void> => {
     setBusy(true);
@@ -67,6 +63,19 @@ export function SelectionBar({
     setBusy(false);
     onDone();
   };
+  return [busy, each];
+}
+
+export function SelectionBar({
+  chosen,
+  onDone,
+  onNone,
+}: {
+  chosen: readonly Capture[];
+  onDone: () => void;
+  onNone: () => void;
+}): JSX.Element {
+  const [busy, each] = useEach(chosen, onDone);
   const remove = async (): Promise<void> => {
     const before = [...chosen];
     await each(async (one) => {
@@ -136,16 +145,8 @@ export function DeletedBar({
   onDone: () => void;
   onNone: () => void;
 }): JSX.Element {
-  const [busy, setBusy] = useState(false);
+  const [busy, each] = useEach(chosen, onDone);
   const [asked, setAsked] = useState(false);
-  const each = async (change: (id: string) => Promise<unknown>): Promise<void> => {
-    setBusy(true);
-    await attempt(async () => {
-      for (const one of chosen) await change(one.id);
-    });
-    setBusy(false);
-    onDone();
-  };
   const size = chosen.reduce((sum, one) => sum + (one.recording?.bytes ?? 0), 0);
   return (
     <div className="selection" role="group" aria-label="Selected captures">
@@ -153,7 +154,7 @@ export function DeletedBar({
       <span className="dim">{bytes(size)} of recordings</span>
       {asked ? (
         <>
-          <ActionButton disabled={busy} onClick={() => void each(calls.purgeCapture)}>
+          <ActionButton disabled={busy} onClick={() => void each((one) => calls.purgeCapture(one.id))}>
             Yes, free the disk space
           </ActionButton>
           <button type="button" onClick={() => setAsked(false)}>
@@ -164,7 +165,7 @@ export function DeletedBar({
         <>
           <ActionButton
             disabled={busy}
-            onClick={() => void each(async (id) => storeCapture(await calls.restoreCapture(id)))}
+            onClick={() => void each(async (one) => storeCapture(await calls.restoreCapture(one.id)))}
           >
             Restore
           </ActionButton>

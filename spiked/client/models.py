@@ -945,6 +945,22 @@ class SourceKindsOut(BaseModel):
     items: list[SourceKindOut]
 
 
+class SpikesOut(BaseModel):
+    """
+    When a pixel fired.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    first_frame: Annotated[int, Field(description="Absolute index of the first frame that was looked at.")]
+    frames: Annotated[int, Field(description="Number of recorded frames that were looked at.")]
+    spikes: Annotated[
+        list[int],
+        Field(description="Absolute indices of the frames in which it fired."),
+    ]
+
+
 class Stage(StrEnum):
     """
     The phase of a reconstruction.
@@ -972,16 +988,18 @@ class State(StrEnum):
 
 class StatsOut(BaseModel):
     """
-    Statistics of a few frames.
+    Statistics of a few frames, over all pixels or those of a region.
     """
 
     model_config = ConfigDict(
         extra="ignore",
     )
     frame: Annotated[int, Field(description="Absolute index of the middle one.")]
+    frames: Annotated[int, Field(description="Number of frames in which spikes were counted.")]
     rate_histogram: RateHistogram
     hot_pixels: Annotated[list[list[int]], Field(description="x, y in the upright image.")]
     mean_rate: Annotated[float, Field(description="Spikes a pixel and frame.")]
+    deviation: Annotated[float, Field(description="Standard deviation of the rates of the pixels.")]
 
 
 class Status(StrEnum):

@@ -17,6 +17,7 @@ from spiked_service.base.errors import BusyError
 from spiked_service.base.limits import OverloadedError
 from spiked_service.captures.uploads import UploadBusyError, UploadError, UploadOffsetError, UploadTooLargeError
 from spiked_service.results.frame_images import FrameNotRecordedError
+from spiked_service.results.rate_statistics import NotInImageError
 from spiked_service.store.catalogue import StoreError, UnknownIdError
 
 MEDIA_TYPE = "application/problem+json"
@@ -92,6 +93,7 @@ _STATUS: dict[type[SpikedError], HTTPStatus] = {
     NothingError: HTTPStatus.NOT_FOUND,
     GoneError: HTTPStatus.NOT_FOUND,
     FrameNotRecordedError: HTTPStatus.NOT_FOUND,
+    NotInImageError: HTTPStatus.NOT_FOUND,
     ForbiddenError: HTTPStatus.FORBIDDEN,
     BusyError: HTTPStatus.CONFLICT,
     UploadBusyError: HTTPStatus.CONFLICT,
@@ -111,6 +113,7 @@ _KINDS: dict[type[SpikedError], str] = {
     NothingError: "nothing-there",
     GoneError: "gone",
     FrameNotRecordedError: "not-recorded",
+    NotInImageError: "not-in-image",
     BusyError: "busy",
     KeyReusedError: "idempotency-key-reused",
 }

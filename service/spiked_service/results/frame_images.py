@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +13,7 @@ from spiked.recording import Recording
 from spiked.sensor import Sensor
 from spiked.undistortion import Undistortion
 from spiked_service.results.image_encoding import display_white
+from spiked_service.results.rate_statistics import RateStatistics, Region, statistics_of
 
 _MOMENT_FRAMES = 32
 """Frames of an `interval` image: 1.5 % noise of the spike-aligned rate; motion is blurred over them."""
@@ -21,14 +21,10 @@ _COUNTED_FRAMES = 64
 """Frames of a `rate` image and of the statistics."""
 _ACCUMULATED_FRAMES = 1024
 """Frames of an `accumulation` image."""
+_READ_FRAMES = 256
+"""Frames unpacked at a time."""
 _EDGE_FRAMES = 64
 """Frames on either side of a window that are searched for the spikes that bound it."""
-_BINS = 64
-"""Bins of the histogram of rates, 0 to 1 spike a frame."""
-_HOT_RATE = 0.3
-"""Excess rate of a hot pixel over the median of its 5x5 neighbours, spikes per frame."""
-_HOT_MOST = 64
-"""Hot pixels listed, the worst first."""
 
 
 class FrameNotRecordedError(RecordingError):
@@ -89,19 +85,6 @@ class Picture:
     """Absolute index of the middle frame."""
 
 
-@dataclass(frozen=True)
-class Statistics:
-    """Spike rates of the pixels."""
-
-    frame: int
-    rate_histogram: list[int]
-    """Number of pixels by rate, in 64 equal bins from 0 to 1 spike per frame."""
-    hot_pixels: list[tuple[int, int]]
-    """x, y of pixels that fire much more often than their neighbours, at most 64."""
-    mean_rate: float
-    """Spikes per pixel and frame."""
-
-
 def frame_window_at(recording: Recording, frame: int | None, first_frame: int = 0) -> FrameWindow:
     """The frames around absolute index `frame`, or around the middle of the recording if None.
 
@@ -145,19 +128,27 @@ def picture(window: FrameWindow, kind: PictureKind, white: float | None, undisto
     return Picture(image, white or display_white(image), window.frame)
 
 
-def statistics(window: FrameWindow) -> Statistics:
-    """Spike rates over `_COUNTED_FRAMES` frames."""
-    rate = _rate(window.aligned(_COUNTED_FRAMES))
-    levels = (rate * 255).clip(0, 255).astype(np.uint8)
-    excess = levels.astype(np.int16) - cv2.medianBlur(levels, 5)
-    rows, columns = np.nonzero(excess > _HOT_RATE * 255)
-    worst = np.argsort(-excess[rows, columns])[:_HOT_MOST]
-    return Statistics(
-        frame=window.frame,
-        rate_histogram=np.histogram(rate, _BINS, (0, 1))[0].tolist(),
-        hot_pixels=[(int(columns[k]), int(rows[k])) for k in worst],
-        mean_rate=float(rate.mean()),
-    )
+def statistics(window: FrameWindow, region: Region | None = None) -> RateStatistics:
+    """Spike rates over `_COUNTED_FRAMES` frames. Raises NotInImageError."""
+    aligned = window.aligned(_COUNTED_FRAMES)
+    return statistics_of(aligned.count, aligned.end - aligned.begin, window.frame, region)
+
+
+def spikes_of(window: FrameWindow, x: int, y: int, frames: int) -> tuple[int, list[int]]:
+    """Absolute indices of the frames in which a pixel of the upright image fired, and that of the first one looked at.
+
+    Looks at `frames` recorded frames around the middle one. Raises NotInImageError.
+    """
+    recording = window.recording
+    Region(x, y, 1, 1).within(window.sensor.width, window.sensor.height)
+    first = min(max(0, window.row - frames // 2), max(0, recording.frames - frames))
+    last = min(recording.frames, first + frames)
+    fired: list[int] = []
+    for begin in range(first, last, _READ_FRAMES):
+        images = recording.images(begin, min(_READ_FRAMES, last - begin))
+        fired += [begin + int(row) for row in np.flatnonzero(images[:, y, x])]
+    absolute = [window.first_frame + recording.capture_index(row) for row in fired]
+    return window.first_frame + recording.capture_index(first), absolute
 
 
 def _rate(window: Window) -> NDArray[np.float32]:

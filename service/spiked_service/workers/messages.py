@@ -331,12 +331,12 @@ class PreviewTaken(BaseModel):
     """Rate shown as white, spikes a frame."""
     images: dict[PreviewKind, str]
     """WebP, base64."""
-    mean_rate: float
-    """Spikes per pixel and frame."""
     rate_histogram: list[int]
     """Pixels by rate, in equal bins from 0 to 1 spike a frame."""
-    hot_pixels: list[tuple[int, int]]
-    """x, y of pixels that fire much more often than their neighbours, at most 64."""
+    counts: str
+    """Spikes of the pixels, a PNG of 8 or 16 bits, base64."""
+    counted: int
+    """Frames in which they were counted."""
 
 
 class Logged(BaseModel):

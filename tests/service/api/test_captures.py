@@ -127,6 +127,43 @@ def test_a_thumbnail_and_statistics(service: Any, done: CaptureOut) -> None:
     assert abs(stats["frame"] - 200) <= 1
 
 
+def test_statistics_of_a_region_and_spikes_of_a_pixel(service: Any, done: CaptureOut, tmp_path: Path) -> None:
+    path = service.client.save_recording(done.id, tmp_path / "rec.dat")
+    images = open_recording(path).images(0, 512)
+    answer = service.http.get(f"captures/{done.id}/spikes", params={"x": 40, "y": 30, "frame": 256, "frames": 200})
+    assert answer.json() == {
+        "first_frame": 156,
+        "frames": 200,
+        "spikes": [156 + int(k) for k in np.flatnonzero(images[156:356, 30, 40])],
+    }
+    every = service.http.get(f"captures/{done.id}/spikes", params={"x": 159, "y": 99}).json()
+    assert (every["first_frame"], every["frames"]) == (0, 512) and len(every["spikes"]) == images[:, 99, 159].sum()
+
+    region = {"x": 30, "y": 20, "width": 16, "height": 9}
+    stats = service.http.get(f"captures/{done.id}/stats", params={"frame": 256, **region}).json()
+    assert (stats["frame"], stats["frames"]) == (256, 64)
+    rate = images[224:288, 20:29, 30:46].mean(0)
+    assert abs(stats["mean_rate"] - rate.mean()) < 1e-6 and abs(stats["deviation"] - rate.std()) < 1e-6
+    assert sum(stats["rate_histogram"]["counts"]) == 16 * 9
+    assert sum(service.http.get(f"captures/{done.id}/stats?x=159&y=98").json()["rate_histogram"]["counts"]) == 2
+    for where in ("stats?x=160", "stats?x=1&width=160", "stats?height=101", "spikes?x=160&y=0", "spikes?x=0&y=100"):
+        refused = service.http.get(f"captures/{done.id}/{where}")
+        assert refused.status_code == 404 and "160x100" in refused.json()["detail"]
+
+
+def test_statistics_of_a_region_while_frames_come(service: Any) -> None:
+    capture = service.client.start_capture("sim:?width=64&height=48", reconstruct=False)
+    deadline = time.monotonic() + 60
+    while (answer := service.http.get(f"captures/{capture.id}/stats?x=8&y=4&width=20&height=10")).status_code == 404:
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    stats = answer.json()
+    assert sum(stats["rate_histogram"]["counts"]) == 200 and stats["frames"] > 0 and 0 < stats["mean_rate"] < 1
+    assert service.http.get(f"captures/{capture.id}/spikes?x=8&y=4").status_code in (200, 404)
+    service.client.stop_capture(capture.id)
+    service.client.wait_for_capture(capture.id, 60)
+
+
 def test_names_notes_and_keeping(service: Any, done: CaptureOut) -> None:
     changed = service.client.change_capture(done.id, name="renamed", keep=True)
     assert (changed.name, changed.notes, changed.keep) == ("renamed", done.notes, True)

@@ -4,7 +4,7 @@ import base64
 import threading
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.routing import APIRoute
 
 from spiked.errors import ConfigurationError
@@ -15,12 +15,21 @@ from spiked_service.api.problems import NotReadyError, problems
 from spiked_service.api.results import Result, Results
 from spiked_service.api.routes.parameters import BINARY, NOT_MODIFIED, PICTURES, WishedImage
 from spiked_service.api.schemas.base import IN_DIGITS, LARGEST_INTEGER
-from spiked_service.api.schemas.captures import StatsOut
+from spiked_service.api.schemas.captures import SpikesOut, StatsOut
 from spiked_service.api.schemas.views import ViewRequest
 from spiked_service.api.views import image_format, views_response
 from spiked_service.captures.captures import Captures
-from spiked_service.results.frame_images import FrameWindow, Picture, PictureKind, frame_window_at, picture, statistics
+from spiked_service.results.frame_images import (
+    FrameWindow,
+    Picture,
+    PictureKind,
+    frame_window_at,
+    picture,
+    spikes_of,
+    statistics,
+)
 from spiked_service.results.image_encoding import ImageFormat, encode, thumbnail
+from spiked_service.results.rate_statistics import Region, from_text, statistics_of
 from spiked_service.results.view_renderer import ViewRenderer
 from spiked_service.store.folder import DataFolder
 from spiked_service.workers.messages import PreviewKind
@@ -39,6 +48,12 @@ White = Annotated[
 ]
 Undistorted = Annotated[
     bool, Query(description="Without the distortion of the lens: of a recorded frame, or of the scene.")
+]
+Column = Annotated[int, Query(ge=0, le=LARGEST_INTEGER, description="Of the upright image, from the left."), IN_DIGITS]
+Row = Annotated[int, Query(ge=0, le=LARGEST_INTEGER, description="Of the upright image, from the top."), IN_DIGITS]
+Frames = Annotated[int, Query(ge=1, le=8192, description="Recorded frames to look at, around `frame`."), IN_DIGITS]
+Side = Annotated[
+    int | None, Query(ge=1, le=LARGEST_INTEGER, description="Of the region, pixels. Default: to the edge."), IN_DIGITS
 ]
 _PICTURE: dict[int | str, dict[str, Any]] = {
     200: {"description": "The image; X-Frame is its middle frame.", "content": PICTURES},
@@ -96,16 +111,28 @@ def preview_routes(
         return files.content(request, path.read_bytes(), "image/webp", files.etag(files.stamp(path)))
 
     @router.get("/stats", responses=problems(404))
-    def get_stats(capture_id: str, frame: Frame = None) -> StatsOut:
-        """Spike rates over a few frames: the newest, or those around a recorded frame."""
+    def get_stats(capture_id: str, region: Annotated[Region | None, Depends(_region)], frame: Frame = None) -> StatsOut:
+        """Spike rates over a few frames, the newest or those around a recorded frame, of all pixels or of a region."""
         if frame is None and captures.get(capture_id).row.state.acquiring:
-            stats = captures.picture(capture_id)
-            if stats is None:
+            taken = captures.picture(capture_id)
+            if taken is None:
                 raise NotReadyError(f"capture {capture_id} has no frames yet")
-            return StatsOut.of(stats)
-        return StatsOut.of(statistics(_frame_window(captures, folder, capture_id, frame)))
+            return StatsOut.of(statistics_of(from_text(taken.counts), taken.counted, taken.frame, region))
+        return StatsOut.of(statistics(_frame_window(captures, folder, capture_id, frame), region))
+
+    @router.get("/spikes", responses=problems(404))
+    def get_spikes(capture_id: str, x: Column, y: Row, frame: Frame = None, frames: Frames = 1024) -> SpikesOut:
+        """When a pixel of a recording fired."""
+        window = _frame_window(captures, folder, capture_id, frame)
+        first, spikes = spikes_of(window, x, y, frames)
+        return SpikesOut(first_frame=first, frames=min(frames, window.recording.frames), spikes=spikes)
 
     return router
+
+
+def _region(x: Column = 0, y: Row = 0, width: Side = None, height: Side = None) -> Region | None:
+    """The region that is asked for; None: all pixels."""
+    return None if (x, y, width, height) == (0, 0, None, None) else Region(x, y, width, height)
 
 
 def _live_preview(captures: Captures, capture_id: str, kind: PreviewKind) -> Response:

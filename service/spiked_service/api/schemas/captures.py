@@ -29,11 +29,10 @@ from spiked_service.api.schemas.base import (
     example,
     examples,
 )
-from spiked_service.results.frame_images import Statistics
+from spiked_service.results.rate_statistics import RateStatistics
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.rows import CaptureState, Counters, Grade, Origin, Quality, Recorded
 from spiked_service.store.snapshot import Snapshot
-from spiked_service.workers.messages import PreviewTaken
 
 
 class ConsumerOut(Out):
@@ -443,19 +442,31 @@ class RateHistogram(Out):
 
 
 class StatsOut(Out):
-    """Statistics of a few frames."""
+    """Statistics of a few frames, over all pixels or those of a region."""
 
     frame: int = Field(description="Absolute index of the middle one.")
+    frames: int = Field(description="Number of frames in which spikes were counted.")
     rate_histogram: RateHistogram
     hot_pixels: list[tuple[int, int]] = Field(description="x, y in the upright image.")
     mean_rate: float = Field(description="Spikes a pixel and frame.")
+    deviation: float = Field(description="Standard deviation of the rates of the pixels.")
 
     @classmethod
-    def of(cls, found: Statistics | PreviewTaken) -> "StatsOut":
+    def of(cls, found: RateStatistics) -> "StatsOut":
         """As it is shown."""
         return cls(
             frame=found.frame,
+            frames=found.frames,
             rate_histogram=RateHistogram.of(found.rate_histogram),
             hot_pixels=found.hot_pixels,
             mean_rate=found.mean_rate,
+            deviation=found.deviation,
         )
+
+
+class SpikesOut(Out):
+    """When a pixel fired."""
+
+    first_frame: int = Field(description="Absolute index of the first frame that was looked at.")
+    frames: int = Field(description="Number of recorded frames that were looked at.")
+    spikes: list[int] = Field(description="Absolute indices of the frames in which it fired.")

@@ -8,13 +8,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.blocks import Window, aligned_window
+from spiked.blocks import aligned_window
 from spiked.recon.frontend.demosaic import fill_mosaic
 from spiked.recon.frontend.mosaic_check import layout_warnings
 from spiked.ring import End, Frames, Gap, Policy, RingReader
 from spiked.sensor import Sensor
 from spiked.whole_files import write_atomically
 from spiked_service.results.image_encoding import display_white, thumbnail
+from spiked_service.results.rate_statistics import as_text, statistics_of
 from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.messages import PreviewCommand, PreviewKind, PreviewTaken, Warned
 
@@ -24,12 +25,6 @@ _PERIOD_S = 0.15
 """Pause between two sets of images, seconds."""
 _WAIT_S = 0.1
 """Longest wait for frames, seconds, so that the worker can leave."""
-_BINS = 64
-"""Bins of the histogram of rates, 0 to 1 spike a frame."""
-_HOT_RATE = 0.3
-"""Spikes a frame by which a hot pixel exceeds the median of its neighbours."""
-_HOT_MOST = 64
-"""Hot pixels listed, the worst first."""
 _MEMORY = 0.85
 """Weight of the accumulated image when another is added."""
 _QUALITY = 85
@@ -87,7 +82,8 @@ class PreviewRenderer:
         """Images of compact frames uint8 [n, frame_bytes] starting at index `first`."""
         window = aligned_window(frames, self._sensor, first, first + block, first + len(frames) - block)
         interval = window.rate(fill=True)
-        rate = window.count.astype(np.float32) / np.float32(window.end - window.begin)
+        counted = window.end - window.begin
+        rate = window.count.astype(np.float32) / np.float32(counted)
         old = rate if self._accumulated is None else self._accumulated
         accumulated = (_MEMORY * old + (1 - _MEMORY) * rate).astype(np.float32)
         self._accumulated = accumulated
@@ -106,9 +102,9 @@ class PreviewRenderer:
             height=self._sensor.height,
             white=white,
             images={kind: base64.b64encode(_webp(shown[kind], white[kind])).decode() for kind in shown},
-            mean_rate=float(rate.mean()),
-            rate_histogram=np.histogram(rate, _BINS, (0, 1))[0].tolist(),
-            hot_pixels=_hot(window),
+            rate_histogram=statistics_of(window.count, counted, window.begin).rate_histogram,
+            counts=as_text(window.count),
+            counted=counted,
         )
 
     def layout_warning(self) -> str | None:
@@ -134,13 +130,3 @@ def _webp(image: Image, white: float) -> bytes:
         pixels = pixels[..., ::-1]
     _, encoded = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
     return encoded.tobytes()
-
-
-def _hot(window: Window) -> list[tuple[int, int]]:
-    """x, y of pixels that fire far more often than the median of their neighbours."""
-    frames = window.end - window.begin
-    rate = (window.count * (255.0 / frames)).clip(0, 255).astype(np.uint8)
-    excess = rate.astype(np.int16) - cv2.medianBlur(rate, 5)
-    rows, columns = np.nonzero(excess > _HOT_RATE * 255)
-    worst = np.argsort(-excess[rows, columns])[:_HOT_MOST]
-    return [(int(columns[k]), int(rows[k])) for k in worst]

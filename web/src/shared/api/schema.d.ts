@@ -489,11 +489,33 @@ export interface paths {
         };
         /**
          * Get Stats
-         * @description Spike rates over a few frames: the newest, or those around a recorded frame.
+         * @description Spike rates over a few frames, the newest or those around a recorded frame, of all pixels or of a region.
          *
          *     Scope of a token: `read`.
          */
         get: operations["get_stats_api_v1_captures__capture_id__stats_get"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/captures/{capture_id}/spikes": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Spikes
+         * @description When a pixel of a recording fired.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["get_spikes_api_v1_captures__capture_id__spikes_get"];
         put?: never;
         post?: never;
         delete?: never;
@@ -3791,6 +3813,27 @@ export interface components {
             items: components["schemas"]["SourceKindOut"][];
         };
         /**
+         * SpikesOut
+         * @description When a pixel fired.
+         */
+        SpikesOut: {
+            /**
+             * First Frame
+             * @description Absolute index of the first frame that was looked at.
+             */
+            first_frame: number;
+            /**
+             * Frames
+             * @description Number of recorded frames that were looked at.
+             */
+            frames: number;
+            /**
+             * Spikes
+             * @description Absolute indices of the frames in which it fired.
+             */
+            spikes: number[];
+        };
+        /**
          * Stage
          * @description The phase of a reconstruction.
          * @enum {string}
@@ -3844,7 +3887,7 @@ export interface components {
         } & unknown;
         /**
          * StatsOut
-         * @description Statistics of a few frames.
+         * @description Statistics of a few frames, over all pixels or those of a region.
          */
         StatsOut: {
             /**
@@ -3852,6 +3895,11 @@ export interface components {
              * @description Absolute index of the middle one.
              */
             frame: number;
+            /**
+             * Frames
+             * @description Number of frames in which spikes were counted.
+             */
+            frames: number;
             rate_histogram: components["schemas"]["RateHistogram"];
             /**
              * Hot Pixels
@@ -3866,6 +3914,11 @@ export interface components {
              * @description Spikes a pixel and frame.
              */
             mean_rate: number;
+            /**
+             * Deviation
+             * @description Standard deviation of the rates of the pixels.
+             */
+            deviation: number;
         };
         /**
          * Status
@@ -7060,6 +7113,14 @@ export interface operations {
             query?: {
                 /** @description Absolute index of a recorded frame. Default: the newest frames. */
                 frame?: number | null;
+                /** @description Of the upright image, from the left. */
+                x?: number;
+                /** @description Of the upright image, from the top. */
+                y?: number;
+                /** @description Of the region, pixels. Default: to the edge. */
+                width?: number | null;
+                /** @description Of the region, pixels. Default: to the edge. */
+                height?: number | null;
             };
             header?: never;
             path: {
@@ -7076,6 +7137,109 @@ export interface operations {
                 };
                 content: {
                     "application/json": components["schemas"]["StatsOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_spikes_api_v1_captures__capture_id__spikes_get: {
+        parameters: {
+            query: {
+                /** @description Of the upright image, from the left. */
+                x: number;
+                /** @description Of the upright image, from the top. */
+                y: number;
+                /** @description Absolute index of a recorded frame. Default: the newest frames. */
+                frame?: number | null;
+                /** @description Recorded frames to look at, around `frame`. */
+                frames?: number;
+            };
+            header?: never;
+            path: {
+                capture_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["SpikesOut"];
                 };
             };
             /** @description The request is malformed. */

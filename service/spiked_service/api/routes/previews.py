@@ -110,6 +110,13 @@ def preview_routes(
                     write_atomically(path, thumbnail(picture(window, PictureKind.INTERVAL, None).image))
         return files.content(request, path.read_bytes(), "image/webp", files.etag(files.stamp(path)))
 
+    _add_measurements(router, captures, folder)
+    return router
+
+
+def _add_measurements(router: APIRouter, captures: Captures, folder: DataFolder) -> None:
+    """Routes of rates and of spikes."""
+
     @router.get("/stats", responses=problems(404))
     def get_stats(capture_id: str, region: Annotated[Region | None, Depends(_region)], frame: Frame = None) -> StatsOut:
         """Spike rates over a few frames, the newest or those around a recorded frame, of all pixels or of a region."""
@@ -126,8 +133,6 @@ def preview_routes(
         window = _frame_window(captures, folder, capture_id, frame)
         first, spikes = spikes_of(window, x, y, frames)
         return SpikesOut(first_frame=first, frames=min(frames, window.recording.frames), spikes=spikes)
-
-    return router
 
 
 def _region(x: Column = 0, y: Row = 0, width: Side = None, height: Side = None) -> Region | None:

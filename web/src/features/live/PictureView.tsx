@@ -9,6 +9,8 @@ import { isFinished } from "../../shared/state/store";
 import { Icon } from "../../shared/ui/icons";
 import { Empty, Segmented } from "../../shared/ui/parts";
 import { Histogram } from "./Histogram";
+import { RegionOverlay, RegionPanel } from "./RegionTool";
+import { type Region, same, within } from "./region";
 import { usePicture } from "./usePicture";
 
 const KINDS: readonly { value: PreviewKind; label: string; hint: string }[] = [
@@ -22,17 +24,18 @@ const KINDS: readonly { value: PreviewKind; label: string; hint: string }[] = [
 ];
 const STATS_MS = 1000;
 
-function useStats(capture: Capture | null): Stats | null {
-  const [value, setValue] = useState<{ id: string; stats: Stats } | null>(null);
+function useStats(capture: Capture | null, region: Region | null): Stats | null {
+  const [value, setValue] = useState<{ key: string; stats: Stats } | null>(null);
   const id = capture?.id ?? null;
+  const key = `${id ?? ""} ${JSON.stringify(region)}`;
   const over = capture === null || isFinished(capture);
   const begun = over || (capture.counters?.received ?? 0) > 0;
   useEffect(() => {
     if (id === null || !begun) return;
     let current = true;
     const ask = (): void => {
-      stats(id).then(
-        (got) => current && setValue({ id, stats: got }),
+      stats(id, region).then(
+        (got) => current && setValue({ key, stats: got }),
         () => undefined, // the picture says that there is nothing yet
       );
     };
@@ -42,8 +45,8 @@ function useStats(capture: Capture | null): Stats | null {
       current = false;
       clearInterval(timer);
     };
-  }, [id, over, begun]);
-  return value?.id === id ? value.stats : null;
+  }, [id, over, begun, key, region]);
+  return value?.key === key ? value.stats : null;
 }
 
 export function PictureView({ capture }: { capture: Capture | null }): JSX.Element {
@@ -52,14 +55,17 @@ export function PictureView({ capture }: { capture: Capture | null }): JSX.Eleme
   const [marked, setMarked] = useState(true);
   const gain = 2 ** stops;
   const picture = usePicture(capture, kind, gain);
-  const measured = useStats(capture);
+  const sensor = capture?.sensor ?? null;
+  const [chosen, setChosen] = useState<Region | null>(null);
+  const fits = chosen === null || sensor === null ? chosen : within(chosen, sensor);
+  const region = fits !== null && chosen !== null && same(fits, chosen) ? chosen : null; // of a larger camera before
+  const measured = useStats(capture, region);
   const histogram = measured?.rate_histogram ?? null;
   const image = useRef<HTMLImageElement>(null);
   useEffect(() => {
     if (image.current !== null)
       image.current.style.filter = picture?.gained === true || gain === 1 ? "" : `brightness(${gain})`;
   }, [gain, picture?.gained]);
-  const sensor = capture?.sensor ?? null;
   const hot = measured?.hot_pixels ?? [];
   return (
     <section className="panel picture" aria-label="Live picture">
@@ -102,10 +108,21 @@ export function PictureView({ capture }: { capture: Capture | null }): JSX.Eleme
                 ))}
               </svg>
             )}
+            {sensor !== null && <RegionOverlay sensor={sensor} region={region} onRegion={setChosen} />}
             <Caption capture={capture} frame={picture.frame} />
           </div>
         )}
       </div>
+      {capture !== null && sensor !== null && picture !== null && (
+        <RegionPanel
+          capture={capture.id}
+          sensor={sensor}
+          region={region}
+          stats={measured}
+          over={isFinished(capture)}
+          onRegion={setChosen}
+        />
+      )}
       <Histogram
         histogram={histogram}
         meanRate={measured?.mean_rate ?? null}

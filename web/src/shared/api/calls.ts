@@ -23,6 +23,7 @@ import type {
   ScaleRequest,
   Setting,
   SourceKind,
+  Spikes,
   Stats,
   System,
   TagScale,
@@ -126,8 +127,21 @@ export const restoreCapture = (id: string): Promise<Capture> =>
   answered(client.POST("/api/v1/captures/{capture_id}:restore", ofCapture(id)));
 export const purgeCapture = (id: string): Promise<unknown> =>
   answered(client.POST("/api/v1/captures/{capture_id}:purge", ofCapture(id)));
-export const stats = (id: string): Promise<Stats> =>
-  answered(client.GET("/api/v1/captures/{capture_id}/stats", ofCapture(id)));
+/** Over all pixels, or a region of the picture. */
+export const stats = (
+  id: string,
+  region: { x: number; y: number; width: number; height: number } | null = null,
+): Promise<Stats> =>
+  answered(
+    client.GET("/api/v1/captures/{capture_id}/stats", {
+      params: { path: { capture_id: id }, query: region ?? {} },
+    }),
+  );
+/** When a pixel fired, in the middle of the recording. */
+export const spikes = (id: string, x: number, y: number): Promise<Spikes> =>
+  answered(
+    client.GET("/api/v1/captures/{capture_id}/spikes", { params: { path: { capture_id: id }, query: { x, y } } }),
+  );
 
 export const reconstruction = (id: string): Promise<Reconstruction> =>
   answered(client.GET("/api/v1/reconstructions/{reconstruction_id}", ofReconstruction(id)));

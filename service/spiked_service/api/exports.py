@@ -88,32 +88,42 @@ class Exports:
             raise OverloadedError("another export is being made; try again when it is ready")
         try:
             self._place.mkdir(exist_ok=True)
-            self._tidy()
-            errors: list[SpikedError] = []
-            ended = threading.Event()
-
-            def on_event(event: WorkerEvent) -> None:
-                if isinstance(event, WorkerError):
-                    errors.append((DiskFullError if event.disk_full else ConfigurationError)(event.reason))
-
-            def on_exit(reason: str | None) -> None:
-                if reason is not None:
-                    errors.append(ConfigurationError(reason))
-                ended.set()
-
-            WorkerProcess(command, self._folder.path / "exports.log", on_event, on_exit)
-            ended.wait()
-            if errors:
-                raise errors[0]
+            self._tidy(KEPT - 1)
+            try:
+                self._run(command)
+            except DiskFullError:
+                if not self._tidy(0):
+                    raise
+                self._run(command)  # with the space of those that were kept
         finally:
             self._making.release()
 
-    def _tidy(self) -> None:
-        """Remove the oldest files, and what a worker left that was killed."""
+    def _run(self, command: ExportCommand) -> None:
+        errors: list[SpikedError] = []
+        ended = threading.Event()
+
+        def on_event(event: WorkerEvent) -> None:
+            if isinstance(event, WorkerError):
+                errors.append((DiskFullError if event.disk_full else ConfigurationError)(event.reason))
+
+        def on_exit(reason: str | None) -> None:
+            if reason is not None:
+                errors.append(ConfigurationError(reason))
+            ended.set()
+
+        WorkerProcess(command, self._folder.path / "exports.log", on_event, on_exit)
+        ended.wait()
+        if errors:
+            raise errors[0]
+
+    def _tidy(self, most: int) -> bool:
+        """Keep this many files, the newest, and nothing that a worker left that was killed; whether a file went."""
         files = sorted(self._place.iterdir(), key=lambda file: file.stat().st_mtime)
-        kept = [file for file in files if not file.name.startswith(".")][-KEPT + 1 :]
+        whole = [file for file in files if not file.name.startswith(".")]
+        kept = whole[len(whole) - min(most, len(whole)) :]
         for file in files:
             if file.is_dir():
                 shutil.rmtree(file)
             elif file not in kept:
                 file.unlink()
+        return len(kept) < len(whole)

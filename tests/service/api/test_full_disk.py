@@ -57,5 +57,11 @@ def test_a_daemon_on_a_full_disk_answers_and_works_again_with_room(tmp_path: Pat
         for number in range(5):  # left by workers that were killed
             shutil.copytree(disk / "profiles", disk / "exports" / f".export-{number}")
         assert service.http.get(f"{job}/exports/ply").status_code == 200
-        assert [path.name[:1] for path in (disk / "exports").iterdir()] == ["0"]
+        (kept,) = (disk / "exports").iterdir()
+        assert kept.name.startswith("0")
+        fill(disk, left_bytes=kept.stat().st_size // 2)
+        assert service.http.get(f"{job}/exports/ply?views=3").status_code == 200, "the kept one makes room"
+        (other,) = (disk / "exports").iterdir()
+        assert other.name != kept.name
+        (disk / "others").unlink()
         assert service.http.patch(f"captures/{done.id}", json={"name": "new"}).status_code == 200

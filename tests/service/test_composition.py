@@ -17,7 +17,7 @@ SERVICE = Path(spiked_service.__file__).parent
 ELSEWHERE = {
     ("Catalogue", "captures/reconcile.py"),  # opens it, or a new one in place of a damaged one
     ("Catalogue", "store/backup.py"),
-    ("DataFolder", "cli/commands/backup.py"),  # of a service that need not run
+    ("DataFolder", "cli/commands/restore.py"),  # of a service that need not run
     ("ReloadableSettings", "cli/commands/serve.py"),  # read from the flags of the command
     ("Tokens", "cli/commands/token.py"),
 }

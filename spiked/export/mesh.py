@@ -118,10 +118,10 @@ def _integrated(volume: _Volume, views: Sequence[RenderedView]) -> tuple[Floats,
                 view.rotation,
                 view.centre,
                 np.array([optics.fx, optics.fy, optics.cx, optics.cy]),
-                None if optics.distortion is None else optics.distortion.arguments(),
                 TRUNCATION * volume.step,
                 total[rows],
                 seen[rows],
+                **optics.lens(),
             )
 
     with ThreadPoolExecutor(usable_cores()) as threads:

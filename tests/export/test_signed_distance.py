@@ -28,9 +28,8 @@ def test_distances_are_those_of_the_camera_model(lens: Distortion | None) -> Non
     corners = random.uniform(-2, 2, (300, 3))
     total, seen = np.zeros((300, SIDE**3), np.float32), np.zeros((300, SIDE**3), np.int32)
     focal = np.array([optics.fx, optics.fy, optics.cx, optics.cy])
-    given = None if lens is None else lens.arguments()
     for _ in range(2):  # they add up
-        _dense.add_distances(corners, STEP, SIDE, depth, rotation, centre, focal, given, REACH, total, seen)
+        _dense.add_distances(corners, STEP, SIDE, depth, rotation, centre, focal, REACH, total, seen, **optics.lens())
     within = np.stack(np.meshgrid(*(np.arange(SIDE),) * 3, indexing="ij"), -1).reshape(-1, 3)
     local = (corners[:, None] + (within + 0.5) * STEP - centre) @ rotation
     x, y = np.moveaxis(np.floor(optics.project(local)).astype(int), -1, 0)
@@ -44,7 +43,7 @@ def test_distances_are_those_of_the_camera_model(lens: Distortion | None) -> Non
 
 
 def test_arrays_of_other_shapes_are_refused() -> None:
-    one = (np.zeros((2, 3)), STEP, SIDE, np.zeros((3, 3), np.float32), np.eye(3), np.zeros(3), np.ones(4), None, REACH)
+    one = (np.zeros((2, 3)), STEP, SIDE, np.zeros((3, 3), np.float32), np.eye(3), np.zeros(3), np.ones(4), REACH)
     with pytest.raises(ValueError, match="each block"):
         _dense.add_distances(*one, np.zeros((1, 64), np.float32), np.zeros((2, 64), np.int32))
     with pytest.raises(ValueError, match="voxel of a block"):

@@ -120,10 +120,10 @@ class Exports:
         """Keep this many files, the newest, and nothing that a worker left that was killed; whether a file went."""
         files = sorted(self._place.iterdir(), key=lambda file: file.stat().st_mtime)
         whole = [file for file in files if not file.name.startswith(".")]
-        kept = whole[len(whole) - min(most, len(whole)) :]
+        gone = whole[: max(0, len(whole) - most)]
         for file in files:
             if file.is_dir():
                 shutil.rmtree(file)
-            elif file not in kept:
+            elif file in gone or file.name.startswith("."):
                 file.unlink()
-        return len(kept) < len(whole)
+        return bool(gone)

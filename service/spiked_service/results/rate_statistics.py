@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from spiked.errors import ConfigurationError
 
-__all__ = ["NotInImageError", "RateStatistics", "Region", "as_text", "from_text", "statistics_of"]
+__all__ = ["NotInImageError", "RateStatistics", "Region", "as_text", "from_text", "histogram_of", "statistics_of"]
 
 _BINS = 64
 """Bins of the histogram of rates, 0 to 1 spike a frame."""
@@ -54,7 +54,7 @@ class RateStatistics:
     frames: int
     """Number of frames in which spikes were counted."""
     rate_histogram: list[int]
-    """Number of pixels by rate, in 64 equal bins from 0 to 1 spike per frame."""
+    """As of `histogram_of`."""
     hot_pixels: list[tuple[int, int]]
     """x, y of pixels that fire much more often than their neighbours, at most 64, the worst first."""
     mean_rate: float
@@ -74,11 +74,17 @@ def statistics_of(counts: NDArray[np.uint16], frames: int, frame: int, region: R
     return RateStatistics(
         frame=frame,
         frames=frames,
-        rate_histogram=np.histogram(inside, _BINS, (0, 1))[0].tolist(),
+        rate_histogram=histogram_of(inside),
         hot_pixels=[(x, y) for x, y in _hot(rate) if rows.start <= y < rows.stop and columns.start <= x < columns.stop],
         mean_rate=float(inside.mean()),
         deviation=float(inside.std()),
     )
+
+
+def histogram_of(rate: NDArray[np.float32]) -> list[int]:
+    """Number of pixels by rate, in 64 equal bins from 0 to 1 spike per frame."""
+    counts: list[int] = np.histogram(rate, _BINS, (0, 1))[0].tolist()
+    return counts
 
 
 def as_text(counts: NDArray[np.uint16]) -> str:

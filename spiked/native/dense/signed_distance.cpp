@@ -33,8 +33,8 @@ inline double depth_at(const View& view, double x, double y) {
 
 void add_distances(const Array<const double, 2>& corners, double step, int side, const Array<const float, 2>& depth,
                    const Array<const double, 2>& rotation, const Array<const double, 1>& centre,
-                   const Array<const double, 1>& focal, const std::optional<Array<const double, 1>>& lens, double reach,
-                   const Array<float, 2>& total, const Array<int32_t, 2>& seen) {
+                   const Array<const double, 1>& focal, double reach, const Array<float, 2>& total,
+                   const Array<int32_t, 2>& seen, const std::optional<Array<const double, 1>>& lens) {
     const auto voxels = static_cast<size_t>(side) * side * side;
     expect(side > 0 && corners.shape(1) == 3, "corners have the shape [n, 3], and a block has a side");
     expect(rotation.shape(0) == 3 && rotation.shape(1) == 3 && centre.shape(0) == 3, "a pose is [3, 3] and [3]");
@@ -75,7 +75,9 @@ void add_distances(const Array<const double, 2>& corners, double step, int side,
 }  // namespace
 
 void bind_signed_distance(nb::module_& m) {
-    m.def("add_distances", &add_distances,
+    m.def("add_distances", &add_distances, nb::arg("corners"), nb::arg("step"), nb::arg("side"), nb::arg("depth"),
+          nb::arg("rotation"), nb::arg("centre"), nb::arg("camera"), nb::arg("reach"), nb::arg("total"),
+          nb::arg("seen"), nb::arg("lens") = nb::none(),
           "For blocks of side^3 voxels with these corners [n, 3]: adds min(distance / reach, 1) in front of the\n"
           "surface that a depth image shows, and down to -1 behind it, and counts the voxels that it was added to.");
 }

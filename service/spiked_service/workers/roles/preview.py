@@ -15,7 +15,7 @@ from spiked.ring import End, Frames, Gap, Policy, RingReader
 from spiked.sensor import Sensor
 from spiked.whole_files import write_atomically
 from spiked_service.results.image_encoding import display_white, thumbnail
-from spiked_service.results.rate_statistics import as_text, statistics_of
+from spiked_service.results.rate_statistics import as_text, histogram_of
 from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.messages import PreviewCommand, PreviewKind, PreviewTaken, Warned
 
@@ -102,7 +102,7 @@ class PreviewRenderer:
             height=self._sensor.height,
             white=white,
             images={kind: base64.b64encode(_webp(shown[kind], white[kind])).decode() for kind in shown},
-            rate_histogram=statistics_of(window.count, counted, window.begin).rate_histogram,
+            rate_histogram=histogram_of(rate),
             counts=as_text(window.count),
             counted=counted,
         )

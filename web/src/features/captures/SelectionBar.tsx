@@ -49,6 +49,12 @@ export function ListControls({
   );
 }
 
+interface Selection {
+  chosen: readonly Capture[];
+  onDone: () => void;
+  onNone: () => void;
+}
+
 /** Whether a change is under way, and what makes one of all chosen captures, one after the other. */
 function useEach(
   chosen: readonly Capture[],
@@ -66,15 +72,7 @@ function useEach(
   return [busy, each];
 }
 
-export function SelectionBar({
-  chosen,
-  onDone,
-  onNone,
-}: {
-  chosen: readonly Capture[];
-  onDone: () => void;
-  onNone: () => void;
-}): JSX.Element {
+export function SelectionBar({ chosen, onDone, onNone }: Selection): JSX.Element {
   const [busy, each] = useEach(chosen, onDone);
   const remove = async (): Promise<void> => {
     const before = [...chosen];
@@ -136,15 +134,7 @@ export function SelectionBar({
 }
 
 /** Of deleted captures: bring them back, or free their disk space. */
-export function DeletedBar({
-  chosen,
-  onDone,
-  onNone,
-}: {
-  chosen: readonly Capture[];
-  onDone: () => void;
-  onNone: () => void;
-}): JSX.Element {
+export function DeletedBar({ chosen, onDone, onNone }: Selection): JSX.Element {
   const [busy, each] = useEach(chosen, onDone);
   const [asked, setAsked] = useState(false);
   const size = chosen.reduce((sum, one) => sum + (one.recording?.bytes ?? 0), 0);

@@ -24,7 +24,7 @@ export function usePicture(capture: Capture | null, kind: PreviewKind, gain: num
   const pushed = useService((state) =>
     state.previewOf === capture?.id && PUSHED.includes(kind) ? state.previews[kind] : undefined,
   );
-  const [picture, setPicture] = useState<(Picture & { key: string }) | null>(null);
+  const [answered, setAnswered] = useState<{ key: string; over: boolean; picture: Picture | null } | null>(null);
   const id = capture?.id ?? null;
   const over = capture === null || isFinished(capture);
   const begun = over || (capture.counters?.received ?? 0) > 0;
@@ -32,10 +32,10 @@ export function usePicture(capture: Capture | null, kind: PreviewKind, gain: num
   // Live pictures are encoded once for all clients, so the page applies the gain.
   const gained = over || kind === "render";
   const servedGain = gained ? gain : 1;
+  const key = `${id ?? ""} ${kind}`;
 
   useEffect(() => {
     if (id === null || served || !begun) return;
-    const key = `${id} ${kind}`;
     let timer: ReturnType<typeof setTimeout> | undefined;
     let url: string | null = null;
     const ended = new AbortController();
@@ -48,10 +48,11 @@ export function usePicture(capture: Capture | null, kind: PreviewKind, gain: num
         if (response.ok) {
           const next = URL.createObjectURL(await response.blob());
           const frame = response.headers.get("X-Frame");
-          setPicture({ key, url: next, frame: frame === null ? null : Number(frame), gained });
+          setAnswered({ key, over, picture: { url: next, frame: frame === null ? null : Number(frame), gained } });
           if (url !== null) URL.revokeObjectURL(url);
           url = next;
         } else {
+          if (over) setAnswered({ key, over, picture: null });
           wait = PATIENT_MS;
         }
       } catch {
@@ -66,8 +67,11 @@ export function usePicture(capture: Capture | null, kind: PreviewKind, gain: num
       // The shown picture keeps its URL until the next one has arrived.
       if (url !== null) setTimeout(() => URL.revokeObjectURL(url ?? ""), 2000);
     };
-  }, [id, kind, servedGain, gained, over, served, begun]);
+  }, [id, kind, key, servedGain, gained, over, served, begun]);
 
-  if (served) return { url: `data:image/webp;base64,${pushed.image}`, frame: pushed.frame, gained: false };
-  return picture !== null && picture.key === `${id ?? ""} ${kind}` ? picture : null;
+  // Until the first stored picture has come, the last live one stays.
+  const fresh = answered?.key === key && (answered.over === over || pushed === undefined);
+  if (!served && fresh) return answered.picture;
+  if (pushed === undefined) return null;
+  return { url: `data:image/webp;base64,${pushed.image}`, frame: pushed.frame, gained: false };
 }

@@ -676,6 +676,35 @@ class Pinhole(BaseModel):
     ] = None
 
 
+class PointOut(BaseModel):
+    """
+    What a scene has at a pixel of a frame.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    version: Annotated[int, Field(description="Of the scene.")]
+    frame: Annotated[int, Field(description="Whose pose it is seen from.")]
+    opacity: Annotated[float, Field(description="How opaque the scene is there, 0 to 1.")]
+    rate: Annotated[
+        list[float],
+        Field(description="Radiance in expected spikes a frame; red, green and blue of a colour scene."),
+    ]
+    depth: Annotated[
+        float | None,
+        Field(description="Along the camera's axis, in the scene's unit of length; null below an opacity of 0.5."),
+    ]
+    depth_m: Annotated[
+        float | None,
+        Field(description="The same in metres; null while the scale is not known."),
+    ]
+    position: Annotated[
+        list[float] | None,
+        Field(description="Of the surface, in the axes of the scene; null as depth."),
+    ]
+
+
 class Policy(StrEnum):
     """
     How a reader is treated when it falls behind. The writer waits for none.

@@ -1,4 +1,4 @@
-"""A region of the picture, and a pixel of it."""
+"""A region of the picture, a pixel of it, and the moment that they are of."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -9,11 +9,11 @@ from browsing import PHONE, finished, keep, until, violations
 SOURCE = "sim:?width=160&height=100&pace=0"
 
 
-def test_a_region_is_drawn_typed_and_measured_and_a_pixel_shows_its_spikes(
+def test_a_region_is_drawn_typed_and_measured_and_a_pixel_shows_its_spikes_and_depth(
     daemon: Callable[..., Any], visit: Callable[..., Any], pictures_folder: Path
 ) -> None:
     one = daemon("--device", SOURCE, "--no-capture")
-    plan = {"source": SOURCE, "frames": 2000, "name": "desk", "reconstruct": False}
+    plan = {"source": SOURCE, "frames": 1000, "name": "desk", "options": {"steps": 40}}
     capture = one.http.post("captures", json=plan).json()["id"]
     assert finished(one.http, capture)["state"] == "complete"
     page = visit(one.address)
@@ -51,9 +51,23 @@ def test_a_region_is_drawn_typed_and_measured_and_a_pixel_shows_its_spikes(
     drag(0.5, 0.5, 0.5, 0.5)
     pixel = numbers()
     assert (pixel["width"], pixel["height"]) == (1, 1)
-    spikes = one.http.get(f"captures/{capture}/spikes", params={"x": pixel["x"], "y": pixel["y"]}).json()
-    panel.get_by_text(f"{len(spikes['spikes'])} spikes in 1").wait_for()
-    until(lambda: panel.locator("figure.spikes line").count() == len(spikes["spikes"]), "each has a line")
+    at = {"x": pixel["x"], "y": pixel["y"]}
+
+    def shows_what_the_service_says(frame: int) -> None:
+        spikes = one.http.get(f"captures/{capture}/spikes", params={**at, "frame": frame}).json()
+        point = one.http.get(f"captures/{capture}/point", params={**at, "frame": frame}).json()
+        panel.get_by_text(f"{len(spikes['spikes'])} spikes in").wait_for()
+        until(lambda: panel.locator("figure.spikes line").count() == len(spikes["spikes"]), "each has a line")
+        panel.get_by_text(f"{point['depth']:.3f} units deep").wait_for()
+
+    shows_what_the_service_says(500)
+    moment = page.get_by_label("Moment")
+    assert (moment.get_attribute("min"), moment.get_attribute("max")) == ("0", "999")
+    moment.fill("900")
+    page.get_by_text("frame 900").wait_for()
+    shows_what_the_service_says(900)
+    moment.press("ArrowLeft")
+    page.get_by_text("frame 899").wait_for()
     assert violations(page) == []
     keep(page, pictures_folder / "pixel.webp")
     panel.get_by_role("button", name="All pixels").click()

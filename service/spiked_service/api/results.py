@@ -70,6 +70,11 @@ class Result:
         return found.trajectory(range(0, len(found), max(1, len(found) // poses)))
 
     @property
+    def frame_rate_hz(self) -> float:
+        """That of the camera; 1 while it is not known."""
+        return 1.0 if self.sensor is None else self.sensor.frame_rate_hz
+
+    @property
     def camera(self) -> Camera | None:
         """What it was seen with; None if its optics are not known."""
         if self.sensor is None or self.sensor.intrinsics is None:

@@ -1,4 +1,4 @@
-"""Requested views of a scene, rendered and encoded: one image, or a ZIP of several."""
+"""Requested views of a scene, rendered and encoded: one image, or a ZIP of several; or one pixel, as numbers."""
 
 import io
 import json
@@ -17,10 +17,14 @@ from spiked.sensor import Intrinsics, Sensor
 from spiked.spline import Waypoints
 from spiked_service.api.problems import NoPoseError, NotReadyError
 from spiked_service.api.results import Result
-from spiked_service.api.schemas.views import MAX_PIXELS, PathModel, ViewRequest
+from spiked_service.api.schemas.views import MAX_PIXELS, PathModel, PointOut, ViewRequest
 from spiked_service.api.trajectories import Range
 from spiked_service.results.image_encoding import ImageFormat, encode
+from spiked_service.results.scene_scale import read_scale
 from spiked_service.results.view_renderer import Output, Pose, ViewRenderer, shown
+
+SOLID = 0.5
+"""Opacity from which a pixel shows a surface that has a depth."""
 
 
 def views_response(result: Result, request: ViewRequest, kind: ImageFormat, renderer: ViewRenderer) -> Response:
@@ -64,6 +68,40 @@ def views_response(result: Result, request: ViewRequest, kind: ImageFormat, rend
     return Response(_zip(content), media_type="application/zip", headers=headers)
 
 
+def point_at(result: Result, x: int, y: int, frame: int | None, renderer: ViewRenderer) -> PointOut:
+    """What the scene has at pixel (x, y) of a frame, by default of the newest with a pose.
+
+    Raises as `views_response` does, and ConfigurationError for a pixel that the camera does not have.
+    """
+    seen = result.camera
+    if seen is None:
+        raise NotReadyError("the optics of this capture are not known yet")
+    if x >= seen.width or y >= seen.height:
+        raise ConfigurationError(f"there is no pixel {x}, {y} in {seen.width}x{seen.height} pixels")
+    shown_frame = newest_frame(result) if frame is None else frame
+    poses, rate = result.poses(), result.frame_rate_hz
+    pose = _of_frame(poses, shown_frame, rate, result.published.poses > len(poses))
+    # Of the whole image, because splats beside a smaller one would be projected less exactly.
+    image = renderer.render(result.scene, seen, pose)
+    opacity = float(image.alpha[y, x])
+    version = result.published.version
+    point = PointOut(version=version, frame=shown_frame, opacity=opacity, rate=np.ravel(image.values[y, x]).tolist())
+    if opacity < SOLID:
+        return point
+    depth = float(image.depth[y, x])
+    ray = seen.intrinsics.unproject(np.array([x + 0.5, y + 0.5]))
+    frame_of_reference = read_scale(result.folder).frame_of(version)
+    point.depth = depth
+    point.depth_m = None if frame_of_reference is None else depth * frame_of_reference.metres_per_unit
+    point.position = (pose.centre + pose.rotation @ ray * depth).tolist()
+    return point
+
+
+def newest_frame(result: Result) -> int:
+    """The last frame that has a pose."""
+    return round(result.poses().time_s(-1) * result.frame_rate_hz - 0.5)
+
+
 def _white(output: Output, white: float, plane: np.ndarray) -> float:
     match output:
         case Output.COLOR:
@@ -100,8 +138,7 @@ def _poses(result: Result, request: ViewRequest) -> list[Pose]:
     known = result.poses()
     if request.path is not None:
         return _along(known, request.path)
-    rate = 1.0 if result.sensor is None else result.sensor.frame_rate_hz
-    of_views = result.published.poses > len(known)
+    rate, of_views = result.frame_rate_hz, result.published.poses > len(known)
     return [
         camera.pose() if camera.frame is None else _of_frame(known, camera.frame, rate, of_views) for camera in cameras
     ]

@@ -167,6 +167,39 @@ def test_depth_alpha_and_background(service: Any, job: str, tmp_path: Any) -> No
     assert red[0, 0].tolist() == [0, 0, 255]  # OpenCV reads blue first
 
 
+def test_a_pixel_as_numbers_is_that_of_the_pictures(service: Any, job: str, tmp_path: Any) -> None:
+    pictures = {
+        kind: exr(view(service, job, {"camera": {"frame": 300}, "output": kind}, "exr").content, tmp_path)
+        for kind in ("color", "depth", "alpha")
+    }
+    trajectory = service.client.trajectory(job)
+    centre = trajectory.positions[trajectory.frames.index(300)]
+    turn = rotation_of(np.array(trajectory.quaternions_wxyz[trajectory.frames.index(300)]))
+    k = service.client.capture(service.client.reconstruction(job).capture_id).sensor.intrinsics
+
+    def at(kind: str, x: int, y: int) -> float:
+        return float(np.ravel(pictures[kind][y, x])[0])
+
+    solid = 0
+    for x, y in ((0, 0), (80, 50), (31, 72), (159, 99)):
+        point = service.http.get(f"reconstructions/{job}/point", params={"x": x, "y": y, "frame": 300}).json()
+        assert point["opacity"] == pytest.approx(at("alpha", x, y), rel=1e-6)
+        assert point["rate"] == pytest.approx([at("color", x, y)], rel=1e-6)
+        assert (point["depth"] is None) == (point["position"] is None) == (point["opacity"] < 0.5)
+        assert (point["frame"], point["depth_m"]) == (300, None)
+        if point["depth"] is not None:
+            solid += 1
+            assert point["depth"] == pytest.approx(at("depth", x, y), rel=1e-6)
+            seen = turn.T @ (np.array(point["position"]) - centre)
+            pixel = k.fx * seen[0] / seen[2] + k.cx, k.fy * seen[1] / seen[2] + k.cy
+            assert pixel == pytest.approx((x + 0.5, y + 0.5), abs=1e-6) and seen[2] == pytest.approx(point["depth"])
+    assert solid >= 2
+    newest = service.http.get(f"reconstructions/{job}/point?x=80&y=50").json()
+    assert newest["frame"] == trajectory.frames[-1]
+    for wrong, status in (("x=160&y=0", 422), ("x=0&y=100", 422), ("x=0", 422), ("x=0&y=0&frame=999999", 404)):
+        assert service.http.get(f"reconstructions/{job}/point?{wrong}").status_code == status, wrong
+
+
 def test_another_size_shows_the_same(service: Any, job: str) -> None:
     small = decoded(view(service, job, {"camera": {"frame": 300}}).content)
     large = decoded(view(service, job, {"camera": {"frame": 300}, "width": 320, "height": 200}).content)

@@ -14,6 +14,8 @@ Version = Annotated[
 ]
 FromS = Annotated[float | None, Query(ge=0, le=1e9, description="First time, seconds since the start of the capture.")]
 ToS = Annotated[float | None, Query(ge=0, le=1e9, description="End time, not included, in seconds.")]
+Column = Annotated[int, Query(ge=0, le=LARGEST_INTEGER, description="Of the upright image, from the left."), IN_DIGITS]
+Row = Annotated[int, Query(ge=0, le=LARGEST_INTEGER, description="Of the upright image, from the top."), IN_DIGITS]
 WishedImage = Annotated[ImageFormat | None, Query(description="Takes precedence over Accept; the default is PNG.")]
 
 BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}

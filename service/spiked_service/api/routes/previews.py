@@ -13,11 +13,11 @@ from spiked.whole_files import write_atomically
 from spiked_service.api import files
 from spiked_service.api.problems import NotReadyError, problems
 from spiked_service.api.results import Result, Results
-from spiked_service.api.routes.parameters import BINARY, NOT_MODIFIED, PICTURES, WishedImage
+from spiked_service.api.routes.parameters import BINARY, NOT_MODIFIED, PICTURES, Column, Row, WishedImage
 from spiked_service.api.schemas.base import IN_DIGITS, LARGEST_INTEGER
 from spiked_service.api.schemas.captures import SpikesOut, StatsOut
 from spiked_service.api.schemas.views import ViewRequest
-from spiked_service.api.views import image_format, views_response
+from spiked_service.api.views import image_format, newest_frame, views_response
 from spiked_service.captures.captures import Captures
 from spiked_service.results.frame_images import (
     FrameWindow,
@@ -49,8 +49,6 @@ White = Annotated[
 Undistorted = Annotated[
     bool, Query(description="Without the distortion of the lens: of a recorded frame, or of the scene.")
 ]
-Column = Annotated[int, Query(ge=0, le=LARGEST_INTEGER, description="Of the upright image, from the left."), IN_DIGITS]
-Row = Annotated[int, Query(ge=0, le=LARGEST_INTEGER, description="Of the upright image, from the top."), IN_DIGITS]
 Frames = Annotated[int, Query(ge=1, le=8192, description="Recorded frames to look at, around `frame`."), IN_DIGITS]
 Side = Annotated[
     int | None, Query(ge=1, le=LARGEST_INTEGER, description="Of the region, pixels. Default: to the edge."), IN_DIGITS
@@ -164,8 +162,7 @@ def _headers(white: float, frame: int) -> dict[str, str]:
 
 def _view_at(result: Result, frame: int | None, white: float | None, gain: float, undistorted: bool) -> ViewRequest:
     """The view from the pose of a frame, of the newest pose if None."""
-    rate = 1.0 if result.sensor is None else result.sensor.frame_rate_hz
-    pose = round(result.poses().time_s(-1) * rate - 0.5) if frame is None else frame
+    pose = newest_frame(result) if frame is None else frame
     shown_white = (result.published.white if white is None else white) / gain
     return ViewRequest.model_validate({"camera": {"frame": pose}, "white": shown_white, "undistorted": undistorted})
 

@@ -15,16 +15,18 @@ from spiked_service.api.routes.parameters import (
     ETAG,
     NOT_MODIFIED,
     PICTURES,
+    Column,
     FromS,
+    Row,
     ToS,
     Version,
     WishedImage,
 )
-from spiked_service.api.schemas.base import IN_DIGITS
+from spiked_service.api.schemas.base import IN_DIGITS, LARGEST_INTEGER
 from spiked_service.api.schemas.reconstructions import TrajectoryOut
-from spiked_service.api.schemas.views import ViewRequest
+from spiked_service.api.schemas.views import PointOut, ViewRequest
 from spiked_service.api.trajectories import Range, TrajectoryFormat
-from spiked_service.api.views import image_format, views_response
+from spiked_service.api.views import image_format, point_at, views_response
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.results.shown_scene import FINEST
 from spiked_service.results.view_renderer import ViewRenderer
@@ -56,6 +58,11 @@ Since = Annotated[
 Level = Annotated[
     int,
     Query(ge=0, le=FINEST, description="Level of detail: 0 has a sixteenth of the splats, 1 a quarter, 2 all."),
+    IN_DIGITS,
+]
+PosedFrame = Annotated[
+    int | None,
+    Query(ge=0, le=LARGEST_INTEGER, description="Absolute index of a frame. Default: the newest that has a pose."),
     IN_DIGITS,
 ]
 
@@ -116,6 +123,7 @@ class _Operations:
     scene: _Operation
     changes: _Operation
     render: _Operation
+    point: _Operation
 
 
 def capture_result_routes(results: Results, views: ViewRenderer, route_class: type[APIRoute]) -> APIRouter:
@@ -137,6 +145,7 @@ def capture_result_routes(results: Results, views: ViewRenderer, route_class: ty
                 "render_views",
                 "Images of its newest reconstruction: from one camera, from several, or along the path.",
             ),
+            point=_Operation("get_point", "Depth, opacity and rate that its scene has at a pixel of a frame."),
         ),
     )
 
@@ -168,6 +177,9 @@ def reconstruction_result_routes(
                 "render_reconstruction_views",
                 "Images of a version: from one camera, from several, or along the path; colour, depth or alpha.",
             ),
+            point=_Operation(
+                "get_reconstruction_point", "Depth, opacity and rate that the scene has at a pixel of a frame."
+            ),
         ),
     )
 
@@ -183,6 +195,7 @@ def _result_routes(
     _add_trajectory_route(router, find, results, operations.trajectory)
     _add_scene_routes(router, find, results, operations.scene, operations.changes)
     _add_view_route(router, find, results, views, operations.render)
+    _add_point_route(router, find, results, views, operations.point)
     return router
 
 
@@ -278,3 +291,21 @@ def _add_view_route(
         accept: Annotated[str, Header(include_in_schema=False)] = "",
     ) -> Response:
         return views_response(results.of(row, version), body, image_format(format, accept), views)
+
+
+def _add_point_route(
+    router: APIRouter,
+    find: Callable[..., ReconstructionRow],
+    results: Results,
+    views: ViewRenderer,
+    operation: _Operation,
+) -> None:
+    @router.get("/point", name=operation.name, description=operation.description, responses=problems(404))
+    def get_point(
+        row: Annotated[ReconstructionRow, Depends(find)],
+        x: Column,
+        y: Row,
+        frame: PosedFrame = None,
+        version: Version = None,
+    ) -> PointOut:
+        return point_at(results.of(row, version), x, y, frame, views)

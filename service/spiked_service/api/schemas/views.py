@@ -7,7 +7,16 @@ from numpy.typing import NDArray
 from pydantic import Field, StrictBool, StrictFloat, StrictInt, model_validator
 
 from spiked.pose import rotation_of
-from spiked_service.api.schemas.base import Finite, In, IntrinsicsModel, Quaternion, exactly_one_of, examples, together
+from spiked_service.api.schemas.base import (
+    Finite,
+    In,
+    IntrinsicsModel,
+    Out,
+    Quaternion,
+    exactly_one_of,
+    examples,
+    together,
+)
 from spiked_service.results.view_renderer import Output, Pose
 
 MAX_VIEWS = 100
@@ -127,3 +136,17 @@ class ViewRequest(In):
         if (self.width is None) != (self.height is None):
             raise ValueError("give width and height together")
         return self
+
+
+class PointOut(Out):
+    """What a scene has at a pixel of a frame."""
+
+    version: int = Field(description="Of the scene.")
+    frame: int = Field(description="Whose pose it is seen from.")
+    opacity: float = Field(description="How opaque the scene is there, 0 to 1.")
+    rate: list[float] = Field(description="Radiance in expected spikes a frame; red, green and blue of a colour scene.")
+    depth: float | None = Field(
+        None, description="Along the camera's axis, in the scene's unit of length; null below an opacity of 0.5."
+    )
+    depth_m: float | None = Field(None, description="The same in metres; null while the scale is not known.")
+    position: list[float] | None = Field(None, description="Of the surface, in the axes of the scene; null as depth.")

@@ -24,17 +24,17 @@ const KINDS: readonly { value: PreviewKind; label: string; hint: string }[] = [
 ];
 const STATS_MS = 1000;
 
-function useStats(capture: Capture | null, region: Region | null): Stats | null {
+function useStats(capture: Capture | null, region: Region | null, moment: number | null): Stats | null {
   const [value, setValue] = useState<{ key: string; stats: Stats } | null>(null);
   const id = capture?.id ?? null;
-  const key = `${id ?? ""} ${JSON.stringify(region)}`;
+  const key = `${id ?? ""} ${moment ?? ""} ${JSON.stringify(region)}`;
   const over = capture === null || isFinished(capture);
   const begun = over || (capture.counters?.received ?? 0) > 0;
   useEffect(() => {
     if (id === null || !begun) return;
     let current = true;
     const ask = (): void => {
-      stats(id, region).then(
+      stats(id, region, moment).then(
         (got) => current && setValue({ key, stats: got }),
         () => undefined, // the picture says that there is nothing yet
       );
@@ -45,7 +45,7 @@ function useStats(capture: Capture | null, region: Region | null): Stats | null 
       current = false;
       clearInterval(timer);
     };
-  }, [id, over, begun, key, region]);
+  }, [id, over, begun, key, region, moment]);
   return value?.key === key ? value.stats : null;
 }
 
@@ -54,12 +54,14 @@ export function PictureView({ capture }: { capture: Capture | null }): JSX.Eleme
   const [stops, setStops] = useState(0);
   const [marked, setMarked] = useState(true);
   const gain = 2 ** stops;
-  const picture = usePicture(capture, kind, gain);
+  const [chosenMoment, setMoment] = useState<{ id: string; frame: number } | null>(null);
+  const moment = chosenMoment !== null && chosenMoment.id === capture?.id ? chosenMoment.frame : null;
+  const picture = usePicture(capture, kind, gain, moment);
   const sensor = capture?.sensor ?? null;
   const [chosen, setChosen] = useState<Region | null>(null);
   const fits = chosen === null || sensor === null ? chosen : within(chosen, sensor);
   const region = fits !== null && chosen !== null && same(fits, chosen) ? chosen : null; // of a larger camera before
-  const measured = useStats(capture, region);
+  const measured = useStats(capture, region, moment);
   const histogram = measured?.rate_histogram ?? null;
   const image = useRef<HTMLImageElement>(null);
   useEffect(() => {
@@ -92,7 +94,7 @@ export function PictureView({ capture }: { capture: Capture | null }): JSX.Eleme
       </header>
       <div className="frame">
         {picture === null ? (
-          <NoPicture capture={capture} kind={kind} />
+          <NoPicture capture={capture} kind={kind} moment={moment} />
         ) : (
           <div className="stack">
             <img ref={image} src={picture.url} alt={`Newest frames, ${kind}`} />
@@ -113,6 +115,13 @@ export function PictureView({ capture }: { capture: Capture | null }): JSX.Eleme
           </div>
         )}
       </div>
+      {capture !== null && (
+        <Moment
+          capture={capture}
+          frame={moment ?? picture?.frame ?? null}
+          onFrame={(frame) => setMoment({ id: capture.id, frame })}
+        />
+      )}
       {capture !== null && sensor !== null && picture !== null && (
         <RegionPanel
           capture={capture.id}
@@ -120,6 +129,7 @@ export function PictureView({ capture }: { capture: Capture | null }): JSX.Eleme
           region={region}
           stats={measured}
           over={isFinished(capture)}
+          moment={moment}
           onRegion={setChosen}
         />
       )}
@@ -129,6 +139,38 @@ export function PictureView({ capture }: { capture: Capture | null }): JSX.Eleme
         frameRateHz={sensor?.frame_rate_hz ?? null}
       />
     </section>
+  );
+}
+
+/** Which frame of a recording is shown. */
+function Moment({
+  capture,
+  frame,
+  onFrame,
+}: {
+  capture: Capture;
+  frame: number | null;
+  onFrame: (frame: number) => void;
+}): JSX.Element | null {
+  const { recording, sensor } = capture;
+  if (recording === null || sensor === null || !isFinished(capture)) return null;
+  const first = recording.first_frame;
+  const last = first + recording.frames + recording.lost - 1;
+  const at = frame ?? Math.round((first + last) / 2);
+  const ms = ((1000 * at) / sensor.frame_rate_hz).toFixed(1);
+  return (
+    <label className="slider moment">
+      Moment
+      <input
+        type="range"
+        min={first}
+        max={last}
+        value={at}
+        aria-valuetext={`frame ${at}, ${ms} ms`}
+        onChange={(event) => onFrame(event.target.valueAsNumber)}
+      />
+      <output>{ms} ms</output>
+    </label>
   );
 }
 
@@ -143,7 +185,15 @@ function Caption({ capture, frame }: { capture: Capture | null; frame: number | 
   );
 }
 
-function NoPicture({ capture, kind }: { capture: Capture | null; kind: PreviewKind }): JSX.Element {
+function NoPicture({
+  capture,
+  kind,
+  moment,
+}: {
+  capture: Capture | null;
+  kind: PreviewKind;
+  moment: number | null;
+}): JSX.Element {
   if (capture === null)
     return (
       <Empty icon="camera" title="No capture yet">
@@ -155,6 +205,12 @@ function NoPicture({ capture, kind }: { capture: Capture | null; kind: PreviewKi
     return (
       <Empty icon="problem" title="The capture has failed">
         {capture.reason}
+      </Empty>
+    );
+  if (moment !== null)
+    return (
+      <Empty icon="camera" title="No picture of this moment">
+        {kind === "render" ? "The scene has no pose at this frame." : "This frame was lost."}
       </Empty>
     );
   if (kind === "render")

@@ -1,11 +1,11 @@
-/** A region of the picture, drawn or typed, and when a pixel of it fired. */
+/** A region of the picture, drawn or typed, and its rates. */
 
-import { type JSX, type PointerEvent, useEffect, useRef, useState } from "react";
+import { type JSX, type PointerEvent, useRef } from "react";
 
-import { spikes as askSpikes } from "../../shared/api/calls";
-import type { Sensor, Spikes, Stats } from "../../shared/api/types";
+import type { Sensor, Stats } from "../../shared/api/types";
 import { count, rate } from "../../shared/state/format";
-import { dragged, intervals, isPixel, type Region, within } from "./region";
+import { PixelProbe } from "./PixelProbe";
+import { dragged, isPixel, type Region, within } from "./region";
 
 const SIDES = [
   ["x", "Left"],
@@ -62,6 +62,7 @@ export function RegionPanel({
   region,
   stats,
   over,
+  moment,
   onRegion,
 }: {
   capture: string;
@@ -69,6 +70,7 @@ export function RegionPanel({
   region: Region | null;
   stats: Stats | null;
   over: boolean;
+  moment: number | null;
   onRegion: (region: Region | null) => void;
 }): JSX.Element {
   if (region === null)
@@ -123,58 +125,10 @@ export function RegionPanel({
       )}
       {isPixel(region) &&
         (over ? (
-          <SpikeTrain capture={capture} x={region.x} y={region.y} rateHz={sensor.frame_rate_hz} />
+          <PixelProbe capture={capture} x={region.x} y={region.y} moment={moment} rateHz={sensor.frame_rate_hz} />
         ) : (
-          <p className="dim">Its spikes over time are shown when the capture has ended.</p>
+          <p className="dim">Its spikes over time and its depth are shown when the capture has ended.</p>
         ))}
     </section>
-  );
-}
-
-function SpikeTrain({
-  capture,
-  x,
-  y,
-  rateHz,
-}: {
-  capture: string;
-  x: number;
-  y: number;
-  rateHz: number;
-}): JSX.Element | null {
-  const key = `${capture} ${x} ${y}`;
-  const [got, setGot] = useState<{ key: string; spikes: Spikes | null } | null>(null);
-  useEffect(() => {
-    let current = true;
-    askSpikes(capture, x, y).then(
-      (spikes) => current && setGot({ key, spikes }),
-      () => current && setGot({ key, spikes: null }), // it was not recorded
-    );
-    return () => {
-      current = false;
-    };
-  }, [capture, x, y, key]);
-  if (got === null || got.key !== key) return null;
-  if (got.spikes === null) return <p className="dim">The capture was not recorded: its spikes are not known.</p>;
-  const { first_frame: first, frames, spikes } = got.spikes;
-  const between = intervals(spikes);
-  const ms = ((1000 * frames) / rateHz).toFixed(1);
-  return (
-    <figure className="spikes">
-      <svg
-        viewBox={`0 0 ${frames} 10`}
-        preserveAspectRatio="none"
-        role="img"
-        aria-label={`Spikes of pixel ${x}, ${y} over ${frames} frames`}
-      >
-        {spikes.map((frame) => (
-          <line key={frame} x1={frame - first + 0.5} x2={frame - first + 0.5} y1={0} y2={10} />
-        ))}
-      </svg>
-      <figcaption className="dim">
-        {count(spikes.length)} spikes in {count(frames)} frames from frame {count(first)}, {ms} ms
-        {between !== null && `; ${between.mean.toFixed(1)} ± ${between.deviation.toFixed(1)} frames apart`}
-      </figcaption>
-    </figure>
   );
 }

@@ -1,4 +1,4 @@
-/** The newest picture of a capture: from the WebSocket if it carries this kind, otherwise from REST. */
+/** The picture of a capture: the newest from the WebSocket if it carries this kind, otherwise from REST. */
 
 import { useEffect, useState } from "react";
 
@@ -20,7 +20,13 @@ const PATIENT_MS = 1500;
 /** Kinds sent over the WebSocket; others are rendered on request. */
 const PUSHED: readonly PreviewKind[] = ["interval", "rate"];
 
-export function usePicture(capture: Capture | null, kind: PreviewKind, gain: number): Picture | null {
+/** `moment`: the frame to show of a capture that has ended; null: its middle. */
+export function usePicture(
+  capture: Capture | null,
+  kind: PreviewKind,
+  gain: number,
+  moment: number | null,
+): Picture | null {
   const pushed = useService((state) =>
     state.previewOf === capture?.id && PUSHED.includes(kind) ? state.previews[kind] : undefined,
   );
@@ -32,6 +38,7 @@ export function usePicture(capture: Capture | null, kind: PreviewKind, gain: num
   // Live pictures are encoded once for all clients, so the page applies the gain.
   const gained = over || kind === "render";
   const servedGain = gained ? gain : 1;
+  const shown = over && moment !== null ? moment : undefined;
   const key = `${id ?? ""} ${kind}`;
 
   useEffect(() => {
@@ -42,9 +49,8 @@ export function usePicture(capture: Capture | null, kind: PreviewKind, gain: num
     const ask = async (): Promise<void> => {
       let wait = PERIOD_MS;
       try {
-        const response = await reach(address.preview(id, kind, { gain: servedGain === 1 ? undefined : servedGain }), {
-          signal: ended.signal,
-        });
+        const wanted = { gain: servedGain === 1 ? undefined : servedGain, frame: shown };
+        const response = await reach(address.preview(id, kind, wanted), { signal: ended.signal });
         if (response.ok) {
           const next = URL.createObjectURL(await response.blob());
           const frame = response.headers.get("X-Frame");
@@ -67,7 +73,7 @@ export function usePicture(capture: Capture | null, kind: PreviewKind, gain: num
       // The shown picture keeps its URL until the next one has arrived.
       if (url !== null) setTimeout(() => URL.revokeObjectURL(url ?? ""), 2000);
     };
-  }, [id, kind, key, servedGain, gained, over, served, begun]);
+  }, [id, kind, key, shown, servedGain, gained, over, served, begun]);
 
   // Until the first stored picture has come, the last live one stays.
   const fresh = answered?.key === key && (answered.over === over || pushed === undefined);

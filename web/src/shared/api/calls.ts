@@ -23,6 +23,7 @@ import type {
   ScaleRequest,
   Setting,
   SourceKind,
+  ScenePoint,
   Spikes,
   Stats,
   System,
@@ -127,20 +128,30 @@ export const restoreCapture = (id: string): Promise<Capture> =>
   answered(client.POST("/api/v1/captures/{capture_id}:restore", ofCapture(id)));
 export const purgeCapture = (id: string): Promise<unknown> =>
   answered(client.POST("/api/v1/captures/{capture_id}:purge", ofCapture(id)));
-/** Over all pixels, or a region of the picture. */
+/** Over all pixels, or a region of the picture; of the newest frames, of a recording those around `frame`. */
 export const stats = (
   id: string,
   region: { x: number; y: number; width: number; height: number } | null = null,
+  frame: number | null = null,
 ): Promise<Stats> =>
   answered(
     client.GET("/api/v1/captures/{capture_id}/stats", {
-      params: { path: { capture_id: id }, query: region ?? {} },
+      params: { path: { capture_id: id }, query: { ...region, frame } },
     }),
   );
-/** When a pixel fired, in the middle of the recording. */
-export const spikes = (id: string, x: number, y: number): Promise<Spikes> =>
+/** When a pixel fired, around a frame or in the middle of the recording. */
+export const spikes = (id: string, x: number, y: number, frame: number | null): Promise<Spikes> =>
   answered(
-    client.GET("/api/v1/captures/{capture_id}/spikes", { params: { path: { capture_id: id }, query: { x, y } } }),
+    client.GET("/api/v1/captures/{capture_id}/spikes", {
+      params: { path: { capture_id: id }, query: { x, y, frame } },
+    }),
+  );
+/** What the scene of the newest reconstruction has at a pixel. */
+export const point = (id: string, x: number, y: number, frame: number | null): Promise<ScenePoint> =>
+  answered(
+    client.GET("/api/v1/captures/{capture_id}/point", {
+      params: { path: { capture_id: id }, query: { x, y, frame } },
+    }),
   );
 
 export const reconstruction = (id: string): Promise<Reconstruction> =>

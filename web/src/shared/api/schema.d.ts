@@ -612,6 +612,28 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/api/v1/captures/{capture_id}/point": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Point
+         * @description Depth, opacity and rate that its scene has at a pixel of a frame.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["get_point_api_v1_captures__capture_id__point_get"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
     "/api/v1/reconstructions": {
         parameters: {
             query?: never;
@@ -916,6 +938,28 @@ export interface paths {
          *     Scope of a token: `read`.
          */
         post: operations["render_reconstruction_views_api_v1_reconstructions__reconstruction_id__views_post"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/reconstructions/{reconstruction_id}/point": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Reconstruction Point
+         * @description Depth, opacity and rate that the scene has at a pixel of a frame.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["get_reconstruction_point_api_v1_reconstructions__reconstruction_id__point_get"];
+        put?: never;
+        post?: never;
         delete?: never;
         options?: never;
         head?: never;
@@ -3073,6 +3117,47 @@ export interface components {
              * @description Of the lens, as OpenCV has it; null: none.
              */
             distortion?: (components["schemas"]["OpencvLens"] | components["schemas"]["FisheyeLens"]) | null;
+        };
+        /**
+         * PointOut
+         * @description What a scene has at a pixel of a frame.
+         */
+        PointOut: {
+            /**
+             * Version
+             * @description Of the scene.
+             */
+            version: number;
+            /**
+             * Frame
+             * @description Whose pose it is seen from.
+             */
+            frame: number;
+            /**
+             * Opacity
+             * @description How opaque the scene is there, 0 to 1.
+             */
+            opacity: number;
+            /**
+             * Rate
+             * @description Radiance in expected spikes a frame; red, green and blue of a colour scene.
+             */
+            rate: number[];
+            /**
+             * Depth
+             * @description Along the camera's axis, in the scene's unit of length; null below an opacity of 0.5.
+             */
+            depth: number | null;
+            /**
+             * Depth M
+             * @description The same in metres; null while the scale is not known.
+             */
+            depth_m: number | null;
+            /**
+             * Position
+             * @description Of the surface, in the axes of the scene; null as depth.
+             */
+            position: number[] | null;
         };
         /**
          * Policy
@@ -7810,6 +7895,109 @@ export interface operations {
             };
         };
     };
+    get_point_api_v1_captures__capture_id__point_get: {
+        parameters: {
+            query: {
+                /** @description Of the upright image, from the left. */
+                x: number;
+                /** @description Of the upright image, from the top. */
+                y: number;
+                /** @description Absolute index of a frame. Default: the newest that has a pose. */
+                frame?: number | null;
+                /** @description Default: the newest; `GET versions` lists them. */
+                version?: number | null;
+            };
+            header?: never;
+            path: {
+                capture_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["PointOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
     list_reconstructions_api_v1_reconstructions_get: {
         parameters: {
             query?: {
@@ -9495,6 +9683,109 @@ export interface operations {
                     "image/jpeg": string;
                     "image/x-exr": string;
                     "application/zip": string;
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_reconstruction_point_api_v1_reconstructions__reconstruction_id__point_get: {
+        parameters: {
+            query: {
+                /** @description Of the upright image, from the left. */
+                x: number;
+                /** @description Of the upright image, from the top. */
+                y: number;
+                /** @description Absolute index of a frame. Default: the newest that has a pose. */
+                frame?: number | null;
+                /** @description Default: the newest; `GET versions` lists them. */
+                version?: number | null;
+            };
+            header?: never;
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["PointOut"];
                 };
             };
             /** @description The request is malformed. */

@@ -45,6 +45,7 @@ export type Trajectory = Schemas["TrajectoryOut"];
 export type RateHistogram = Schemas["RateHistogram"];
 /** Pixels as [x, y]; the generated client forgets that pairs have two numbers. */
 export type Stats = Omit<Schemas["StatsOut"], "hot_pixels"> & { hot_pixels: number[][] };
+export type ScenePoint = Schemas["PointOut"];
 export type Spikes = Schemas["SpikesOut"];
 export type Gap = Schemas["GapOut"];
 export type Closure = Schemas["ClosureOut"];

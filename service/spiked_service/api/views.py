@@ -83,18 +83,19 @@ def point_at(result: Result, x: int, y: int, frame: int | None, renderer: ViewRe
     pose = _of_frame(poses, shown_frame, rate, result.published.poses > len(poses))
     # Of the whole image, because splats beside a smaller one would be projected less exactly.
     image = renderer.render(result.scene, seen, pose)
-    opacity = float(image.alpha[y, x])
-    version = result.published.version
-    point = PointOut(version=version, frame=shown_frame, opacity=opacity, rate=np.ravel(image.values[y, x]).tolist())
-    if opacity < SOLID:
-        return point
-    depth = float(image.depth[y, x])
+    opacity, depth = float(image.alpha[y, x]), float(image.depth[y, x])
+    version, solid = result.published.version, opacity >= SOLID
     ray = seen.intrinsics.unproject(np.array([x + 0.5, y + 0.5]))
-    frame_of_reference = read_scale(result.folder).frame_of(version)
-    point.depth = depth
-    point.depth_m = None if frame_of_reference is None else depth * frame_of_reference.metres_per_unit
-    point.position = (pose.centre + pose.rotation @ ray * depth).tolist()
-    return point
+    scale = read_scale(result.folder).frame_of(version)
+    return PointOut(
+        version=version,
+        frame=shown_frame,
+        opacity=opacity,
+        rate=np.ravel(image.values[y, x]).tolist(),
+        depth=depth if solid else None,
+        depth_m=depth * scale.metres_per_unit if solid and scale is not None else None,
+        position=(pose.centre + pose.rotation @ ray * depth).tolist() if solid else None,
+    )
 
 
 def newest_frame(result: Result) -> int:

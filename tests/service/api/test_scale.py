@@ -22,6 +22,8 @@ def test_a_scale_is_stored_once_and_answers_are_in_metres(service: Any, done: Ca
     assert http.put(f"{url}/scale", json={"revision": 0, "metres_per_unit": 3.0}).status_code == 409
     metric = http.get(f"{url}/trajectory?step=50&metric=true").json()
     np.testing.assert_allclose(metric["positions"], 2 * np.array(own["positions"]), atol=1e-8)
+    point = http.get(f"{url}/point?x=80&y=50").json()
+    assert point["depth"] > 0 and point["depth_m"] == 2 * point["depth"]
     up = http.put(f"{url}/scale", json={"revision": 1, "up": [0, 0, -3]}).json()
     assert up["up"] == [0, 0, -1] and up["metres_per_unit"] == 2.0
     turned = http.get(f"{url}/trajectory?step=50&metric=true").json()

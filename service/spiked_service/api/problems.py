@@ -1,6 +1,5 @@
 """Errors as RFC 9457 problem details, with `what_to_do`."""
 
-import errno
 from difflib import get_close_matches
 from http import HTTPStatus
 from typing import Any
@@ -12,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from starlette.exceptions import HTTPException
 
 from spiked.errors import SpikedError
+from spiked.whole_files import FULL
 from spiked_service.api.paths import allowed_methods
 from spiked_service.base.errors import BusyError
 from spiked_service.base.limits import OverloadedError
@@ -23,8 +23,6 @@ from spiked_service.store.catalogue import StoreError, UnknownIdError
 MEDIA_TYPE = "application/problem+json"
 _RETRY_S = 1
 """`Retry-After` of a busy service, seconds."""
-_FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Of a full disk, and of a quota."""
 
 
 class Problem(BaseModel):
@@ -172,6 +170,8 @@ def problem(
 def problem_of(error: SpikedError, request: Request) -> JSONResponse:
     """The response to a SpikedError."""
     status = next((_STATUS[kind] for kind in type(error).__mro__ if kind in _STATUS), HTTPStatus.UNPROCESSABLE_ENTITY)
+    if isinstance(error.__cause__, OSError) and error.__cause__.errno in FULL:
+        status = HTTPStatus.INSUFFICIENT_STORAGE
     headers = {"Retry-After": str(_RETRY_S)} if status is HTTPStatus.SERVICE_UNAVAILABLE else {}
     if isinstance(error, UploadOffsetError):
         headers["Upload-Offset"] = str(error.offset_bytes)
@@ -187,7 +187,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(OSError)
     async def _system(request: Request, error: OSError) -> JSONResponse:
-        if error.errno not in _FULL:
+        if error.errno not in FULL:
             raise error  # unexpected
         return problem_of(StoreError("the disk is full, and nothing was changed: free disk space"), request)
 

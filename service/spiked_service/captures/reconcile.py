@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from spiked_service.results.versions import version_row, versions
 from spiked_service.store.catalogue import Catalogue, DamagedError, StoreError, Table
 from spiked_service.store.folder import DataFolder
+from spiked_service.store.row_copies import outdated, read_copy
 from spiked_service.store.rows import CaptureRow, Origin
 
 _Row = TypeVar("_Row")
@@ -80,10 +81,14 @@ def _reconcile(
     orphans, missing, stale = [], 0, 0
     for row_id in sorted(ids):
         try:
-            before, copy = known.get(row_id), _read(copy_of(row_id))
+            path = copy_of(row_id)
+            before, copy = known.get(row_id), read_copy(path)
+            if before is None and copy is None:
+                path = outdated(path)
+                copy = read_copy(path)
             if copy is not None and before is not None and copy == before.encode():
                 continue
-            row = None if copy is None else _parsed(table, row_id, copy, copy_of(row_id), log)
+            row = None if copy is None else _parsed(table, row_id, copy, path, log)
             if before is None and row is None:
                 orphans.append(row_id)
             elif before is None:
@@ -107,13 +112,6 @@ def _reconcile(
             f"{table.kind}s out of date in the catalogue and updated from their files: {stale}",
         )
     return tuple(orphans)
-
-
-def _read(path: Path) -> bytes | None:
-    try:
-        return path.read_bytes()
-    except (FileNotFoundError, NotADirectoryError):
-        return None
 
 
 def _parsed(table: Table[Any], row_id: str, copy: bytes, path: Path, log: Log) -> Any | None:

@@ -188,7 +188,10 @@ class Reconstructions:
                 job.finish_early()
 
     def restart(self, reconstruction_id: str, options: ReconstructionOptions | None = None) -> ReconstructionRow:
-        """Queue an ended reconstruction again; version numbers continue. Raises BusyError if it has not ended."""
+        """Queue an ended reconstruction again; version numbers continue.
+
+        Raises BusyError if it has not ended, StoreError, and then it stays ended.
+        """
         with self._lock:
             row = self.rows.get(reconstruction_id)
             if not row.state.over:

@@ -158,9 +158,13 @@ class ReconstructionRepository:
                 raise BusyError(f"a version of reconstruction {reconstruction_id} is being written: try again")
 
     def requeue(self, row: ReconstructionRow) -> None:
-        """Save the row of an ended reconstruction that is queued again. Raises BusyError while it is edited."""
+        """Save the row of an ended reconstruction that is queued again.
+
+        Raises BusyError while it is edited, StoreError, and then it has not changed.
+        """
         with self._lock:
             self.check_not_edited(row.id)
+            self._catalogue.reconstructions.put(replace(row, queue_place=None))
             self.save(row)
 
     def forget_scale(self, row: ReconstructionRow) -> None:

@@ -1,6 +1,7 @@
 """Versions of a scene and its trajectory: one process publishes them, others read them at any time."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -108,19 +109,20 @@ class Publisher:
         if scene is not None:
             edited = {"splats": len(scene), "scene_bytes": len(content), "psnr_db": None}
         shown = scene or Scene.read_ply(self._folder / earlier.scene)
-        slots = self._write_slots(shown, earlier.white, version, tolerance=0.0)
         paths = [
             one.model_copy(update={"trajectory": f"path-{version:06d}-{number}.poses"})
             for number, one in enumerate(earlier.paths, 1)
         ]
-        published = earlier.model_copy(
-            update={"version": version, "at": datetime.now(UTC), "paths": paths, **names, **slots, **edited}
-        )
-        write_atomically(self._folder / published.scene, content)
-        for old, new in zip(earlier.paths, paths, strict=True):
-            write_atomically(self._folder / new.trajectory, (self._folder / old.trajectory).read_bytes())
-        write_atomically(self._folder / published.trajectory, pose_file(self._folder, earlier).read_bytes())
-        self._list(published)
+        with self._listed(version):
+            slots = self._write_slots(shown, earlier.white, version, tolerance=0.0)
+            published = earlier.model_copy(
+                update={"version": version, "at": datetime.now(UTC), "paths": paths, **names, **slots, **edited}
+            )
+            write_atomically(self._folder / published.scene, content)
+            for old, new in zip(earlier.paths, paths, strict=True):
+                write_atomically(self._folder / new.trajectory, (self._folder / old.trajectory).read_bytes())
+            write_atomically(self._folder / published.trajectory, pose_file(self._folder, earlier).read_bytes())
+            self._list(published)
         return published
 
     def publish(
@@ -143,27 +145,39 @@ class Publisher:
         """
         version = self.version + 1
         content = scene.ply(white)
-        published = Published(
-            version=version,
-            white=white,
-            scene=f"scene-{version:06d}.ply",
-            trajectory=f"trajectory-{version:06d}.poses",
-            at=datetime.now(UTC),
-            splats=len(scene),
-            poses=len(trajectory) if posed_frames is None else posed_frames,
-            scene_bytes=len(content),
-            psnr_db=psnr_db,
-            intrinsics=None if intrinsics is None else (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy),
-            distortion=None if intrinsics is None else lens_of(intrinsics.distortion),
-            **self._write_slots(scene, white, version, tolerance),
-            paths=[one.published(f"path-{version:06d}-{number}.poses") for number, one in enumerate(others, 1)],
-        )
-        for path, one in zip(published.paths, others, strict=True):
-            _write_poses(self._folder / path.trajectory, one.trajectory, None)
-        write_atomically(self._folder / published.scene, content)
-        _write_poses(self._folder / published.trajectory, trajectory, states)
-        self._list(published)
+        with self._listed(version):
+            published = Published(
+                version=version,
+                white=white,
+                scene=f"scene-{version:06d}.ply",
+                trajectory=f"trajectory-{version:06d}.poses",
+                at=datetime.now(UTC),
+                splats=len(scene),
+                poses=len(trajectory) if posed_frames is None else posed_frames,
+                scene_bytes=len(content),
+                psnr_db=psnr_db,
+                intrinsics=None if intrinsics is None else (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy),
+                distortion=None if intrinsics is None else lens_of(intrinsics.distortion),
+                **self._write_slots(scene, white, version, tolerance),
+                paths=[one.published(f"path-{version:06d}-{number}.poses") for number, one in enumerate(others, 1)],
+            )
+            for path, one in zip(published.paths, others, strict=True):
+                _write_poses(self._folder / path.trajectory, one.trajectory, None)
+            write_atomically(self._folder / published.scene, content)
+            _write_poses(self._folder / published.trajectory, trajectory, states)
+            self._list(published)
         return published
+
+    @contextmanager
+    def _listed(self, version: int) -> Iterator[None]:
+        """Remove what was written of a version if it does not come to be listed: on a full disk, space counts."""
+        try:
+            yield
+        except OSError:
+            if self.version != version:
+                for file in self._folder.glob(f"*-{version:06d}*"):
+                    file.unlink(missing_ok=True)
+            raise
 
     def _write_slots(self, scene: Scene, white: float, version: int, tolerance: float) -> dict[str, Any]:
         """Bring the slots up to date and write them. Return what `Published` says of them."""
@@ -177,9 +191,10 @@ class Publisher:
         without_slots = [one.model_copy(update={"slots": None}) for one in kept[:-_NEWEST]]
         kept = without_slots + kept[-_NEWEST:]
         write_atomically(self._folder / _INDEX, _Index(versions=kept).model_dump_json().encode())
-        gone = {one.version: one for one in self._versions}.keys() - {one.version for one in kept}
+        earlier, self._versions = self._versions, kept
+        gone = {one.version: one for one in earlier}.keys() - {one.version for one in kept}
         slots = {one.slots for one in kept}
-        for one in self._versions:
+        for one in earlier:
             if one.slots is not None and one.slots not in slots:
                 (self._folder / one.slots).unlink(missing_ok=True)
             if one.version in gone:
@@ -188,7 +203,6 @@ class Publisher:
                 pose_file(self._folder, one).unlink(missing_ok=True)
                 for path in one.paths:
                     (self._folder / path.trajectory).unlink(missing_ok=True)
-        self._versions = kept
 
 
 def pose_file(folder: Path, published: Published) -> Path:

@@ -14,6 +14,7 @@ from spiked.errors import SpikedError
 from spiked_service.store.disk_reserve import DiskReserve
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.migrations import MIGRATIONS, copy_before_migration, migrate, schema_of, written_by
+from spiked_service.store.row_copies import RowCopies
 from spiked_service.store.rows import CaptureRow, CaptureState, JobState, ReconstructionRow, UploadRow, VersionRow
 
 _WAIT_S = 5.0
@@ -61,7 +62,7 @@ class Catalogue:
     """Rows by id. Every method may be called from any thread, raises StoreError, and is one short transaction.
 
     A row is kept as one JSON document; columns made from it serve the queries. In a data folder a copy of the document
-    lies beside the files that it is about: never older than the row, so it replaces a row that was lost.
+    lies beside the files that it is about: as new as what was answered, so it replaces a row that was lost.
     `synchronous = NORMAL`: a kill loses nothing, a power cut at most the last moments, and what lies on disk then is
     put right when the service starts.
     """
@@ -71,6 +72,8 @@ class Catalogue:
         self._path = path
         self._readers: list[sqlite3.Connection] = []
         self._writing = threading.RLock()
+        self.copies = RowCopies()
+        """Of the rows that the open transaction changes."""
         with _as_store_error(path):
             self._writer = _connect(path)
         try:
@@ -116,12 +119,15 @@ class Catalogue:
             self._writer.execute("BEGIN IMMEDIATE")
             try:
                 yield self._writer
+                self.copies.prepare()
+                self._writer.execute("COMMIT")
             except BaseException:
                 # A full disk may have rolled back by itself.
                 with suppress(sqlite3.OperationalError):
                     self._writer.execute("ROLLBACK")
+                self.copies.drop()
                 raise
-            self._writer.execute("COMMIT")
+            self.copies.place()
 
     def keep_reserve(self) -> None:
         """Keep some space of the disk for `freeing`, if it is not kept yet and there is room."""
@@ -284,7 +290,7 @@ class Table(Generic[_Row]):
                 f"INSERT OR REPLACE INTO {self._name} (id, document) VALUES (?, ?)", (row.id, document.decode())
             )
             if self._beside is not None:
-                _write_copy(self._beside(row.id), document)
+                self._catalogue.copies.put(self._beside(row.id), document)
 
     def documents(self) -> dict[str, str]:
         """All rows as they are stored, by id."""
@@ -332,7 +338,7 @@ class Table(Generic[_Row]):
         with self._catalogue.transaction() as connection:
             connection.execute(f"DELETE FROM {self._name} WHERE id = ?", (row_id,))
             if self._beside is not None:
-                self._beside(row_id).unlink(missing_ok=True)
+                self._catalogue.copies.remove(self._beside(row_id))
 
     def where(self, condition: str = "1", values: tuple[Any, ...] = ()) -> list[_Row]:
         """Rows that match an SQL condition, which may include ORDER BY."""
@@ -352,18 +358,6 @@ _VERSION = TypeAdapter(VersionRow)
 
 def _connect(path: Path) -> sqlite3.Connection:
     return sqlite3.connect(path, timeout=_WAIT_S, isolation_level=None, check_same_thread=False)
-
-
-def _write_copy(path: Path, document: bytes) -> None:
-    """Replace the copy of a row. If that fails, the copy is deleted rather than left outdated."""
-    part = path.with_name(path.name + ".part")
-    try:
-        if path.parent.is_dir():
-            part.write_bytes(document)
-            part.replace(path)
-    except OSError:
-        part.unlink(missing_ok=True)
-        path.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -11,6 +11,8 @@ from spiked.scene import Scene
 from spiked.trajectory import Trajectory
 from spiked.whole_files import write_atomically
 
+from ...small_disk import fill, small_disk
+
 
 def test_files_of_the_last_three_versions_are_kept_and_old_versions_thinned(tmp_path: Path) -> None:
     publisher = Publisher(tmp_path)
@@ -75,3 +77,31 @@ def test_of_a_file_that_cannot_be_written_nothing_is_left(tmp_path: Path) -> Non
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a", b"old")]
+
+
+def test_of_a_version_that_has_no_room_nothing_is_left(tmp_path: Path) -> None:
+    """Whichever of its files is the first without room: slots, scene, poses, or the list."""
+    rng = np.random.default_rng(0)
+    shapes = ((2000, 3), (2000, 4), (2000, 3), (2000,), (2000, 1))
+    scene = Scene(*(rng.normal(size=shape).astype(np.float32) for shape in shapes))
+    trajectory = Trajectory(np.arange(2000) + 0.5, np.eye(3)[None].repeat(2000, 0), np.zeros((2000, 3)))
+    with small_disk(tmp_path / "data", 4) as disk:
+        folder = disk / "job"
+        folder.mkdir()
+        publisher = Publisher(folder)
+        first = publisher.publish(scene, trajectory, 0.1)
+        files = sorted(folder.iterdir())
+        refused = 0
+        for room in range(0, 1_000_000, 40_000):
+            others = fill(disk, left_bytes=room)
+            try:
+                publisher.publish(scene, trajectory, 0.1)
+            except OSError:
+                refused += 1
+                assert sorted(folder.iterdir()) == files, room
+                assert publisher.version == 1 and newest(folder) == first
+            else:
+                break
+            finally:
+                others.unlink()
+        assert refused >= 4 and publisher.version == 2

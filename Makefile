@@ -89,7 +89,7 @@ packages: wheel
 	$(PYTHON) deploy/build_image.py dist/spiked_*_$$(dpkg --print-architecture).deb
 
 clean:
-	rm -rf web/node_modules service/spiked_service/page service/spiked_service/guide
+	rm -rf web/node_modules service/spiked_service/page service/spiked_service/guide spiked/export/viewer.js
 	rm -rf $(VENV) build dist out .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find spiked -name '*.so' -delete
 

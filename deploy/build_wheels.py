@@ -106,6 +106,8 @@ def check(programs: Path, wheel: Path) -> None:
     for folder, target in {"page": "page", "guide": "docs"}.items():
         if f"spiked_service/{folder}/index.html" not in inside:
             sys.exit(f"error: {wheel.name} has no {folder}; run `make {target}` first")
+    if "spiked/export/viewer.js" not in inside:
+        sys.exit(f"error: {wheel.name} has no viewer; run `make page` first")
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from spiked.errors import SceneError
 from spiked.scene import Scene
 
-__all__ = ["SceneChanges", "SceneMirror"]
+__all__ = ["SceneChanges", "SceneMirror", "travelling", "whole_scene"]
 
 _MAGIC = b"SPKC"
 """First bytes of a message."""
@@ -26,6 +26,10 @@ _HEADER = struct.Struct("<4s9I")
 channels, of emptied and of filled slots."""
 MOST_SLOTS = 50_000_000
 """More is no scene but a damaged header."""
+_LARGEST_HALF = 60_000.0
+"""Values are stored up to this: near the largest of 16-bit floats."""
+_FINEST = 2
+"""Level of detail with all splats."""
 _KINDS = ("<u4", "<f4", "<f2", "<f2", "i1", "u1")
 """Types of the columns."""
 
@@ -111,6 +115,27 @@ class SceneChanges:
         if not all(np.isfinite(column).all() for column in columns):
             raise SceneError("these changes of a scene hold values that are not finite")
         return cls(bool(whole), began, version, level, slots, gone, slot, *columns, quats, opacities)
+
+
+def whole_scene(scene: Scene, white: float, version: int) -> SceneChanges:
+    """All splats of a scene, in slots of their own, at the finest level of detail; radiance `white` is colour 1."""
+    slots = np.arange(len(scene), dtype=np.uint32)
+    return SceneChanges(True, 0, version, _FINEST, len(scene), slots[:0], slots, *travelling(scene, white))
+
+
+def travelling(scene: Scene, white: float) -> tuple[NDArray[Any], ...]:
+    """The splats as they travel: means [n, 3], log_scales [n, 3], colours [n, C], quats [n, 4], opacities [n].
+
+    Radiance `white` is colour 1.
+    """
+    quats = scene.quats / np.maximum(np.linalg.norm(scene.quats, axis=1, keepdims=True), 1e-12)
+    return (
+        scene.means,
+        np.clip(scene.log_scales, -_LARGEST_HALF, _LARGEST_HALF).astype(np.float16),
+        np.clip(scene.colours / np.float32(white or 1), -_LARGEST_HALF, _LARGEST_HALF).astype(np.float16),
+        np.round(np.where(quats[:, :1] < 0, -quats, quats) * 127).astype(np.int8),
+        np.round(255 / (1 + np.exp(-np.clip(scene.opacity_logits, -30, 30)))).astype(np.uint8),
+    )
 
 
 class SceneMirror:

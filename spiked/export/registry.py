@@ -13,6 +13,7 @@ from spiked.export import (
     ros_bag,
     splats,
     video,
+    viewer_page,
 )
 from spiked.export.kind import ExportKind
 
@@ -33,6 +34,7 @@ KINDS: tuple[ExportKind, ...] = (
     ros_bag.KIND,
     nexus.KIND,
     video.KIND,
+    viewer_page.KIND,
 )
 """In the order in which they are listed."""
 

@@ -48,6 +48,9 @@ class ExportSource:
     first_frame: int = 0
     """Index in the capture of the recording's first frame."""
     name: str = "spiked"
+    """Of files."""
+    title: str = ""
+    """For people, if it has another one."""
     unit: str = "scene"
     """Of lengths: `m` once it is in metres."""
 

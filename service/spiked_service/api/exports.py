@@ -52,16 +52,17 @@ class Exports:
         kind.check()
         result = self._results.of(row, version)
         result = result.metric() if metric else result
-        known = (row.id, files.stamp(result.scene), kind.name, options, result.frame)
+        title = row.name or self._captures.get(row.capture_id).row.name
+        known = (row.id, files.stamp(result.scene), kind.name, options, result.frame, title)
         number = result.published.version
         made = self._place / f"{row.id}-{number:06d}-{zlib.crc32(repr(known).encode()):08x}"
         if not made.exists():
-            self._make(self._command(row, result, kind, options, made))
+            self._make(self._command(row, title, result, kind, options, made))
         name = f"{row.id}-{number:06d}-{kind.name}{kind.suffix or '.zip'}"
         return files.ranged(request, made, name, kind.sent_as, **{"X-Scene-Version": str(number)})
 
     def _command(
-        self, row: ReconstructionRow, result: Result, kind: ExportKind, options: ExportOptions, out: Path
+        self, row: ReconstructionRow, title: str, result: Result, kind: ExportKind, options: ExportOptions, out: Path
     ) -> ExportCommand:
         capture = self._captures.get(row.capture_id).row
         closed = capture.recording is not None and not capture.state.acquiring
@@ -72,6 +73,7 @@ class Exports:
             out=out,
             options=options,
             name=f"{row.id}-{result.published.version:06d}",
+            title=title,
             scene=result.scene,
             poses=result.poses().path,
             white=result.published.white,

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from spiked.errors import SceneError
 from spiked.scene import Scene
-from spiked.scene_changes import SceneChanges
+from spiked.scene_changes import SceneChanges, travelling
 
 TOLERANCE = 0.03
 """Difference of a splat, as a share of white at its centre, that is not sent; 0 sends every difference. Of 0.01, 0.03
@@ -27,8 +27,6 @@ _DARKEST = 0.3
 """Brightness, share of white, that moving or hiding splats count with at least: dark ones hide bright ones."""
 _SAMPLED = 16
 """Every so many splats one is looked up by its place, which costs more than all other steps."""
-_LARGEST_HALF = 60_000.0
-"""Values are stored up to this: near the largest of 16-bit floats."""
 _COLUMNS = ("mean", "log_scale", "colour", "quat", "opacity")
 """What travels of a slot, in the order of `SceneChanges`."""
 
@@ -147,12 +145,8 @@ def _row_type(channels: int) -> np.dtype[Any]:
 def _rows(scene: Scene, white: float, version: int) -> Rows:
     """The splats as they travel; colour 1 is radiance `white`."""
     rows = np.zeros(len(scene), _row_type(scene.colours.shape[1]))
-    quats = scene.quats / np.maximum(np.linalg.norm(scene.quats, axis=1, keepdims=True), 1e-12)
-    rows["mean"] = scene.means
-    rows["log_scale"] = np.clip(scene.log_scales, -_LARGEST_HALF, _LARGEST_HALF)
-    rows["colour"] = np.clip(scene.colours / np.float32(white or 1), -_LARGEST_HALF, _LARGEST_HALF)
-    rows["quat"] = np.round(np.where(quats[:, :1] < 0, -quats, quats) * 127)
-    rows["opacity"] = np.round(255 / (1 + np.exp(-np.clip(scene.opacity_logits, -30, 30))))
+    for name, column in zip(_COLUMNS, travelling(scene, white), strict=True):
+        rows[name] = column
     rows["held"], rows["changed"] = True, version
     return rows
 

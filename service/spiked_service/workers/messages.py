@@ -180,6 +180,9 @@ class ExportCommand(_Command):
     """The file; a folder becomes a ZIP."""
     options: ExportOptions
     name: str
+    """Of files."""
+    title: str
+    """For people."""
     scene: Path
     poses: Path
     white: float

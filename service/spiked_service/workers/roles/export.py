@@ -52,6 +52,7 @@ def source_of(command: ExportCommand) -> ExportSource:
         recording=recording,
         first_frame=command.first_frame,
         name=command.name,
+        title=command.title,
     )
     if command.metres_per_unit is None:
         return source

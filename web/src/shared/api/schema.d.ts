@@ -10215,7 +10215,7 @@ export interface operations {
             header?: never;
             path: {
                 /** @description Name of a format. */
-                format: "depth" | "points-ply" | "points-pcd" | "mesh-ply" | "mesh-glb" | "colmap" | "nerfstudio" | "ply" | "compressed-ply" | "spz" | "sog" | "rerun" | "mcap" | "ros-bag" | "nexus" | "video";
+                format: "depth" | "points-ply" | "points-pcd" | "mesh-ply" | "mesh-glb" | "colmap" | "nerfstudio" | "ply" | "compressed-ply" | "spz" | "sog" | "rerun" | "mcap" | "ros-bag" | "nexus" | "video" | "viewer";
                 reconstruction_id: string;
             };
             cookie?: never;
@@ -10238,6 +10238,7 @@ export interface operations {
                     "application/octet-stream": string;
                     "model/gltf-binary": string;
                     "video/mp4": string;
+                    "text/html": string;
                 };
             };
             /** @description The requested range. */
@@ -10250,6 +10251,7 @@ export interface operations {
                     "application/octet-stream": string;
                     "model/gltf-binary": string;
                     "video/mp4": string;
+                    "text/html": string;
                 };
             };
             /** @description The content has not changed. */
@@ -10372,7 +10374,7 @@ export interface operations {
             header?: never;
             path: {
                 /** @description Name of a format. */
-                format: "depth" | "points-ply" | "points-pcd" | "mesh-ply" | "mesh-glb" | "colmap" | "nerfstudio" | "ply" | "compressed-ply" | "spz" | "sog" | "rerun" | "mcap" | "ros-bag" | "nexus" | "video";
+                format: "depth" | "points-ply" | "points-pcd" | "mesh-ply" | "mesh-glb" | "colmap" | "nerfstudio" | "ply" | "compressed-ply" | "spz" | "sog" | "rerun" | "mcap" | "ros-bag" | "nexus" | "video" | "viewer";
                 capture_id: string;
             };
             cookie?: never;
@@ -10395,6 +10397,7 @@ export interface operations {
                     "application/octet-stream": string;
                     "model/gltf-binary": string;
                     "video/mp4": string;
+                    "text/html": string;
                 };
             };
             /** @description The requested range. */
@@ -10407,6 +10410,7 @@ export interface operations {
                     "application/octet-stream": string;
                     "model/gltf-binary": string;
                     "video/mp4": string;
+                    "text/html": string;
                 };
             };
             /** @description The content has not changed. */

@@ -109,6 +109,7 @@ def test_corners_in_the_middle_only_are_warned_about() -> None:
     assert not calibrate_lens(corners("barrel"), BOARD, WIDTH, HEIGHT, LensModel.OPENCV).warnings()
 
 
+@pytest.mark.slow
 @pytest.mark.validation
 def test_two_seconds_by_hand_are_enough(figure: Any) -> None:
     known = LENSES["barrel"]

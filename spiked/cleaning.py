@@ -1,4 +1,5 @@
-"""Cleaning of a scene: what lies outside a box, and floaters, which few views see or which stick out."""
+"""Cleaning of a scene: what lies outside a box or inside an outline, and floaters, which few views see or which stick
+out."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ from spiked.render.cpu import Rasteriser
 from spiked.scene import Scene
 from spiked.trajectory import Trajectory
 
-__all__ = ["Box", "Cleaned", "FloaterRemoval", "clean"]
+__all__ = ["Box", "Cleaned", "FloaterRemoval", "Outline", "clean"]
 
 Mask = NDArray[np.bool_]
 
@@ -36,6 +37,35 @@ class Box:
         """Splats [N] whose means are inside."""
         low, high = np.array(self.low, np.float32), np.array(self.high, np.float32)
         return np.asarray(((scene.means >= low) & (scene.means <= high)).all(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """A closed outline as a camera sees it, and all that lies behind it."""
+
+    corners: NDArray[np.float64]
+    """Slopes x/z and y/z in the camera's axes, [k >= 3, 2]; the last one is joined to the first."""
+    rotation: NDArray[np.float64]
+    """Camera to world, OpenCV axes, [3, 3]."""
+    centre: NDArray[np.float64]
+    """Of the camera, [3]."""
+
+    def __post_init__(self) -> None:
+        if self.corners.ndim != 2 or self.corners.shape[1] != 2 or len(self.corners) < 3:
+            raise ConfigurationError(f"an outline has three corners or more, not {len(self.corners)}")
+        if not np.isfinite(self.corners).all():
+            raise ConfigurationError("an outline has corners that are not finite")
+
+    def contains(self, scene: Scene) -> Mask:
+        """Splats [N] in front of the camera whose means are inside; where it crosses itself, by the even-odd rule."""
+        seen = (scene.means - self.centre) @ self.rotation
+        ahead = seen[:, 2] > 0
+        x, y = (seen[:, k] / np.where(ahead, seen[:, 2], 1) for k in (0, 1))
+        inside = np.zeros(len(scene), bool)
+        for (x0, y0), (x1, y1) in zip(self.corners, np.roll(self.corners, -1, axis=0), strict=True):
+            if y0 != y1:  # a ray to the right crosses the side
+                inside ^= ((y0 > y) != (y1 > y)) & (x < x0 + (x1 - x0) * (y - y0) / (y1 - y0))
+        return np.asarray(inside & ahead)
 
 
 @dataclass(frozen=True)
@@ -82,6 +112,8 @@ class Cleaned:
     scene: Scene
     outside: int
     """Splats that lay outside the box."""
+    outlined: int
+    """Splats that lay inside the outline."""
     floaters: int
     """Splats that were removed as floaters."""
     shrunk: int
@@ -95,25 +127,29 @@ def clean(
     box: Box | None = None,
     removal: FloaterRemoval | None = None,
     progress: Callable[[float], None] | None = None,
+    outline: Outline | None = None,
 ) -> Cleaned:
-    """The scene without what is outside of `box`, and without floaters if `removal` is given.
+    """The scene without what is outside of `box` or inside of `outline`, and without floaters if `removal` is given.
 
     Raises ConfigurationError if nothing would be left.
     """
     kept = scene if box is None else scene.select(box.contains(scene))
-    outside, floaters, shrunk = len(scene) - len(kept), 0, 0
+    outside, outlined, floaters, shrunk = len(scene) - len(kept), 0, 0, 0
+    if outline is not None:
+        chosen = outline.contains(kept)
+        outlined, kept = int(chosen.sum()), kept.select(~chosen)
     if removal is not None and len(kept):
         rows = evenly(len(path), removal.views)
         chosen = removal.floaters(kept, _seen(kept, path, camera, rows, removal.least_px, progress), len(rows))
         floaters = int(chosen.sum())
         kept = kept.select(~chosen)
     if not len(kept):
-        raise ConfigurationError("nothing of the scene would be left: choose a larger box")
+        raise ConfigurationError("nothing of the scene would be left: choose a larger box or a smaller outline")
     if removal is not None and removal.shrink:
         most = np.float32(np.log(removal.largest(kept)))
         shrunk = int((kept.log_scales > most).any(axis=1).sum())
         kept = replace(kept, log_scales=np.minimum(kept.log_scales, most))
-    return Cleaned(kept, outside, floaters, shrunk)
+    return Cleaned(kept, outside, outlined, floaters, shrunk)
 
 
 def _seen(

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from spiked.cleaning import Box, FloaterRemoval, clean
+from spiked.cleaning import Box, FloaterRemoval, Outline, clean
 from spiked.errors import ConfigurationError
 from spiked.render.cpu import Rasteriser
 from spiked.scene import Scene
@@ -54,6 +54,30 @@ def test_a_box_cuts(room: RoomMap) -> None:
     cleaned = clean(room.scene, room.path, CAMERA, box=box)
     assert cleaned.outside + len(cleaned.scene) == len(room.scene) and 0 < cleaned.outside < len(room.scene)
     assert box.contains(cleaned.scene).all()
+
+
+def test_an_outline_cuts_what_is_behind_it(room: RoomMap) -> None:
+    row = len(room.path) // 2
+    rotation, centre = room.path.rotations[row], room.path.centres[row]
+    # An L: its notch, at the lower right, stays. The camera says which splats are where.
+    w, h = CAMERA.width / 8, CAMERA.height / 8
+    pixels = np.array([[2 * w, 2 * h], [6 * w, 2 * h], [6 * w, 4 * h], [4 * w, 4 * h], [4 * w, 6 * h], [2 * w, 6 * h]])
+    outline = Outline(CAMERA.intrinsics.unproject(pixels)[:, :2], rotation, centre)
+    seen = (room.scene.means - centre) @ rotation
+    x, y = CAMERA.intrinsics.project(seen).T
+    wanted = (x > 2 * w) & (x < 6 * w) & (y > 2 * h) & (y < 6 * h) & ~((x > 4 * w) & (y > 4 * h)) & (seen[:, 2] > 0)
+    assert 20 < wanted.sum() < len(room.scene) / 2
+    np.testing.assert_array_equal(outline.contains(room.scene), wanted)
+    cleaned = clean(room.scene, room.path, CAMERA, outline=outline)
+    assert cleaned.outlined == wanted.sum() and len(cleaned.scene) == (~wanted).sum()
+    behind = Outline(outline.corners, rotation @ np.diag([-1.0, 1.0, -1.0]), centre)
+    assert not behind.contains(room.scene.select(seen[:, 2] > 0)).any(), "nothing behind the camera"
+
+
+@pytest.mark.parametrize("corners", [[[0, 0], [1, 1]], [[0, 0], [1, 1], [np.nan, 0]], [[0, 0, 0]] * 3])
+def test_what_is_no_outline_is_refused(corners: list[list[float]]) -> None:
+    with pytest.raises(ConfigurationError, match="an outline has"):
+        Outline(np.array(corners, float), np.eye(3), np.zeros(3))
 
 
 def test_what_leaves_nothing_is_refused(room: RoomMap) -> None:

@@ -145,26 +145,6 @@ class CaptureState(StrEnum):
     failed = "failed"
 
 
-class CleanRequest(BaseModel):
-    """
-    What is removed.
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    version: Annotated[
-        int,
-        Field(description="The newest version, which is edited; 409 if there is another."),
-    ]
-    box: Annotated[BoxModel | None, Field(description="Splats outside are removed.")] = None
-    floaters: Annotated[bool, Field(description="Remove splats that few views see.")] = True
-    shrink: Annotated[
-        bool,
-        Field(description="With floaters: also make splats smaller that are larger than a quarter of the scene."),
-    ] = False
-
-
 class ClockPair(BaseModel):
     """
     Host time at which a frame had arrived whole, Unix time in ns.
@@ -231,6 +211,7 @@ class EditedOut(BaseModel):
     version: int
     splats: int
     outside: Annotated[int, Field(description="Splats that lay outside the box.")]
+    outlined: Annotated[int, Field(description="Splats that lay inside the outline.")]
     floaters: Annotated[int, Field(description="Splats that were removed as floaters.")]
     shrunk: Annotated[int, Field(description="Splats that were made smaller.")]
 
@@ -594,6 +575,21 @@ class Origin(StrEnum):
     live = "live"
     upload = "upload"
     recovered = "recovered"
+
+
+class OutlineModel(BaseModel):
+    """
+    An outline drawn over a view, and where that was seen from: c2w, or position and quaternion_wxyz.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    corners: Annotated[
+        list[list[float]],
+        Field(description="x/z and y/z in the camera's OpenCV axes, in order."),
+    ]
+    camera: Annotated[CameraModel, Field(description="A frame cannot be given here.")]
 
 
 class Output(StrEnum):
@@ -1274,6 +1270,30 @@ class ZmqOut(BaseModel):
         Field(description="REP: the newest message of each kind, or those after a number."),
     ]
     previews: Annotated[str, Field(description="PUB: pictures.")]
+
+
+class CleanRequest(BaseModel):
+    """
+    What is removed.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    version: Annotated[
+        int,
+        Field(description="The newest version, which is edited; 409 if there is another."),
+    ]
+    box: Annotated[BoxModel | None, Field(description="Splats outside are removed.")] = None
+    outline: Annotated[
+        OutlineModel | None,
+        Field(description="Splats inside are removed, however far behind it."),
+    ] = None
+    floaters: Annotated[bool, Field(description="Remove splats that few views see.")] = True
+    shrink: Annotated[
+        bool,
+        Field(description="With floaters: also make splats smaller that are larger than a quarter of the scene."),
+    ] = False
 
 
 class ConsumerOut(BaseModel):

@@ -3,11 +3,12 @@
 import re
 import zipfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from browsing import PHONE, Studied, address, picture, shown_version, still, until, violations
+from browsing import PHONE, Studied, address, keep, picture, shown_version, still, until, violations
 
 
 @pytest.fixture
@@ -124,6 +125,32 @@ def test_a_scene_is_cleaned_and_brought_back(studied: Studied, scene: Callable[.
     page.get_by_role("button", name="Remove floaters").click()
     page.get_by_text(re.compile(r"Removed \d.* floaters")).wait_for()
     assert violations(page) == []
+    page.get_by_role("button", name="Undo").click()
+    until(lambda: studied.reconstruction()["splats"] == before["splats"], "all splats are back")
+
+
+def test_splats_inside_a_lasso_are_removed(studied: Studied, scene: Callable[..., Any], pictures_folder: Path) -> None:
+    page = scene()
+    before = studied.reconstruction()
+    page.locator("summary").filter(has_text="Clean").click()
+    page.get_by_role("button", name="Draw around splats").click()
+    box = page.locator(".stage canvas").bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(middle[0] + 90, middle[1])
+    page.mouse.down()
+    for turn in np.linspace(0, 2 * np.pi, 24):
+        page.mouse.move(middle[0] + 90 * np.cos(turn), middle[1] + 60 * np.sin(turn))
+    page.mouse.up()
+    remove = page.get_by_role("button", name=re.compile(r"Remove \d.* splats"))
+    remove.wait_for()
+    assert violations(page) == []
+    keep(page, pictures_folder / "lasso.webp")
+    inside = int(re.sub(r"\D", "", remove.inner_text()))
+    remove.click()
+    page.get_by_text(re.compile(r"Removed \d.* splats")).wait_for()
+    until(lambda: studied.reconstruction()["splats"] == before["splats"] - inside, "as many as the page has counted")
+    page.keyboard.press("Escape")
+    page.get_by_role("button", name="Draw around splats").wait_for()
     page.get_by_role("button", name="Undo").click()
     until(lambda: studied.reconstruction()["splats"] == before["splats"], "all splats are back")
 

@@ -36,3 +36,21 @@ def test_a_cleaned_scene_is_a_version_and_can_be_undone(
     assert (
         len(scene_of(service, job, tmp_path)) == len(scene) and http.get(url).json()["version"] == edited["version"] + 1
     )
+
+
+def test_what_is_outlined_in_a_view_is_removed(service: Any, done: CaptureOut, job: str, tmp_path: Path) -> None:
+    http, url = service.http, f"reconstructions/{job}"
+    before, scene = http.get(url).json(), scene_of(service, job, tmp_path)
+    camera = {"position": [0.0, 0.0, 0.0], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]}
+    corners = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]
+    slopes = scene.means[:, :2] / scene.means[:, 2:]
+    inside = (np.abs(slopes) < 0.1).all(axis=1) & (scene.means[:, 2] > 0)
+    body = {"version": before["version"], "floaters": False, "outline": {"corners": corners, "camera": camera}}
+    edited = http.post(f"{url}:clean", json=body).json()
+    assert edited["outlined"] == inside.sum() > 0
+    assert edited["splats"] == len(scene) - inside.sum() and edited["floaters"] == 0
+    for wrong in ({"corners": corners[:2]}, {"camera": {"frame": 100}}, {"corners": [[0, 1e9]] * 3}):
+        outline = {"corners": corners, "camera": camera} | wrong
+        refused = http.post(f"{url}:clean", json={**body, "version": edited["version"], "outline": outline})
+        assert refused.status_code == 422, refused.text
+    assert http.post(f"{url}:revert", json={"version": edited["version"], "to": before["version"]}).status_code == 200

@@ -25,7 +25,10 @@ def cleaning_routes(rows: ReconstructionRepository, results: Results, route_clas
 
     @router.post(":clean", responses=problems(404, 409, 507))
     def clean_scene(reconstruction_id: str, body: CleanRequest, idempotency_key: IdempotencyKey = None) -> EditedOut:
-        """Publish a version without what is outside of a box, and without floaters. `:revert` undoes it."""
+        """Publish a version without what is outside of a box, inside of an outline, and without floaters.
+
+        `:revert` undoes it.
+        """
         result = results.of(rows.get(reconstruction_id), body.version)
         camera, path = result.camera, result.path(_POSES)
         if camera is None or not len(path):
@@ -37,6 +40,7 @@ def cleaning_routes(rows: ReconstructionRepository, results: Results, route_clas
                 camera,
                 None if body.box is None else body.box.box(),
                 FloaterRemoval(shrink=body.shrink) if body.floaters else None,
+                outline=None if body.outline is None else body.outline.outline(),
             )
         published = rows.publish_edit(
             reconstruction_id, body.version, lambda publisher: publisher.again(result.published, found.scene)
@@ -45,6 +49,7 @@ def cleaning_routes(rows: ReconstructionRepository, results: Results, route_clas
             version=published.version,
             splats=published.splats,
             outside=found.outside,
+            outlined=found.outlined,
             floaters=found.floaters,
             shrunk=found.shrunk,
         )
@@ -58,6 +63,8 @@ def cleaning_routes(rows: ReconstructionRepository, results: Results, route_clas
         published = rows.publish_edit(reconstruction_id, body.version, lambda publisher: publisher.again(earlier))
         if other_unit:
             forget_scale(folder, published.version - 1)
-        return EditedOut(version=published.version, splats=published.splats, outside=0, floaters=0, shrunk=0)
+        return EditedOut(
+            version=published.version, splats=published.splats, outside=0, outlined=0, floaters=0, shrunk=0
+        )
 
     return router

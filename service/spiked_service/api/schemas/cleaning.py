@@ -1,9 +1,16 @@
 """Cleaning of a scene."""
 
-from pydantic import Field, StrictBool, StrictInt
+from typing import Annotated
 
-from spiked.cleaning import Box
+import numpy as np
+from pydantic import Field, StrictBool, StrictFloat, StrictInt
+
+from spiked.cleaning import Box, Outline
+from spiked.errors import ConfigurationError
 from spiked_service.api.schemas.base import LARGEST_INTEGER, In, Out, Vector, examples
+from spiked_service.api.schemas.views import CameraModel
+
+_Slope = Annotated[StrictFloat, Field(ge=-1e6, le=1e6)]
 
 Newest = Field(ge=1, le=LARGEST_INTEGER, description="The newest version, which is edited; 409 if there is another.")
 
@@ -21,6 +28,29 @@ class BoxModel(In):
         return Box(self.low, self.high)
 
 
+class OutlineModel(In):
+    """An outline drawn over a view, and where that was seen from: c2w, or position and quaternion_wxyz."""
+
+    model_config = examples(
+        {
+            "corners": [[-0.1, -0.1], [0.1, -0.1], [0.0, 0.1]],
+            "camera": {"position": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]},
+        }
+    )
+
+    corners: list[tuple[_Slope, _Slope]] = Field(
+        min_length=3, max_length=1000, description="x/z and y/z in the camera's OpenCV axes, in order."
+    )
+    camera: CameraModel = Field(description="A frame cannot be given here.")
+
+    def outline(self) -> Outline:
+        """The same for the library. Raises ConfigurationError for a frame."""
+        if self.camera.frame is not None:
+            raise ConfigurationError("outline.camera: give c2w, or position and quaternion_wxyz; a frame is no view")
+        pose = self.camera.pose()
+        return Outline(np.array(self.corners), pose.rotation, pose.centre)
+
+
 class CleanRequest(In):
     """What is removed."""
 
@@ -28,6 +58,7 @@ class CleanRequest(In):
 
     version: StrictInt = Newest
     box: BoxModel | None = Field(None, description="Splats outside are removed.")
+    outline: OutlineModel | None = Field(None, description="Splats inside are removed, however far behind it.")
     floaters: StrictBool = Field(True, description="Remove splats that few views see.")
     shrink: StrictBool = Field(
         False, description="With floaters: also make splats smaller that are larger than a quarter of the scene."
@@ -49,5 +80,6 @@ class EditedOut(Out):
     version: int
     splats: int
     outside: int = Field(description="Splats that lay outside the box.")
+    outlined: int = Field(description="Splats that lay inside the outline.")
     floaters: int = Field(description="Splats that were removed as floaters.")
     shrunk: int = Field(description="Splats that were made smaller.")

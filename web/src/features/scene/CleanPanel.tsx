@@ -1,4 +1,4 @@
-/** Removes floaters and what is outside of a box; each change is a version, and can be undone. */
+/** Removes floaters, what is outside of a box and what is inside of an outline; each change is a version, and can be undone. */
 
 import { type JSX, useEffect, useMemo, useState } from "react";
 
@@ -10,6 +10,7 @@ import { isEnded } from "../../shared/state/store";
 import { toast } from "../../shared/state/toasts";
 import { ActionButton } from "../../shared/ui/access";
 import { type Box, cut, NO_CUT, SIDES } from "./cropBox";
+import { LassoTool } from "./LassoTool";
 import type { Viewer } from "./Viewer";
 
 export interface CleanProps {
@@ -61,7 +62,8 @@ function Cleaning({ viewer, job, newest }: CleanProps & { viewer: Viewer }): JSX
         disabled={!ready}
         onClick={() =>
           void edit(
-            () => calls.clean(job.id, { version: job.version, floaters: true, shrink: false, box: null }),
+            () =>
+              calls.clean(job.id, { version: job.version, floaters: true, shrink: false, box: null, outline: null }),
             (found) => `Removed ${count(found.floaters)} floaters`,
           )
         }
@@ -91,13 +93,30 @@ function Cleaning({ viewer, job, newest }: CleanProps & { viewer: Viewer }): JSX
         onClick={() => {
           if (box === null) return;
           void edit(
-            () => calls.clean(job.id, { version: job.version, floaters: false, shrink: false, box: boxOf(box) }),
+            () =>
+              calls.clean(job.id, {
+                version: job.version,
+                floaters: false,
+                shrink: false,
+                box: boxOf(box),
+                outline: null,
+              }),
             (found) => `Removed ${count(found.outside)} splats outside of the box`,
           );
         }}
       >
         Cut to the box
       </ActionButton>
+      <LassoTool
+        viewer={viewer}
+        ready={ready}
+        onRemove={(outline) =>
+          edit(
+            () => calls.clean(job.id, { version: job.version, floaters: false, shrink: false, box: null, outline }),
+            (found) => `Removed ${count(found.outlined)} splats`,
+          )
+        }
+      />
       {undo !== null && (
         <ActionButton
           disabled={busy || job.version !== undo.after}

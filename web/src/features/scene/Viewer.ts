@@ -30,6 +30,7 @@ import { axisNames } from "./axisNames";
 import { type Changes, changed, NO_SLOTS, type Slots } from "./changes";
 import type { Box } from "./cropBox";
 import { type Colouring, type Path, quantile } from "./path";
+import { countInside, type Outline, outlineOf, type Point } from "./lasso";
 import { LoopLines } from "./loops";
 import { MarkLines } from "./MarkLines";
 import { OVERLAY_ORDER, PathLines } from "./PathLines";
@@ -530,6 +531,14 @@ export class Viewer {
       }
     }
     return low[0] > high[0] ? null : { low, high };
+  }
+
+  /** What lies behind a line on the canvas, in pixels from its corner; null while another camera is looked through. */
+  outline(line: readonly Point[]): { outline: Outline; splats: number } | null {
+    if (this.riding) return null;
+    const { clientWidth, clientHeight } = this.canvas;
+    const outline = outlineOf(line, clientWidth, clientHeight, this.camera);
+    return { outline, splats: countInside(this.slots, outline) };
   }
 
   /** Draw the edges of a box; null: none. */

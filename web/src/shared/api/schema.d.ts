@@ -1087,7 +1087,9 @@ export interface paths {
         put?: never;
         /**
          * Clean Scene
-         * @description Publish a version without what is outside of a box, and without floaters. `:revert` undoes it.
+         * @description Publish a version without what is outside of a box, inside of an outline, and without floaters.
+         *
+         *     `:revert` undoes it.
          *
          *     Scope of a token: `operate`.
          */
@@ -2119,6 +2121,8 @@ export interface components {
             version: number;
             /** @description Splats outside are removed. */
             box?: components["schemas"]["BoxModel"] | null;
+            /** @description Splats inside are removed, however far behind it. */
+            outline?: components["schemas"]["OutlineModel"] | null;
             /**
              * Floaters
              * @description Remove splats that few views see.
@@ -2348,6 +2352,11 @@ export interface components {
              * @description Splats that lay outside the box.
              */
             outside: number;
+            /**
+             * Outlined
+             * @description Splats that lay inside the outline.
+             */
+            outlined: number;
             /**
              * Floaters
              * @description Splats that were removed as floaters.
@@ -3033,6 +3042,51 @@ export interface components {
          * @enum {string}
          */
         Origin: "live" | "upload" | "recovered";
+        /**
+         * OutlineModel
+         * @description An outline drawn over a view, and where that was seen from: c2w, or position and quaternion_wxyz.
+         * @example {
+         *       "camera": {
+         *         "position": [
+         *           0,
+         *           0,
+         *           0
+         *         ],
+         *         "quaternion_wxyz": [
+         *           1,
+         *           0,
+         *           0,
+         *           0
+         *         ]
+         *       },
+         *       "corners": [
+         *         [
+         *           -0.1,
+         *           -0.1
+         *         ],
+         *         [
+         *           0.1,
+         *           -0.1
+         *         ],
+         *         [
+         *           0,
+         *           0.1
+         *         ]
+         *       ]
+         *     }
+         */
+        OutlineModel: {
+            /**
+             * Corners
+             * @description x/z and y/z in the camera's OpenCV axes, in order.
+             */
+            corners: [
+                number,
+                number
+            ][];
+            /** @description A frame cannot be given here. */
+            camera: components["schemas"]["CameraModel"];
+        };
         /**
          * Output
          * @description What a view shows.

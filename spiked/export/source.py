@@ -33,6 +33,9 @@ class ExportOptions:
     """Voxels along the longest side of the volume that a mesh is made in; points are at least half a voxel apart."""
     seconds: float = 10.0
     """Length of a video."""
+    through: tuple[tuple[float, ...], ...] = ()
+    """Poses that a video goes through, in the scene's own unit: centre x, y, z and rotation w, x, y, z of each. None:
+    it goes along the recorded path, smoothed."""
 
 
 @dataclass(frozen=True)

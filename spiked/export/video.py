@@ -1,10 +1,15 @@
-"""An MP4 along the recorded path, without its tremor."""
+"""An MP4 along the recorded path without its tremor, or through poses that are chosen."""
 
 from pathlib import Path
 
+import numpy as np
+
+from spiked.errors import ConfigurationError
 from spiked.export.kind import ExportKind
 from spiked.export.source import ExportOptions, ExportSource
-from spiked.video import Mp4Writer, calm_path, scene_pictures, video_camera
+from spiked.pose import rotation_of
+from spiked.trajectory import Trajectory
+from spiked.video import CameraPath, Mp4Writer, calm_path, scene_pictures, video_camera, waypoint_path
 
 __all__ = ["KIND"]
 
@@ -14,17 +19,30 @@ PICTURES_A_SECOND = 30
 
 def write(source: ExportSource, file: Path, options: ExportOptions) -> str:
     """Write the file. Raises SceneError, ConfigurationError and OSError."""
-    scene, path, camera = source.need_scene(), source.need_path(), video_camera(source.need_sensor())
+    scene, camera = source.need_scene(), video_camera(source.need_sensor())
+    path = _path(source, options)
     count = max(1, round(options.seconds * PICTURES_A_SECOND))
     with Mp4Writer(file, PICTURES_A_SECOND) as video:
-        for picture in scene_pictures(scene, calm_path(path), camera, count, source.white):
+        for picture in scene_pictures(scene, path, camera, count, source.white):
             video.write(picture)
     return f"{count} pictures of {camera.width} x {camera.height}, {options.seconds:g} s"
 
 
+def _path(source: ExportSource, options: ExportOptions) -> CameraPath:
+    if not options.through:
+        return calm_path(source.need_path())
+    if source.unit != "scene":
+        raise ConfigurationError("poses to go through are in the unit of the scene: leave metres out")
+    poses = np.array(options.through, float)
+    if poses.ndim != 2 or poses.shape[1] != 7 or not np.isfinite(poses).all() or not poses[:, 3:].any(axis=1).all():
+        raise ConfigurationError("a pose to go through has seven numbers: a centre, and a quaternion that is not zero")
+    rotations = np.array([rotation_of(one / np.abs(one).max()) for one in poses[:, 3:]])
+    return waypoint_path(Trajectory(np.arange(len(poses), dtype=float), rotations, poses[:, :3]))
+
+
 KIND = ExportKind(
     name="video",
-    title="MP4 along the recorded path, smoothed",
+    title="MP4 along the recorded path, smoothed, or through chosen poses",
     readers="browsers, players, slides",
     loses="everything but what the camera would have seen",
     suffix=".mp4",

@@ -351,7 +351,9 @@ def test_riding_along_compares_observed_and_rendered(studied: Studied, visit: Ca
 
 
 @pytest.mark.slow
-def test_views_are_bookmarked_and_linked(studied: Studied, visit: Callable[..., Any]) -> None:
+def test_views_are_bookmarked_and_linked(
+    studied: Studied, visit: Callable[..., Any], pictures_folder: Path
+) -> None:
     page = open_scene(visit, f"{studied.address}?page=scene")
     canvas = page.locator(".stage canvas")
     at_first = still(page)
@@ -371,6 +373,22 @@ def test_views_are_bookmarked_and_linked(studied: Studied, visit: Callable[..., 
     with page.expect_download() as download:
         page.get_by_role("button", name="Screenshot").click()
     assert decoded(Path(download.value.path()).read_bytes()).shape == at_first.shape
+    size = page.get_by_label("Size of the screenshot")
+    size.select_option(label="other size")
+    page.get_by_label("Width").fill("900")
+    page.get_by_label("Height").fill("300")
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Screenshot").click()
+    wide = decoded(Path(download.value.path()).read_bytes())
+    assert wide.shape == (300, 900, 3) and np.ptp(wide) > 0.4
+    until(lambda: psnr_db(picture(page), at_first) > 30, "the canvas is as before", 20)
+
+    page.get_by_role("button", name="Add").click()
+    until(lambda: page.get_by_role("button", name="View 2", exact=True).count() == 1, "a second bookmark")
+    keep(page, pictures_folder / "bookmarks.webp")
+    link = page.get_by_role("link", name="Video through them").get_attribute("href")
+    answer = studied.http.get(f"{studied.address}{link}", timeout=120)
+    assert answer.headers["content-type"] == "video/mp4" and len(answer.content) > 10_000, answer.text[:300]
 
 
 @pytest.mark.slow

@@ -36,6 +36,18 @@ Resolution = Annotated[
     int, Query(ge=16, le=512, description="Voxels of a mesh along the longest side of the scene."), IN_DIGITS
 ]
 Seconds = Annotated[float, Query(ge=0.1, le=120, description="Length of a video.")]
+_NUMBER = r"-?[0-9]+(\.[0-9]+)?"
+_POSE = rf"{_NUMBER}(,{_NUMBER}){{6}}"
+Through = Annotated[
+    str | None,
+    Query(
+        pattern=rf"^{_POSE}(;{_POSE})+$",
+        max_length=6000,
+        description="Poses that a video goes through instead of along the path: x,y,z,qw,qx,qy,qz of each, separated "
+        "by semicolons; camera to world, OpenCV axes.",
+        examples=["0,0,0,1,0,0,0;0.1,0,0,1,0,0,0"],
+    ),
+]
 Metric = Annotated[bool, Query(description="In metres, with up along -y; 404 while the scale is not known.")]
 
 _HEADERS: dict[str, Any] = {
@@ -100,8 +112,10 @@ def _add(router: APIRouter, prefix: str, name: str, find: Callable[..., Reconstr
         expected_depth: ExpectedDepth = False,
         resolution: Resolution = 256,
         seconds: Seconds = 10.0,
+        through: Through = None,
         metric: Metric = False,
     ) -> Response:
         depth: Literal["median", "expected"] = "expected" if expected_depth else "median"
-        options = ExportOptions(views, undistorted, depth, resolution, seconds)
+        poses = () if through is None else tuple(tuple(map(float, one.split(","))) for one in through.split(";"))
+        options = ExportOptions(views, undistorted, depth, resolution, seconds, poses)
         return exports.response(request, row, find_kind(format), options, version=version, metric=metric)

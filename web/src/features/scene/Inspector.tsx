@@ -1,6 +1,6 @@
 /** Settings of the scene view: version, camera control, layers, legend, bookmarks. */
 
-import { type JSX, useState } from "react";
+import type { JSX } from "react";
 
 import { revert } from "../../shared/api/calls";
 import type { Capture, Closure, Reconstruction, Version } from "../../shared/api/types";
@@ -12,7 +12,7 @@ import { toast } from "../../shared/state/toasts";
 import { ActionButton } from "../../shared/ui/access";
 import { Icon } from "../../shared/ui/icons";
 import { JobBadge, JobReason, Meter, Segmented, Stat, trackingMeaning, Warnings } from "../../shared/ui/parts";
-import { type Bookmark, readBookmarks, writeBookmarks } from "./bookmarks";
+import { BookmarksPanel } from "./BookmarksPanel";
 import type { Colouring } from "./path";
 import { MAX_WIDTH_PX, type LineStyle, SPEED_STYLES, STATE_STYLES, STATES } from "./stateStyles";
 import type { Closures } from "./useClosures";
@@ -23,6 +23,7 @@ import { ViewPanel, type Shows } from "./ViewPanel";
 import { CleanPanel } from "./CleanPanel";
 import { ComparePanel } from "./ComparePanel";
 import { MeasurePanel } from "./MeasurePanel";
+import { ScreenshotTool, type Size } from "./ScreenshotTool";
 import type { Preset } from "./presets";
 
 const LAYER_NAMES: Record<keyof Layers, string> = {
@@ -72,7 +73,7 @@ export interface InspectorProps {
   onRide: (ride: boolean) => void;
   comparison: Comparison | null;
   onHome: () => void;
-  onScreenshot: () => void;
+  onScreenshot: (size: Size | null) => void;
   currentView: () => { camera: number[]; frame: number | null };
   onView: (camera: number[], frame: number | null) => void;
 }
@@ -144,10 +145,14 @@ export function Inspector(props: InspectorProps): JSX.Element {
       <Loops closures={props.closures} onTime={props.onTime} />
       <MeasurePanel viewer={props.viewer} jobId={job.id} />
       <CleanPanel viewer={props.viewer} job={job} newest={pinned === null} />
-      <Bookmarks key={capture.id} captureId={capture.id} currentView={props.currentView} onView={props.onView} />
-      <button type="button" onClick={props.onScreenshot}>
-        <Icon name="camera" /> Screenshot
-      </button>
+      <BookmarksPanel
+        key={capture.id}
+        captureId={capture.id}
+        jobId={job.id}
+        currentView={props.currentView}
+        onView={props.onView}
+      />
+      <ScreenshotTool onScreenshot={props.onScreenshot} />
     </aside>
   );
 }
@@ -292,61 +297,3 @@ function Loops({ closures, onTime }: { closures: Closures; onTime: (time_s: numb
 const LOOPS_LISTED = 5;
 const inWords = (loop: Closure): string =>
   `at ${duration(loop.later_s)} the camera sees again what it saw at ${duration(loop.earlier_s)}`;
-
-function Bookmarks({
-  captureId,
-  currentView,
-  onView,
-}: {
-  captureId: string;
-  currentView: () => { camera: number[]; frame: number | null };
-  onView: (camera: number[], frame: number | null) => void;
-}): JSX.Element {
-  const [bookmarks, setBookmarks] = useState(() => readBookmarks(captureId));
-  const keep = (next: Bookmark[]): void => {
-    setBookmarks(next);
-    try {
-      writeBookmarks(captureId, next);
-    } catch {
-      toast("This browser does not allow the page to store bookmarks.", { tone: "problem" });
-    }
-  };
-  return (
-    <section className="bookmarks" aria-label="Bookmarks">
-      <div className="row">
-        <span className="dim">Bookmarks</span>
-        <button
-          type="button"
-          onClick={() => {
-            const names = new Set(bookmarks.map((one) => one.name));
-            let number = bookmarks.length + 1;
-            while (names.has(`View ${number}`)) number += 1;
-            keep([...bookmarks, { name: `View ${number}`, ...currentView() }]);
-          }}
-        >
-          <Icon name="bookmark" /> Add
-        </button>
-      </div>
-      {bookmarks.length > 0 && (
-        <ul>
-          {bookmarks.map((one, i) => (
-            <li key={one.name}>
-              <button type="button" className="bare" onClick={() => onView(one.camera, one.frame)}>
-                {one.name}
-                {one.frame !== null && <span className="dim"> frame {count(one.frame)}</span>}
-              </button>
-              <button
-                type="button"
-                className="bare"
-                aria-label={`Remove ${one.name}`}
-                onClick={() => keep(bookmarks.filter((_, k) => k !== i))}
-              >
-                <Icon name="close" />
-              </button>
-            </li>
-          ))}
-        </ul>
-      )}
-    </section>
-  );
-}

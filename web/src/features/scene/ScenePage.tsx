@@ -26,6 +26,7 @@ import { Scrubber } from "./Scrubber";
 import { type Comparison as Compared, useComparison } from "./useComparison";
 import { usePath } from "./usePath";
 import { useClosures } from "./useClosures";
+import type { Size } from "./ScreenshotTool";
 import { useScene } from "./useScene";
 import { useSceneKeys } from "./useSceneKeys";
 import { useVersions } from "./useVersions";
@@ -165,11 +166,12 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   }, [viewer, linked]);
 
   if (job === null) return null;
-  const screenshot = async (): Promise<void> => {
+  const screenshot = async (size: Size | null): Promise<void> => {
     if (viewer === null) return;
     const link = document.createElement("a");
-    link.href = URL.createObjectURL(await viewer.picture());
-    link.download = `spiked-${capture.id}-v${viewer.version}.png`;
+    link.href = URL.createObjectURL(await viewer.picture(size));
+    const sized = size === null ? "" : `-${size.width}x${size.height}`;
+    link.download = `spiked-${capture.id}-v${viewer.version}${sized}.png`;
     link.click();
     URL.revokeObjectURL(link.href);
     toast(`Saved ${link.download}`);
@@ -263,7 +265,9 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
           viewer?.home();
           adjust({ camera: null });
         }}
-        onScreenshot={() => void screenshot().catch((error: unknown) => toast(errorText(error), { tone: "problem" }))}
+        onScreenshot={(size) =>
+          void screenshot(size).catch((error: unknown) => toast(errorText(error), { tone: "problem" }))
+        }
         currentView={() => ({ camera: viewer?.view() ?? [], frame: route().frame })}
         onView={(camera, frame) => adjust({ camera, frame, ride: false })}
       />

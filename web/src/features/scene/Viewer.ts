@@ -615,11 +615,35 @@ export class Viewer {
     this.draw();
   }
 
-  /** The canvas as a PNG file. */
-  picture(): Promise<Blob> {
-    this.renderer.render(this.world, this.riding ? this.rider : this.camera);
-    return new Promise((resolve, reject) => {
+  /** The canvas as a PNG file, or the same view in another size. While riding along the height follows from the width. */
+  picture(size: { width: number; height: number } | null = null): Promise<Blob> {
+    const camera = this.riding ? this.rider : this.camera;
+    if (size !== null) this.takeSize(size);
+    this.path.dashFor(camera, size?.height ?? this.canvas.clientHeight);
+    this.renderer.render(this.world, camera);
+    const { drawingBufferWidth, drawingBufferHeight } = this.renderer.getContext();
+    const taken = new Promise<Blob>((resolve, reject) => {
       this.canvas.toBlob((blob) => (blob === null ? reject(new Error("The canvas gave no picture.")) : resolve(blob)));
     });
+    if (size === null) return taken;
+    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
+    this.resize();
+    const { width, height } = this.sizeOf(size);
+    if (drawingBufferWidth !== width || drawingBufferHeight !== height)
+      throw new Error(`This browser draws no picture of ${width} × ${height}: choose a smaller one.`);
+    return taken;
+  }
+
+  private sizeOf({ width, height }: { width: number; height: number }): { width: number; height: number } {
+    const shape = this.riding && this.sensor !== null ? this.sensor.height / this.sensor.width : height / width;
+    return { width, height: Math.round(width * shape) };
+  }
+
+  private takeSize(size: { width: number; height: number }): void {
+    const { width, height } = this.sizeOf(size);
+    this.renderer.setPixelRatio(1);
+    this.renderer.setSize(width, height, false);
+    this.camera.aspect = width / height;
+    this.camera.updateProjectionMatrix();
   }
 }

@@ -23,6 +23,28 @@ export function placementOf(position: readonly number[], wxyz: readonly number[]
   return { position: pointOf(position), quaternion: turned.normalize() };
 }
 
+/** A pose in the axes of the service. */
+export interface ServicePose {
+  position: [number, number, number];
+  quaternion_wxyz: [number, number, number, number];
+}
+
+/** The inverse of `placementOf`. */
+export function poseOf({ position, quaternion }: Placement): ServicePose {
+  const turned = HALF_TURN.clone().invert().multiply(quaternion).multiply(HALF_TURN);
+  return {
+    position: [position.x, -position.y, -position.z],
+    quaternion_wxyz: [turned.w, turned.x, turned.y, turned.z],
+  };
+}
+
+/** The pose of a view as `Viewer.view` gives it: position and target, upright. */
+export function poseOfView(view: readonly number[]): ServicePose {
+  const position = new Vector3(...view.slice(0, 3));
+  const looking = new Matrix4().lookAt(position, new Vector3(...view.slice(3, 6)), new Vector3(0, 1, 0));
+  return poseOf({ position, quaternion: new Quaternion().setFromRotationMatrix(looking) });
+}
+
 /** Projection of a pinhole camera whose principal point need not be the image centre. */
 export function projectionOf(k: Intrinsics, width: number, height: number, near: number, far: number): Matrix4 {
   const left = (-k.cx / k.fx) * near;

@@ -1,7 +1,7 @@
 import { PerspectiveCamera, Vector3 } from "three";
 import { expect, test } from "vitest";
 
-import { placementOf, pointOf } from "./axes";
+import { placementOf, pointOf, poseOfView } from "./axes";
 import type { Slots } from "./changes";
 import { countInside, outlineOf, thinnedLine } from "./lasso";
 
@@ -48,4 +48,17 @@ test("corners of a line that is drawn are apart", () => {
   const line = Array.from({ length: 100 }, (_, i) => [i, 0] as const);
   expect(thinnedLine(line)).toHaveLength(25);
   expect(thinnedLine([])).toEqual([]);
+});
+
+test("a view is a pose of the service that looks at its target, upright", () => {
+  const view = [0.5, 1.2, 3, -0.4, 0.1, -1, 55];
+  const pose = poseOfView(view);
+  const placed = placementOf(pose.position, pose.quaternion_wxyz);
+  const target = new Vector3(...view.slice(3, 6)).sub(placed.position).applyQuaternion(placed.quaternion.invert());
+  expect(target.x).toBeCloseTo(0);
+  expect(target.y).toBeCloseTo(0);
+  expect(target.z).toBeLessThan(0); // cameras of three.js look along -z
+  const up = new Vector3(0, 1, 0).applyQuaternion(placed.quaternion);
+  expect(up.x).toBeCloseTo(0);
+  expect(up.y).toBeGreaterThan(0);
 });

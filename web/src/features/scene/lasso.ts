@@ -2,6 +2,7 @@
 
 import { MathUtils, type PerspectiveCamera, Quaternion } from "three";
 
+import { poseOf, type ServicePose } from "./axes";
 import type { Slots } from "./changes";
 
 /** Corners nearer to the one before than this many pixels are left out. */
@@ -10,7 +11,7 @@ const APART_PX = 4;
 /** As `:clean` takes it: slopes and the view in OpenCV axes. */
 export interface Outline {
   corners: [number, number][];
-  camera: { position: [number, number, number]; quaternion_wxyz: [number, number, number, number] };
+  camera: ServicePose;
 }
 
 export type Point = readonly [number, number];
@@ -29,12 +30,9 @@ export function thinnedLine(points: readonly Point[]): Point[] {
 export function outlineOf(points: readonly Point[], width: number, height: number, camera: PerspectiveCamera): Outline {
   const top = Math.tan(MathUtils.degToRad(camera.fov) / 2);
   const side = (top * width) / height;
-  const half = new Quaternion(1, 0, 0, 0);
-  const turned = half.clone().invert().multiply(camera.quaternion).multiply(half);
-  const { x, y, z } = camera.position;
   return {
     corners: points.map(([px, py]) => [((2 * px) / width - 1) * side, ((2 * py) / height - 1) * top]),
-    camera: { position: [x, -y, -z], quaternion_wxyz: [turned.w, turned.x, turned.y, turned.z] },
+    camera: poseOf(camera),
   };
 }
 

@@ -275,6 +275,12 @@ export const address = {
   report: (id: string): string => `${API}/reconstructions/${id}/report`,
   exported: (id: string, format: string, metric: boolean): string =>
     `${API}/reconstructions/${id}/exports/${format}${query(metric ? { metric } : {})}`,
+  /** An MP4 through poses: x, y, z, qw, qx, qy, qz of each. */
+  video: (id: string, through: readonly (readonly number[])[], seconds: number): string =>
+    `${API}/reconstructions/${id}/exports/video${query({
+      seconds,
+      through: through.map((pose) => pose.map((value) => value.toFixed(6)).join(",")).join(";"),
+    })}`,
   bundle: (id: string): string => `${API}/reconstructions/${id}/bundle`,
   trajectory: (id: string, format: string): string => `${API}/reconstructions/${id}/trajectory${query({ format })}`,
 };

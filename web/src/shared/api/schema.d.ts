@@ -10263,6 +10263,8 @@ export interface operations {
                 resolution?: number;
                 /** @description Length of a video. */
                 seconds?: number;
+                /** @description Poses that a video goes through instead of along the path: x,y,z,qw,qx,qy,qz of each, separated by semicolons; camera to world, OpenCV axes. */
+                through?: string | null;
                 /** @description In metres, with up along -y; 404 while the scale is not known. */
                 metric?: boolean;
             };
@@ -10422,6 +10424,8 @@ export interface operations {
                 resolution?: number;
                 /** @description Length of a video. */
                 seconds?: number;
+                /** @description Poses that a video goes through instead of along the path: x,y,z,qw,qx,qy,qz of each, separated by semicolons; camera to world, OpenCV axes. */
+                through?: string | null;
                 /** @description In metres, with up along -y; 404 while the scale is not known. */
                 metric?: boolean;
             };

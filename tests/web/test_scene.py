@@ -351,9 +351,7 @@ def test_riding_along_compares_observed_and_rendered(studied: Studied, visit: Ca
 
 
 @pytest.mark.slow
-def test_views_are_bookmarked_and_linked(
-    studied: Studied, visit: Callable[..., Any], pictures_folder: Path
-) -> None:
+def test_views_are_bookmarked_and_linked(studied: Studied, visit: Callable[..., Any], pictures_folder: Path) -> None:
     page = open_scene(visit, f"{studied.address}?page=scene")
     canvas = page.locator(".stage canvas")
     at_first = still(page)

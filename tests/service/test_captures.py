@@ -18,6 +18,7 @@ from spiked_service.captures.archive import DataStore
 from spiked_service.events.bus import Bus
 from spiked_service.operations.metrics import Metrics
 from spiked_service.operations.metrics_sources import metrics_source_of
+from spiked_service.reconstructions.job_runner import begun_anew
 from spiked_service.results.published import Published
 from spiked_service.results.versions import pose_file, versions
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
@@ -549,7 +550,11 @@ def test_a_job_whose_row_could_not_be_saved_begins_when_the_disk_has_room(
         with pytest.raises(StoreError):
             while True:
                 data_store.catalogue.reconstructions.put(job)
-        assert data_store.reconstructions.restart(job.id).state is JobState.QUEUED
+        with pytest.raises(StoreError):  # a user can ask again
+            data_store.reconstructions.restart(job.id)
+        assert data_store.reconstructions.rows.get(job.id) == job
+        data_store.reconstructions.rows.save(begun_anew(job, job.options))  # as of a job whose worker was killed
+        assert data_store.reconstructions.rows.get(job.id).state is JobState.QUEUED
         filler.unlink()
         wait_for(lambda: data_store.reconstructions.rows.get(job.id).attempts > 0, "its worker begins")
         wait_for(lambda: data_store.reconstructions.rows.get(job.id).state.over, "it ends")

@@ -13,14 +13,15 @@ from spiked_service.base.errors import BusyError
 from spiked_service.base.ids import new_id
 from spiked_service.captures.armed_device import ArmedDevice
 from spiked_service.captures.live_capture import LiveCapture
+from spiked_service.captures.new_captures import NewCaptures, check_free, group_devices
 from spiked_service.captures.recent import RecentCaptures
 from spiked_service.captures.sources import device_of, realtime
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue import Reconstructions
-from spiked_service.store.catalogue import Catalogue, Page, StoreError, UnknownIdError
+from spiked_service.store.catalogue import CaptureFilter, Catalogue, Page, StoreError, UnknownIdError
 from spiked_service.store.disk_space import DiskSpace, recording_bytes
 from spiked_service.store.folder import DataFolder
-from spiked_service.store.rows import CaptureEdit, CaptureRow, CaptureState, Origin, Plan
+from spiked_service.store.rows import CaptureEdit, CaptureRow, Plan
 from spiked_service.store.snapshot import Snapshot
 from spiked_service.workers.messages import PreviewTaken
 
@@ -50,6 +51,7 @@ class Captures:
         self._notifier = notifier
         self.limit = 4
         """Most devices in use at a time; may be changed at any time."""
+        self._new = NewCaptures(folder, catalogue, disk_space, reconstructions, notifier, self._changed)
         self._lock = threading.RLock()
         self._live: dict[str, LiveCapture] = {}
         self._armed: dict[str, ArmedDevice] = {}
@@ -70,18 +72,16 @@ class Captures:
         device = device_of(plan.source)
         with self._lock:
             armed_device = self._armed.get(device)
-        size: int | None = None
         if armed_device is not None:
             armed_device.check(plan, self._folder.profiles)
             size = recording_bytes(plan, armed_device.sensor, None)
         elif plan.pretrigger_s:
             raise ConfigurationError(f"{device} is not armed, so it has no earlier frames: arm the device first")
         else:
-            source = open_camera(plan.source, profiles=self._folder.profiles).source
-            size = recording_bytes(plan, source.sensor, source.frames)
+            size = self._new.size_of(plan)
         with self._lock:
             self._refuse_if_busy(device)
-            capture = self._create(plan, size)
+            capture = self._begin(plan, size)
             armed_device = self._armed.pop(device, None)
             if armed_device is None:
                 try:
@@ -98,14 +98,8 @@ class Captures:
 
         Raises as `start`, and ConfigurationError for a device that is named twice or that is armed.
         """
-        devices = [device_of(plan.source) for plan in plans]
-        for device in devices:
-            if devices.count(device) > 1:
-                raise ConfigurationError(f"{device} is named twice in the group: name each device once")
-        sources = [open_camera(plan.source, profiles=self._folder.profiles).source for plan in plans]
-        sizes = [recording_bytes(plan, one.sensor, one.frames) for plan, one in zip(plans, sources, strict=True)]
-        group = new_id()
-        created: list[LiveCapture] = []
+        devices, sizes = group_devices(plans), [self._new.size_of(plan) for plan in plans]
+        group, created = new_id(), list[LiveCapture]()
         with self._lock:
             self._refuse_if_busy(*devices)
             for device, plan in zip(devices, plans, strict=True):
@@ -115,7 +109,7 @@ class Captures:
                     )
             try:
                 for plan, size in zip(plans, sizes, strict=True):
-                    created.append(self._create(plan, size, group))
+                    created.append(self._begin(plan, size, group))
                 for capture in created:
                     capture.acquire()
             except (OSError, StoreError) as error:
@@ -138,33 +132,15 @@ class Captures:
             raise UnknownIdError(f"there is no group {group_id} of captures")
         return [self.snapshot(row) for row in sorted(rows, key=lambda row: row.id)]
 
+    def _begin(self, plan: Plan, size: int | None, group: str | None = None) -> LiveCapture:
+        capture = self._new.create(plan, size, group)
+        self._live[capture.id] = capture
+        return capture
+
     def _undo(self, capture: LiveCapture) -> None:
         """Remove a capture that has not begun."""
         del self._live[capture.id]
-        self._catalogue.captures.remove(capture.id)
-        self._folder.remove(self._folder.capture(capture.id))
-        self._disk_space.release(self._folder.recording(capture.id))
-
-    def _create(self, plan: Plan, size: int | None, group: str | None = None) -> LiveCapture:
-        """Create a capture with its row and folder, and reserve `size` bytes. Raises StoreError."""
-        now = datetime.now(UTC)
-        row = CaptureRow(
-            new_id(), Origin.LIVE, plan, CaptureState.STARTING, now, name=plan.name, notes=plan.notes, group=group
-        )
-        if plan.record:
-            self._disk_space.reserve_recording(self._folder.recording(row.id), size)
-        try:
-            (self._folder.capture(row.id) / "logs").mkdir(parents=True)
-            self._catalogue.captures.put(row)
-        except (OSError, StoreError) as error:
-            self._disk_space.release(self._folder.recording(row.id))
-            self._folder.remove(self._folder.capture(row.id))
-            if isinstance(error, StoreError):
-                raise
-            raise StoreError(f"{self._folder.path} cannot be written: {error.strerror}") from error
-        capture = LiveCapture(row, self._folder, self._catalogue, self._reconstructions, self._notifier, self._changed)
-        self._live[row.id] = capture
-        return capture
+        self._new.undo(capture)
 
     def arm(self, source: str, pretrigger_s: float) -> ArmedDevice:
         """Run a device without recording; its ring holds the newest frames for a later capture.
@@ -215,24 +191,13 @@ class Captures:
         counters = row.counters if live is None or row.state.over else live.counters()
         return Snapshot(row, counters, self._reconstructions.rows.of(row.id))
 
-    def list(
-        self,
-        limit: int = 50,
-        cursor: str | None = None,
-        query: str | None = None,
-        state: CaptureState | None = None,
-        deleted: bool = False,
-        group: str | None = None,
-        tag: str | None = None,
-    ) -> Page[CaptureRow]:
+    def list(self, limit: int = 50, cursor: str | None = None, **wanted: Unpack[CaptureFilter]) -> Page[CaptureRow]:
         """Newest first."""
-        return self._catalogue.capture_page(limit, cursor, query, state, deleted, group, tag)
+        return self._catalogue.capture_page(limit, cursor, **wanted)
 
     def live(self) -> Sequence[Snapshot]:
         """Captures that have not ended, oldest first."""
-        with self._lock:
-            captures = list(self._live.values())
-        return [self.snapshot(capture.row) for capture in captures if not capture.row.state.over]
+        return [self.snapshot(capture.row) for capture in self._kept() if not capture.row.state.over]
 
     def recent(self) -> Sequence[Snapshot]:
         """Captures that have not ended, and the last ones that ended since the service started."""
@@ -242,8 +207,7 @@ class Captures:
 
     def counts(self) -> dict[str, int]:
         """Number of captures by state, without removed ones."""
-        found = self._catalogue.read("SELECT state, count(*) FROM captures WHERE deleted_at IS NULL GROUP BY state")
-        return dict(found)
+        return self._catalogue.capture_counts()
 
     def recording(self, capture_id: str) -> Path:
         """Path of its `.dat`, which may not exist or still grow. Raises UnknownIdError."""
@@ -295,9 +259,7 @@ class Captures:
 
     def processes(self) -> dict[str, dict[str, int]]:
         """Process ids of the running workers by capture and role, without reconstructions."""
-        with self._lock:
-            captures = list(self._live.values())
-        return {capture.id: capture.processes() for capture in captures}
+        return {capture.id: capture.processes() for capture in self._kept()}
 
     def dismiss(self) -> None:
         """Ask every worker to exit at once; no capture can be started afterwards."""
@@ -316,12 +278,15 @@ class Captures:
 
     def retry_saving(self) -> None:
         """Save rows that could not be saved on a full disk."""
-        with self._lock:
-            captures = list(self._live.values())
-        for capture in captures:
+        for capture in self._kept():
             if capture.row.state.over and capture.save():
                 with self._lock:
                     self._live.pop(capture.id, None)
+
+    def _kept(self) -> Sequence[LiveCapture]:
+        """Live captures, and ended ones whose rows are not saved."""
+        with self._lock:
+            return list(self._live.values())
 
     def _all(self) -> Sequence[LiveCapture | ArmedDevice]:
         with self._lock:
@@ -330,17 +295,7 @@ class Captures:
     def _refuse_if_busy(self, *devices: str) -> None:
         if self._closing.is_set():
             raise BusyError("the service is stopping; restart it to capture")
-        for other in self._live.values():
-            device = device_of(other.row.source)
-            if device in devices and not other.row.state.over and other.holds_device:
-                raise BusyError(f"capture {other.id} is still running on {device}: stop it, or wait for its end")
-        in_use = {device_of(other.row.source) for other in self._live.values() if other.holds_device} | set(self._armed)
-        if len(in_use | set(devices)) > self.limit:
-            wanted = f" and {len(devices)} are asked for" if len(devices) > 1 else ""
-            raise BusyError(
-                f"{len(in_use)} devices are in use{wanted}, {self.limit} are allowed: stop a capture, disarm a device, "
-                "or raise the setting limit_captures"
-            )
+        check_free(devices, self._live.values(), self._armed, self.limit)
 
     def _disarmed(self, armed_device: ArmedDevice) -> None:
         """An armed device has failed."""
@@ -371,10 +326,8 @@ class Captures:
 
     def _tick(self) -> None:
         while not self._closing.wait(_TICK_S):
-            with self._lock:
-                captures = list(self._live.values())
             try:
-                for capture in captures:
+                for capture in self._kept():
                     capture.update_state()
                 for snapshot in self.live():
                     self._notifier.capture(snapshot)

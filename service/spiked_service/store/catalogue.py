@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, ParamSpec, Protocol, TypeVar
+from typing import Any, Generic, ParamSpec, Protocol, TypedDict, TypeVar, Unpack
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -56,6 +56,18 @@ class Page(Generic[_Row]):
     items: list[_Row]
     next_cursor: str | None
     """None on the last page."""
+
+
+class CaptureFilter(TypedDict, total=False):
+    """Which captures are listed; None and what is left out: any."""
+
+    query: str | None
+    """Looked for in name, notes, source, tags and metadata."""
+    state: CaptureState | None
+    deleted: bool
+    """Those that were removed, instead of the others."""
+    group: str | None
+    tag: str | None
 
 
 class Catalogue:
@@ -154,15 +166,11 @@ class Catalogue:
         self,
         limit: int = 50,
         cursor: str | None = None,
-        query: str | None = None,
-        state: CaptureState | None = None,
-        deleted: bool = False,
-        group: str | None = None,
-        tag: str | None = None,
+        **wanted: Unpack[CaptureFilter],
     ) -> Page[CaptureRow]:
-        """Captures, newest first; `query` is looked for in name, notes, source, tags and metadata; deleted ones only if
-        asked for."""
-        where, values = ["deleted_at IS NOT NULL" if deleted else "deleted_at IS NULL"], list[Any]()
+        """Captures, newest first."""
+        state, group, tag, query = (wanted.get(key) for key in ("state", "group", "tag", "query"))
+        where, values = ["deleted_at IS NOT NULL" if wanted.get("deleted") else "deleted_at IS NULL"], list[Any]()
         if state is not None:
             where.append("state = ?")
             values.append(str(state))
@@ -175,8 +183,12 @@ class Catalogue:
         if query:
             fields = ("$.name", "$.notes", "$.plan.source", "$.tags", "$.metadata")
             where.append("(" + " OR ".join(f"instr(lower(json_extract(document, '{f}')), ?)" for f in fields) + ")")
-            values += [query.lower()] * len(fields)
+            values += [str(query).lower()] * len(fields)
         return self.captures.page(where, values, limit, cursor)
+
+    def capture_counts(self) -> dict[str, int]:
+        """Number of captures by state, without removed ones."""
+        return dict(self.read("SELECT state, count(*) FROM captures WHERE deleted_at IS NULL GROUP BY state"))
 
     def reconstruction_page(
         self, limit: int = 50, cursor: str | None = None, capture_id: str | None = None, state: JobState | None = None

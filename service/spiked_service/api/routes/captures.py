@@ -45,7 +45,7 @@ def capture_routes(captures: Captures, sources: Sources, route_class: type[APIRo
         tag: Annotated[str | None, Query(max_length=64, description="Captures with this tag.")] = None,
     ) -> CapturePage:
         """Captures, newest first."""
-        page = captures.list(limit, cursor, q, state, deleted, group, tag)
+        page = captures.list(limit, cursor, query=q, state=state, deleted=deleted, group=group, tag=tag)
         items = [CaptureOut.of(captures.snapshot(row)) for row in page.items]
         return CapturePage(items=items, next_cursor=page.next_cursor)
 

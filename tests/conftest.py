@@ -14,7 +14,8 @@ import numpy as np
 import psutil
 import pytest
 
-sys.path.append(str(Path(__file__).parent / "usb"))  # pytest's importlib mode adds no folder by itself
+sys.path.append(str(Path(__file__).parent))  # pytest's importlib mode adds no folder by itself
+sys.path.append(str(Path(__file__).parent / "usb"))
 from virtual_camera.host import CameraSettings
 from virtual_camera.rig import VirtualCameras, missing
 from virtual_camera.stream import COMPACT_BYTES

@@ -1,7 +1,6 @@
 """What the tests of survival share: a service without HTTP, its workers real processes."""
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from spiked_service.daemon import open_data_store
 from spiked_service.events.bus import Bus
 from spiked_service.store.rows import ReconstructionRow
 from spiked_service.store.snapshot import Snapshot
+from waiting import until
 
 from spiked.recording import RecordingWriter, open_recording
 from spiked.sensor import Intrinsics, Sensor
@@ -21,26 +21,17 @@ from spiked.simulate import MotionKind, SimulatedCamera
 
 SENSOR = Sensor(96, 64, 20_000.0)
 SMALL = "sim:?width=96&height=64"
-PATIENCE_S = 150.0
-
-
-def wait_for(condition: Callable[[], object], what: str) -> None:
-    """Poll until the condition holds; the test fails if it does not in time."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline, f"waited in vain until {what}"
-        time.sleep(0.02)
 
 
 def over(data_store: DataStore, capture_id: str) -> Snapshot:
     """The capture when it is over."""
-    wait_for(lambda: data_store.captures.get(capture_id).row.state.over, "the capture is over")
+    until(lambda: data_store.captures.get(capture_id).row.state.over, "the capture is over")
     return data_store.captures.get(capture_id)
 
 
 def ended(data_store: DataStore, job: ReconstructionRow) -> ReconstructionRow:
     """The reconstruction when it is over."""
-    wait_for(lambda: data_store.reconstructions.rows.get(job.id).state.over, f"{job.id} is over")
+    until(lambda: data_store.reconstructions.rows.get(job.id).state.over, f"{job.id} is over")
     return data_store.reconstructions.rows.get(job.id)
 
 

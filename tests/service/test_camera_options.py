@@ -16,6 +16,7 @@ from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.rows import CaptureState, JobState, Plan
 from spiked_service.workers.messages import PreviewKind, ReconstructionCommand
 from spiked_service.workers.roles.reconstruction import options_of
+from waiting import until
 
 from spiked.calibration import Calibration
 from spiked.camera import CameraFiles, CameraOptions, Pinhole
@@ -26,7 +27,7 @@ from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Mosaic, Sensor
 from spiked.simulate import SimulatedCamera
 
-from .survival import children, kept, over, random_recording, wait_for
+from .survival import children, kept, over, random_recording
 
 SIZE = "width=96&height=64"
 
@@ -35,7 +36,7 @@ SIZE = "width=96&height=64"
 def data_store(tmp_path: Path) -> Iterator[DataStore]:
     with kept(tmp_path / "data") as one:
         yield one
-    wait_for(lambda: children() == [], "every worker has left")
+    until(lambda: children() == [], "every worker has left")
 
 
 def recorded(data_store: DataStore, source: str, **more: object) -> tuple[Path, Plan]:
@@ -176,7 +177,7 @@ def test_an_armed_device_keeps_its_options(data_store: DataStore) -> None:
     data_store.captures.arm(f"sim:?{SIZE}&mosaic=BGGR", 0.1)
     source = f"sim:?{SIZE}&mosaic=BGGR"
     armed = data_store.captures.armed()[source]
-    wait_for(lambda: armed.counters() is not None, "it is armed")
+    until(lambda: armed.counters() is not None, "it is armed")
     CameraProfile(flipped=False).write(data_store.folder.profiles / "sim%3A.json")
     with pytest.raises(ConfigurationError, match="disarm it"):
         data_store.captures.start(Plan(source, frames=10, reconstruct=False))

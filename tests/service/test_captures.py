@@ -28,6 +28,7 @@ from spiked_service.store.rows import CaptureState, Grade, JobState, Plan, Recon
 from spiked_service.workers.backoff import Backoff
 from spiked_service.workers.messages import Role
 from spiked_service.workers.process import StandbyWorker
+from waiting import until
 
 from spiked.errors import ConfigurationError
 from spiked.poses import PoseFile
@@ -48,7 +49,6 @@ from .survival import (
     over,
     random_recording,
     received,
-    wait_for,
 )
 
 
@@ -56,7 +56,7 @@ from .survival import (
 def data_store(tmp_path: Path) -> Iterator[DataStore]:
     with kept(tmp_path / "data") as one:
         yield one
-    wait_for(lambda: children() == [], "every worker has left")
+    until(lambda: children() == [], "every worker has left")
 
 
 def recorded_only(source: str, **more: object) -> Plan:
@@ -103,11 +103,11 @@ def test_a_killed_recorder_is_followed_and_nothing_is_lost(data_store: DataStore
     source = f"replay:{tmp_path / 'noise.dat'}?pace=1&repeat=1000"
     capture_id = data_store.captures.start(recorded_only(source)).id
     for kills in range(2):
-        wait_for(lambda: received(data_store, capture_id) > 20_000 * (kills + 1), "frames come")  # noqa: B023
+        until(lambda: received(data_store, capture_id) > 20_000 * (kills + 1), "frames come")  # noqa: B023
         pid = data_store.captures.processes()[capture_id]["recorder"]
         os.kill(pid, signal.SIGKILL)
-        wait_for(lambda: data_store.captures.processes()[capture_id].get("recorder", pid) != pid, "another")  # noqa: B023
-    wait_for(lambda: received(data_store, capture_id) > 60_000, "frames come")
+        until(lambda: data_store.captures.processes()[capture_id].get("recorder", pid) != pid, "another")  # noqa: B023
+    until(lambda: received(data_store, capture_id) > 60_000, "frames come")
     data_store.captures.stop(capture_id)
     row = over(data_store, capture_id).row
     assert row.state is CaptureState.COMPLETE
@@ -125,10 +125,10 @@ def test_a_recorder_killed_behind_the_last_frame_is_followed_to_the_end(data_sto
     frames = random_recording(tmp_path / "noise.dat", 997)
     source = f"replay:{tmp_path / 'noise.dat'}?pace=1&repeat=1000"
     capture_id = data_store.captures.start(recorded_only(source, frames=6000)).id
-    wait_for(lambda: received(data_store, capture_id) > 500, "frames come")
+    until(lambda: received(data_store, capture_id) > 500, "frames come")
     recorder = psutil.Process(data_store.captures.processes()[capture_id]["recorder"])
     recorder.suspend()
-    wait_for(lambda: "acquisition" not in data_store.captures.processes()[capture_id], "all frames came")
+    until(lambda: "acquisition" not in data_store.captures.processes()[capture_id], "all frames came")
     recorder.kill()
     row = over(data_store, capture_id).row
     assert row.state is CaptureState.COMPLETE
@@ -143,10 +143,10 @@ def test_what_came_after_the_last_of_many_killed_recorders_is_told_as_lost(
     monkeypatch.setattr("spiked_service.workers.supervisor.Backoff", lambda: Backoff((0.0,)))
     frames = random_recording(tmp_path / "noise.dat", 997)
     capture_id = data_store.captures.start(recorded_only(f"replay:{tmp_path / 'noise.dat'}?pace=1&repeat=1000")).id
-    wait_for(lambda: received(data_store, capture_id) > 500, "frames come")
+    until(lambda: received(data_store, capture_id) > 500, "frames come")
     pid = 0
     for _ in range(2):
-        wait_for(
+        until(
             lambda: data_store.captures.processes()[capture_id].get("recorder", pid) != pid,  # noqa: B023
             "a recorder is there",
         )
@@ -169,7 +169,7 @@ def test_what_came_after_the_last_of_many_killed_recorders_is_told_as_lost(
 def test_a_reconstruction_killed_before_it_reads_holds_nobody_up(data_store: DataStore, tmp_path: Path) -> None:
     random_recording(tmp_path / "noise.dat", 500)
     capture_id = data_store.captures.start(Plan(f"replay:{tmp_path / 'noise.dat'}?repeat=10")).id
-    wait_for(lambda: data_store.captures.get(capture_id).reconstructions, "the reconstruction begins")
+    until(lambda: data_store.captures.get(capture_id).reconstructions, "the reconstruction begins")
     job = data_store.captures.get(capture_id).reconstructions[0]
     os.kill(data_store.reconstructions.processes()[job.id], signal.SIGKILL)
     row = over(data_store, capture_id).row
@@ -185,13 +185,13 @@ def test_a_capture_stopped_while_the_camera_is_absent_ends_and_says_so(data_stor
         states.add(data_store.captures.get(capture_id).row.state)
         return CaptureState.WAITING in states
 
-    wait_for(lambda: "acquisition" in data_store.captures.processes()[capture_id], "the acquisition begins")
+    until(lambda: "acquisition" in data_store.captures.processes()[capture_id], "the acquisition begins")
     if halted:
         acquisition = psutil.Process(data_store.captures.processes()[capture_id]["acquisition"])
         acquisition.suspend()
         time.sleep(1)
         acquisition.resume()
-    wait_for(waits, "it waits for the camera")
+    until(waits, "it waits for the camera")
     assert data_store.captures.get(capture_id).reason == "the camera usb0 is not there: waiting for it"
     data_store.captures.stop(capture_id)
     done = over(data_store, capture_id)
@@ -231,7 +231,7 @@ def test_states_are_updated_again_after_the_catalogue_could_not_be_read(
         return read(capture_id)
 
     monkeypatch.setattr(data_store.catalogue, "reconstructions_of", fails_once)
-    wait_for(lambda: ticks > 2, "the thread that updates the states continues")
+    until(lambda: ticks > 2, "the thread that updates the states continues")
     data_store.captures.stop(capture_id)
     assert over(data_store, capture_id).row.state is CaptureState.COMPLETE
 
@@ -257,7 +257,7 @@ def test_a_source_that_waits_waits_for_the_successor_of_a_killed_recorder(
     frames = random_recording(tmp_path / "noise.dat", 997)
     source = f"replay:{tmp_path / 'noise.dat'}?pace=0&repeat=300"
     capture_id = data_store.captures.start(recorded_only(source)).id
-    wait_for(lambda: received(data_store, capture_id) > 500, "frames come")
+    until(lambda: received(data_store, capture_id) > 500, "frames come")
     os.kill(data_store.captures.processes()[capture_id]["recorder"], signal.SIGKILL)
     row = over(data_store, capture_id).row
     assert row.recording is not None and (row.recording.frames, row.recording.lost) == (997 * 300, 0)
@@ -270,11 +270,11 @@ def test_a_disk_that_stalls_costs_frames_that_are_told(data_store: DataStore, tm
     frames = random_recording(tmp_path / "noise.dat", 500, sensor)
     source = f"replay:{tmp_path / 'noise.dat'}?pace=0.5&repeat=1000"
     capture_id = data_store.captures.start(recorded_only(source)).id
-    wait_for(lambda: received(data_store, capture_id) > 2_000, "frames come")
+    until(lambda: received(data_store, capture_id) > 2_000, "frames come")
     recorder = psutil.Process(data_store.captures.processes()[capture_id]["recorder"])
     recorder.suspend()
     before = received(data_store, capture_id)
-    wait_for(lambda: received(data_store, capture_id) > before + 12_000, "more than the ring holds has come")
+    until(lambda: received(data_store, capture_id) > before + 12_000, "more than the ring holds has come")
     recorder.resume()
     data_store.captures.stop(capture_id)
     row = over(data_store, capture_id).row
@@ -290,7 +290,7 @@ def test_a_killed_acquisition_leaves_a_recording(data_store: DataStore, tmp_path
     frames = random_recording(tmp_path / "noise.dat", 500)
     source = f"replay:{tmp_path / 'noise.dat'}?repeat=1000"
     capture_id = data_store.captures.start(recorded_only(source)).id
-    wait_for(lambda: received(data_store, capture_id) > 1000, "frames come")
+    until(lambda: received(data_store, capture_id) > 1000, "frames come")
     os.kill(data_store.captures.processes()[capture_id]["acquisition"], signal.SIGKILL)
     row = over(data_store, capture_id).row
     assert (row.state, row.reason) == (CaptureState.FAILED, "the acquisition worker was killed by signal 9")
@@ -403,7 +403,7 @@ def test_an_armed_device_begins_in_the_past(data_store: DataStore, tmp_path: Pat
     with pytest.raises(BusyError, match="armed already"):
         data_store.captures.arm(source, 0.2)
     armed_device = next(iter(data_store.captures.armed().values()))
-    wait_for(lambda: (counters := armed_device.counters()) and counters.next_frame > 12_000, "the ring fills")
+    until(lambda: (counters := armed_device.counters()) and counters.next_frame > 12_000, "the ring fills")
     with pytest.raises(ConfigurationError, match=r"keeps 0\.2 s"):
         data_store.captures.start(recorded_only(source, pretrigger_s=0.3))
     counters = armed_device.counters()
@@ -424,10 +424,10 @@ def test_an_armed_device_begins_in_the_past(data_store: DataStore, tmp_path: Pat
 
 def test_a_device_is_disarmed(data_store: DataStore) -> None:
     data_store.captures.arm(SMALL, 0.1)
-    wait_for(lambda: len(children()) >= 4, "workers stand by")
+    until(lambda: len(children()) >= 4, "workers stand by")
     data_store.captures.disarm(SMALL)
     assert data_store.captures.armed() == {}
-    wait_for(lambda: children() == [], "they have left")
+    until(lambda: children() == [], "they have left")
 
 
 @pytest.fixture(name="small_disk")
@@ -509,7 +509,7 @@ def test_a_disk_gone_read_only_is_survived_and_made_up_for(small_disk: Path, tmp
     frames = random_recording(tmp_path / "noise.dat", 500)
     with kept(small_disk) as data_store:
         capture_id = data_store.captures.start(recorded_only(f"replay:{tmp_path / 'noise.dat'}?repeat=40&pace=0.1")).id
-        wait_for(lambda: received(data_store, capture_id) > 1000, "frames come")
+        until(lambda: received(data_store, capture_id) > 1000, "frames come")
         subprocess.run(["mount", "-o", "remount,size=1k", str(small_disk)], check=False, capture_output=True)
         subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=False, capture_output=True)
         with (small_disk / "others").open("wb") as file:
@@ -556,8 +556,8 @@ def test_a_job_whose_row_could_not_be_saved_begins_when_the_disk_has_room(
         data_store.reconstructions.rows.save(begun_anew(job, job.options))  # as of a job whose worker was killed
         assert data_store.reconstructions.rows.get(job.id).state is JobState.QUEUED
         filler.unlink()
-        wait_for(lambda: data_store.reconstructions.rows.get(job.id).attempts > 0, "its worker begins")
-        wait_for(lambda: data_store.reconstructions.rows.get(job.id).state.over, "it ends")
+        until(lambda: data_store.reconstructions.rows.get(job.id).attempts > 0, "its worker begins")
+        until(lambda: data_store.reconstructions.rows.get(job.id).state.over, "it ends")
 
 
 def test_a_capture_that_cannot_be_recorded_at_all_fails_and_says_so(data_store: DataStore, tmp_path: Path) -> None:
@@ -579,9 +579,9 @@ def test_stopping_twice_cuts_the_refinement(data_store: DataStore, tmp_path: Pat
     source = f"replay:{moving_recording(tmp_path / 'moving.dat')}?pace=0"
     plan = Plan(source, options=ReconstructionOptions(steps=200_000))
     capture_id = data_store.captures.start(plan).id
-    wait_for(lambda: data_store.captures.get(capture_id).row.state is CaptureState.FINISHING, "the source ends")
+    until(lambda: data_store.captures.get(capture_id).row.state is CaptureState.FINISHING, "the source ends")
     job = data_store.captures.get(capture_id).reconstructions[0]
-    wait_for(lambda: data_store.reconstructions.rows.get(job.id).stage in ("refining", "done"), "it refines")
+    until(lambda: data_store.reconstructions.rows.get(job.id).stage in ("refining", "done"), "it refines")
     data_store.captures.stop(capture_id)
     done = over(data_store, capture_id)
     assert done.row.state is CaptureState.COMPLETE
@@ -593,9 +593,9 @@ def test_the_end_of_a_refinement_is_never_worse_than_what_was_there(data_store: 
     """Ended at once, a refinement left splats that had just been seeded, and these were called complete."""
     source = f"replay:{moving_recording(tmp_path / 'moving.dat')}?pace=0"
     capture_id = data_store.captures.start(Plan(source, options=ReconstructionOptions(steps=200_000))).id
-    wait_for(lambda: data_store.captures.get(capture_id).row.state is CaptureState.FINISHING, "the source ends")
+    until(lambda: data_store.captures.get(capture_id).row.state is CaptureState.FINISHING, "the source ends")
     job_id = data_store.captures.get(capture_id).reconstructions[0].id
-    wait_for(lambda: data_store.reconstructions.rows.get(job_id).stage == Stage.REFINING, "it refines")
+    until(lambda: data_store.reconstructions.rows.get(job_id).stage == Stage.REFINING, "it refines")
     data_store.captures.stop(capture_id)
     row = over(data_store, capture_id).reconstructions[0]
     assert row.state is JobState.COMPLETE and "the refinement was ended at" in row.reason
@@ -624,7 +624,7 @@ def test_the_service_ends_within_a_moment_and_closes_the_recording(tmp_path: Pat
     frames = random_recording(tmp_path / "noise.dat", 500)
     with kept(tmp_path / "data") as data_store:
         capture_id = data_store.captures.start(recorded_only(f"replay:{tmp_path / 'noise.dat'}?repeat=1000")).id
-        wait_for(lambda: received(data_store, capture_id) > 1000, "frames come")
+        until(lambda: received(data_store, capture_id) > 1000, "frames come")
         begin = time.monotonic()
     assert time.monotonic() - begin < 10
     with kept(tmp_path / "data") as data_store:

@@ -12,6 +12,7 @@ import pytest
 from spiked_service.captures.archive import DataStore
 from spiked_service.store.rows import CaptureState, Plan
 from spiked_service.workers.messages import PreviewKind
+from waiting import until
 
 from spiked.recording import open_recording
 from spiked.ring import DeviceState
@@ -19,7 +20,7 @@ from spiked.sensor import Mosaic, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
 from tests.virtual_card import virtual_card
 
-from .survival import children, kept, over, wait_for
+from .survival import children, kept, over
 
 SENSOR = Sensor(1000, 1000, 20_000.0, flipped=False, mosaic=Mosaic.GRBG)
 FRAMES = 104
@@ -30,7 +31,7 @@ STREAMS = Path(__file__).parents[2].parent / "shared" / "streams"
 def data_store(tmp_path: Path) -> Iterator[DataStore]:
     with kept(tmp_path / "data") as one:
         yield one
-    wait_for(lambda: children() == [], "every worker has left")
+    until(lambda: children() == [], "every worker has left")
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +79,7 @@ def test_a_damaged_stream_is_recorded_bit_by_bit_and_seen_in_colour(
 def test_a_capture_waits_for_an_absent_card(data_store: DataStore, scene: Path, tmp_path: Path) -> None:
     pipe = tmp_path / "card"
     started = data_store.captures.start(Plan(f"pcie:{pipe}?mosaic=GRBG", reconstruct=False))
-    wait_for(lambda: data_store.captures.get(started.id).row.state is CaptureState.WAITING, "the card is missed")
+    until(lambda: data_store.captures.get(started.id).row.state is CaptureState.WAITING, "the card is missed")
     counters = data_store.captures.get(started.id).counters
     assert counters is not None and counters.device is DeviceState.ABSENT
     assert "check the path, the capture card" in counters.device_reason

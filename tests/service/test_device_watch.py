@@ -9,8 +9,9 @@ from spiked_service.daemon import open_data_store
 from spiked_service.events.bus import Bus, Topic
 from spiked_service.settings.reload import ReloadableSettings
 from spiked_service.store.rows import Plan
+from waiting import until
 
-from .survival import over, random_recording, received, wait_for
+from .survival import over, random_recording, received
 
 
 def test_a_device_that_streams_and_rests_is_told_once_each_time(tmp_path: Path) -> None:
@@ -34,7 +35,7 @@ def test_a_device_that_streams_and_rests_is_told_once_each_time(tmp_path: Path) 
         assert states() == [("idle", None)]
         assert states() == []
         capture_id = data_store.captures.start(Plan(source, reconstruct=False)).id
-        wait_for(lambda: received(data_store, capture_id) > 100, "frames come")
+        until(lambda: received(data_store, capture_id) > 100, "frames come")
         assert states()[-1] == ("streaming", capture_id)
         assert states() == []
         data_store.captures.stop(capture_id)

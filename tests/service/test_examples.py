@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +14,7 @@ from queue import Empty, Queue
 from typing import Any
 
 import pytest
+from waiting import until
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DEADLINE_S = 60.0
@@ -42,13 +42,6 @@ def running(*command: str, cwd: Path | None = None) -> Iterator["Queue[str]"]:
         os.killpg(process.pid, signal.SIGTERM)
         process.wait(DEADLINE_S)
         reader.join()
-
-
-def wait_for(condition: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + 4 * DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline, f"waited in vain until {what}"
-        time.sleep(0.1)
 
 
 def reload_until(daemon: Any, lines: "Queue[str]") -> str:
@@ -94,7 +87,7 @@ def test_the_zmq_example_prints_the_state(daemon: Callable[..., Any]) -> None:
     one = daemon("--no-capture", "--device", "sim:")
     plan = {"source": "sim:?width=64&height=48", "frames": 64, "reconstruct": False}
     assert one.http.post("captures", json=plan).status_code == 201
-    wait_for(lambda: one.http.get("captures").json()["items"][0]["state"] == "complete", "the capture is complete")
+    until(lambda: one.http.get("captures").json()["items"][0]["state"] == "complete", "the capture is complete")
     zmq = one.http.get("system").json()["zmq"]
     assert all(zmq[name].startswith("tcp://127.0.0.1:") for name in ("events", "state", "previews"))
     ports = [zmq[name].rpartition(":")[2] for name in ("events", "state")]
@@ -115,14 +108,14 @@ def test_the_path_is_drawn_and_poses_come_over_zmq(daemon: Callable[..., Any], t
         running(sys.executable, str(EXAMPLES / "live_trajectory.py"), websocket(one), cwd=tmp_path),
         running(sys.executable, str(EXAMPLES / "zmq_events.py"), *ports) as poses,
     ):
-        wait_for(lambda: one.http.get("system").json()["event_clients"] == 1, "the example listens")
+        until(lambda: one.http.get("system").json()["event_clients"] == 1, "the example listens")
         body = {"source": f"replay:{tmp_path / 'room' / 'simulated.dat'}", "options": {"steps": 10}}
         assert one.http.post("captures", json=body).status_code == 201
         while (line := poses.get(timeout=4 * DEADLINE_S)).startswith("now:"):  # the state as it was found
             pass
         frame, *position = line.split()
         assert int(frame) >= 0 and len(position) == 3
-        wait_for((tmp_path / "trajectory.png").is_file, "the picture is there")
+        until((tmp_path / "trajectory.png").is_file, "the picture is there")
 
 
 @pytest.mark.slow
@@ -135,7 +128,7 @@ def test_the_bridge_writes_a_bag_that_rosbags_reads(daemon: Callable[..., Any], 
         assert lines.get(timeout=DEADLINE_S) == "connected\n"
         body = {"source": "sim:?width=240&height=160&motion=arc", "frames": 1280, "options": {"steps": 10}}
         assert one.http.post("captures", json=body).status_code == 201
-        wait_for((tmp_path / "bag" / "metadata.yaml").is_file, "the bag is complete")
+        until((tmp_path / "bag" / "metadata.yaml").is_file, "the bag is complete")
     job = one.http.get("reconstructions").json()["items"][0]["id"]
     found: dict[str, list[Any]] = {}
     with AnyReader([tmp_path / "bag"]) as reader:

@@ -7,13 +7,14 @@ import pytest
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.rows import CaptureState, Grade, JobState, Plan
 from spiked_service.workers.frame_skipping import LatestFrames, next_window
+from waiting import until
 
 from spiked.recording import RecordingWriter
 from spiked.ring import End, EndReason, Gap, LossCause, Policy, RingReader, RingWriter
 from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
 
-from .survival import kept, over, wait_for
+from .survival import kept, over
 
 RATE_HZ = 20_000.0
 PACE = 4
@@ -95,7 +96,7 @@ def test_a_fast_camera_is_followed_live_and_then_reconstructed_with_every_frame(
         assert capture.row.verdict is not None and capture.row.verdict.grade is Grade.GOOD
         job = capture.reconstructions[0]
         assert any("were skipped live" in warning for warning in capture.row.warnings), capture.row
-        wait_for(lambda: data_store.reconstructions.rows.get(job.id).state.over, "it is gone through once more")
+        until(lambda: data_store.reconstructions.rows.get(job.id).state.over, "it is gone through once more")
         done = data_store.reconstructions.rows.get(job.id)
         assert (done.state, done.live, done.attempts, done.frames) == (JobState.COMPLETE, False, 2, 10_000)
 

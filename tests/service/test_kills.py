@@ -19,10 +19,11 @@ from spiked_service.captures.archive import DataStore
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.rows import Grade, Plan
 from spiked_service.store.snapshot import Snapshot
+from waiting import until
 
 from spiked.recording import open_recording
 
-from .survival import assert_holds, kept, over, random_recording, received, wait_for
+from .survival import assert_holds, kept, over, random_recording, received
 from .test_recovery import SHM, Service
 
 FIRST_SEED = int(os.environ.get("KILLS_SEED", "0"))
@@ -87,9 +88,7 @@ class Kill:
 
     @staticmethod
     def _wait(data_store: DataStore, capture_id: str, condition: Callable[[], bool]) -> None:
-        wait_for(
-            lambda: condition() or data_store.captures.get(capture_id).row.ended_at is not None, "the moment comes"
-        )
+        until(lambda: condition() or data_store.captures.get(capture_id).row.ended_at is not None, "the moment comes")
 
 
 def assert_accounted(data_store: DataStore, done: Snapshot, frames: NDArray[np.uint8]) -> None:
@@ -137,7 +136,7 @@ def daemon_killed(folder: Path, seed: int) -> None:
     one = Service(data, f"replay:{folder / 'noise.dat'}?repeat=9999")
     try:
         if seed % 3:
-            wait_for(lambda: one.received().get(one.ids[0], 0) > chance.randrange(20_000), "frames come")
+            until(lambda: one.received().get(one.ids[0], 0) > chance.randrange(20_000), "frames come")
         time.sleep(chance.random())
         before = one.received().get(one.ids[0], 0)
     finally:

@@ -21,6 +21,7 @@ from spiked_service.results.versions import Publisher, newest, pose_file, versio
 from spiked_service.settings.reconstruction_options import IntrinsicsOption, ReconstructionOptions
 from spiked_service.store.catalogue import UnknownIdError
 from spiked_service.store.rows import FrameRange, JobState, Plan, ReconstructionRow, Stage, Task
+from waiting import until
 
 from spiked.errors import ConfigurationError
 from spiked.poses import PoseFile
@@ -28,7 +29,7 @@ from spiked.recording import RecordingWriter
 from spiked.trajectory import Trajectory
 
 from ..room_map import GAIN, OPTICS, SENSOR, room_map, visitor
-from .survival import ended, kept, over, wait_for
+from .survival import ended, kept, over
 
 FRAMES = 300
 LEFT, RIGHT = (0.0, 0.5), (0.45, 0.95)
@@ -216,9 +217,9 @@ def test_a_job_whose_worker_is_killed_is_begun_again(place: Place, task: Task) -
     data_store = place.data_store
     maps = [place.maps["left"], place.maps["right"]] if task is Task.MERGE else [place.maps["room"]]
     job = place.submit(place.again, task, *maps)
-    wait_for(lambda: job.id in data_store.reconstructions.processes(), "it runs")
+    until(lambda: job.id in data_store.reconstructions.processes(), "it runs")
     os.kill(data_store.reconstructions.processes()[job.id], signal.SIGKILL)
-    wait_for(lambda: data_store.reconstructions.rows.get(job.id).state is JobState.QUEUED, "it is queued again")
+    until(lambda: data_store.reconstructions.rows.get(job.id).state is JobState.QUEUED, "it is queued again")
     reason = data_store.reconstructions.rows.get(job.id).reason
     assert reason.endswith("; restarted (attempt 2)" if task is Task.MERGE else "from the recording (attempt 2)")
     row = ended(data_store, job)
@@ -230,7 +231,7 @@ def test_an_extension_whose_worker_is_killed_while_it_joins_goes_on(place: Place
     data_store = place.data_store
     capture_id = recorded(data_store, tmp_path, 2, 1200, 0.1)
     job = place.submit(capture_id, Task.EXTEND, place.maps["room"])
-    wait_for(lambda: data_store.reconstructions.rows.get(job.id).stage is Stage.JOINING, "it joins")
+    until(lambda: data_store.reconstructions.rows.get(job.id).stage is Stage.JOINING, "it joins")
     os.kill(data_store.reconstructions.processes()[job.id], signal.SIGKILL)
     row = ended(data_store, job)
     assert (row.state, row.attempts, row.recognised) == (JobState.COMPLETE, 2, True)
@@ -263,7 +264,7 @@ def test_a_cancelled_job_lets_go_of_its_maps(place: Place) -> None:
     data_store.reconstructions.cancel(blocking.id)
     ended(data_store, blocking)
     running = place.submit(place.again, Task.MERGE, place.maps["left"], place.maps["right"])
-    wait_for(lambda: running.id in data_store.reconstructions.processes(), "it runs")
+    until(lambda: running.id in data_store.reconstructions.processes(), "it runs")
     data_store.reconstructions.cancel(running.id)
     row = ended(data_store, running)
     assert (row.state, row.version) == (JobState.CANCELLED, 0)

@@ -25,13 +25,6 @@ from spiked.errors import ConfigurationError
 DEADLINE_S = 20.0
 
 
-def wait_for(condition: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline, f"waited in vain until {what}"
-        time.sleep(0.01)
-
-
 class Systemd:
     """The other end of $NOTIFY_SOCKET."""
 

@@ -24,10 +24,11 @@ from spiked_service.store.rows import (
     Recorded,
     Stage,
 )
+from waiting import until
 
 from spiked.recon.time_left import typical_work_s
 
-from .survival import SENSOR, over, wait_for
+from .survival import SENSOR, over
 
 CAMERA = "sim:?width=160&height=100&pace=0"
 FRAMES = 512
@@ -55,7 +56,7 @@ def take(data_store: DataStore, options: ReconstructionOptions) -> str:
 
 
 def job(data_store: DataStore, capture_id: str) -> ReconstructionRow:
-    wait_for(lambda: data_store.captures.get(capture_id).reconstructions, "its reconstruction has begun")
+    until(lambda: data_store.captures.get(capture_id).reconstructions, "its reconstruction has begun")
     return data_store.captures.get(capture_id).reconstructions[-1]
 
 
@@ -63,8 +64,8 @@ def test_the_next_take_starts_while_the_last_refines_and_waits_for_its_turn(data
     heard: list[Message] = []
     told.observe(heard.append)
     first = take(data_store, LONG)
-    wait_for(lambda: data_store.captures.get(first).row.state is CaptureState.FINISHING, "the first take is over")
-    wait_for(lambda: job(data_store, first).stage is Stage.REFINING, "and refines")
+    until(lambda: data_store.captures.get(first).row.state is CaptureState.FINISHING, "the first take is over")
+    until(lambda: job(data_store, first).stage is Stage.REFINING, "and refines")
     others = []
     for _ in range(2):
         others.append(take(data_store, SHORT))  # the camera is free
@@ -78,7 +79,7 @@ def test_the_next_take_starts_while_the_last_refines_and_waits_for_its_turn(data
     assert [row.queue_place for row in listed] == [2, 1]  # newest first
     data_store.captures.stop(first)  # asked again: the refinement ends
     for other in others:
-        wait_for(lambda: job(data_store, other).state.over, "its turn has come")  # noqa: B023
+        until(lambda: job(data_store, other).state.over, "its turn has come")  # noqa: B023
         assert job(data_store, other).state is JobState.COMPLETE
         assert job(data_store, other).frames == FRAMES and job(data_store, other).queue_place is None
     begun = [job(data_store, other).started_at for other in others]
@@ -93,7 +94,7 @@ def test_the_next_take_starts_while_the_last_refines_and_waits_for_its_turn(data
 
 def test_one_that_nobody_recorded_does_not_give_way(data_store: DataStore) -> None:
     first = take(data_store, LONG)
-    wait_for(lambda: job(data_store, first).stage is Stage.REFINING, "the first refines")
+    until(lambda: job(data_store, first).stage is Stage.REFINING, "the first refines")
     plan = Plan(CAMERA, frames=FRAMES, options=SHORT, record=False)
     done = over(data_store, data_store.captures.start(plan).id)
     assert done.reconstructions[0].state is JobState.COMPLETE

@@ -18,10 +18,11 @@ from spiked_service.store.folder import DataFolder
 from spiked_service.store.retention import Policy
 from spiked_service.store.rows import CaptureState, Grade, JobState, Origin, Plan, UploadRow
 from spiked_service.store.snapshot import Snapshot
+from waiting import until
 
 from spiked.recording import index_path, open_recording, sidecar_path
 
-from .survival import assert_holds, kept, over, random_recording, received, wait_for
+from .survival import assert_holds, kept, over, random_recording, received
 
 FRAMES = 512
 
@@ -60,7 +61,7 @@ def recording(data: Path) -> Path:
 
 def only(data_store: DataStore) -> Snapshot:
     """The only capture, once everything that was left over has been looked at."""
-    wait_for(lambda: data_store.check_catalogue()[1] == "", "what was left over has been looked at")
+    until(lambda: data_store.check_catalogue()[1] == "", "what was left over has been looked at")
     (row,) = data_store.captures.list().items
     return data_store.captures.get(row.id)
 
@@ -143,7 +144,7 @@ def test_an_older_catalogue_brings_no_older_state(data: Path, tmp_path: Path) ->
     for suffix in ("-wal", "-shm"):
         shutil.copy(tmp_path / f"newer{suffix}", data / f"catalogue.sqlite{suffix}")
     with kept(data) as data_store:
-        wait_for(lambda: data_store.check_catalogue()[1] == "", "what was left over has been looked at")
+        until(lambda: data_store.check_catalogue()[1] == "", "what was left over has been looked at")
         rows = {row.id: row for row in data_store.captures.list().items}
         assert {one: (row.name, row.keep) for one, row in rows.items()} == {
             first.id: ("desk, renamed", False),
@@ -178,7 +179,7 @@ def test_without_any_row_sidecar_and_index_tell_what_there_is(data: Path, record
         data_store.retention.apply()
         assert recording.exists()
         job = data_store.reconstructions.submit(row.id, ReconstructionOptions(steps=1))
-        wait_for(lambda: data_store.reconstructions.rows.get(job.id).state is JobState.COMPLETE, "it is reconstructed")
+        until(lambda: data_store.reconstructions.rows.get(job.id).state is JobState.COMPLETE, "it is reconstructed")
     (lost,) = (data / "lost+found").iterdir()
     assert (lost / "published.json").exists(), "nothing says which capture it is of, but it is not removed"
 
@@ -191,7 +192,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with kept(folder / "alive") as data_store:
         source = f"replay:{folder / 'noise.dat'}?repeat=9999"
         capture_id = data_store.captures.start(Plan(source, reconstruct=False, name="noise", notes="n")).id
-        wait_for(lambda: received(data_store, capture_id) > 5000, "frames come")
+        until(lambda: received(data_store, capture_id) > 5000, "frames come")
         shutil.copytree(folder / "alive", folder / "data")
         data_store.captures.stop(capture_id)
         over(data_store, capture_id)
@@ -232,7 +233,7 @@ def test_a_sidecar_that_was_lost_is_rebuilt_from_the_row(data: Path, recording: 
     before = open_recording(recording)
     sidecar_path(recording).unlink()
     with kept(data) as data_store:
-        wait_for(lambda: sidecar_path(recording).exists(), "it is there again")
+        until(lambda: sidecar_path(recording).exists(), "it is there again")
         row = only(data_store).row
         assert row.verdict is not None and row.verdict.grade is Grade.DEGRADED
         assert "its sidecar was missing and was rebuilt" in row.verdict.reasons
@@ -251,7 +252,7 @@ def test_what_cannot_be_read_goes_to_lost_and_found(data: Path, recording: Path,
     a_file = data / "captures" / f"{capture_id[:-2]}{'0' if capture_id[-2] != '0' else '1'}{capture_id[-1]}"
     a_file.write_bytes(b"not a folder")
     with kept(data) as data_store:
-        wait_for(lambda: data_store.check_catalogue()[1] == "", "what was left over has been looked at")
+        until(lambda: data_store.check_catalogue()[1] == "", "what was left over has been looked at")
         assert data_store.captures.list().items == []
     lost = data / "lost+found"
     assert (lost / capture_id / "recording.dat").read_bytes() == content
@@ -317,7 +318,7 @@ def test_a_backup_made_while_the_daemon_captures_is_restored(daemon: Any, tmp_pa
     one = daemon()
     capture = {"source": "sim:?width=96&height=64", "reconstruct": False}
     first = one.http.post("captures", json={**capture, "frames": 100, "name": "first"}).json()["id"]
-    wait_for(lambda: one.http.get(f"captures/{first}").json()["state"] == "complete", "the first is over")
+    until(lambda: one.http.get(f"captures/{first}").json()["state"] == "complete", "the first is over")
     running = one.http.post("captures", json={**capture, "name": "running"}).json()["id"]
     made = spiked("backup", "--data", str(data))
     assert made.returncode == 0, made.stderr
@@ -327,7 +328,7 @@ def test_a_backup_made_while_the_daemon_captures_is_restored(daemon: Any, tmp_pa
     assert refused.returncode == 2 and "another service uses the data folder" in refused.stderr
     one.http.patch(f"captures/{first}", json={"name": "first, renamed", "keep": True})
     one.http.post(f"captures/{running}:stop")
-    wait_for(lambda: one.http.get(f"captures/{running}").json()["state"] == "complete", "the second is over")
+    until(lambda: one.http.get(f"captures/{running}").json()["state"] == "complete", "the second is over")
     one.close()
     (data / "catalogue.sqlite").write_bytes(b"broken")
     done = spiked("restore", "--data", str(data))
@@ -375,7 +376,7 @@ def test_an_upload_outlives_the_catalogue_too(tmp_path: Path) -> None:
         nameless.write_bytes(b"whose?")
     (data / "catalogue.sqlite").unlink()
     with kept(data) as data_store:
-        wait_for(lambda: data_store.check_catalogue()[1] == "", "what was left over has been looked at")
+        until(lambda: data_store.check_catalogue()[1] == "", "what was left over has been looked at")
         data_store.retention.apply()
         assert data_store.catalogue.uploads.where() == [row]
         assert data_store.folder.upload(row.id).read_bytes() == b"abc"

@@ -16,10 +16,11 @@ from spiked_service.results.versions import Publisher, at, newest
 from spiked_service.settings.reconstruction_options import IntrinsicsOption, ReconstructionOptions
 from spiked_service.store.catalogue import UnknownIdError
 from spiked_service.store.rows import CaptureState, JobState, Plan, ReconstructionRow, Stage
+from waiting import PATIENCE_S, until
 
 from spiked.errors import ConfigurationError
 
-from .survival import PATIENCE_S, SMALL, ended, over, random_recording, still_recording, wait_for
+from .survival import SMALL, ended, over, random_recording, still_recording
 
 SHORT = ReconstructionOptions(steps=5)
 LONG = ReconstructionOptions(steps=200_000)
@@ -27,7 +28,7 @@ LONG = ReconstructionOptions(steps=200_000)
 
 def running(data_store: DataStore, job: ReconstructionRow) -> int:
     """Process id of its worker, once it works."""
-    wait_for(lambda: data_store.reconstructions.rows.get(job.id).frames > 0, f"{job.id} runs")
+    until(lambda: data_store.reconstructions.rows.get(job.id).frames > 0, f"{job.id} runs")
     return data_store.reconstructions.processes()[job.id]
 
 
@@ -103,7 +104,7 @@ def test_one_that_is_ended_early_ends_with_the_best_version_that_there_is(house:
     data_store, capture_id = house
     good = ended(data_store, data_store.reconstructions.submit(capture_id, ReconstructionOptions(steps=600)))
     data_store.reconstructions.restart(good.id, LONG)
-    wait_for(lambda: data_store.reconstructions.rows.get(good.id).stage == Stage.REFINING, "it is refined")
+    until(lambda: data_store.reconstructions.rows.get(good.id).stage == Stage.REFINING, "it is refined")
     data_store.reconstructions.finish_early(good.id)
     row = ended(data_store, good)
     assert row.state is JobState.COMPLETE and row.version > good.version
@@ -144,9 +145,9 @@ def test_one_at_a_time_the_most_important_first(house: tuple[DataStore, str]) ->
 def test_a_live_reconstruction_does_not_wait_and_the_queue_waits_for_it(house: tuple[DataStore, str]) -> None:
     data_store, capture_id = house
     live = data_store.captures.start(Plan(f"{SMALL}&seed=7", options=SHORT))
-    wait_for(lambda: data_store.captures.get(live.id).reconstructions, "the live one runs")
+    until(lambda: data_store.captures.get(live.id).reconstructions, "the live one runs")
     queued = data_store.reconstructions.submit(capture_id, SHORT)
-    wait_for(lambda: data_store.captures.get(live.id).reconstructions[0].frames > 200, "it takes frames")
+    until(lambda: data_store.captures.get(live.id).reconstructions[0].frames > 200, "it takes frames")
     assert data_store.reconstructions.rows.get(queued.id).state is JobState.QUEUED
     data_store.captures.stop(live.id)
     assert over(data_store, live.id).reconstructions[0].live
@@ -157,9 +158,9 @@ def test_a_job_whose_worker_dies_is_begun_again_and_given_up_in_the_end(house: t
     data_store, capture_id = house
     job = data_store.reconstructions.submit(capture_id, LONG)
     for attempt in (1, 2, 3):
-        wait_for(lambda: data_store.reconstructions.rows.get(job.id).attempts == attempt, "it is tried again")  # noqa: B023
+        until(lambda: data_store.reconstructions.rows.get(job.id).attempts == attempt, "it is tried again")  # noqa: B023
         os.kill(running(data_store, job), signal.SIGKILL)
-        wait_for(lambda: job.id not in data_store.reconstructions.processes(), "it is dead")
+        until(lambda: job.id not in data_store.reconstructions.processes(), "it is dead")
         if attempt < 3:
             row = data_store.reconstructions.rows.get(job.id)
             assert row.attempts > attempt or row.reason.startswith("the reconstruction worker was killed by signal 9")
@@ -189,10 +190,10 @@ def test_what_cannot_be_reconstructed_is_refused_at_once(house: tuple[DataStore,
 def test_a_job_for_a_capture_that_still_records_waits_for_its_end(house: tuple[DataStore, str]) -> None:
     data_store, _ = house
     capture = data_store.captures.start(Plan(f"{SMALL}&seed=9", reconstruct=False))
-    wait_for(lambda: data_store.captures.get(capture.id).counters is not None, "it runs")
+    until(lambda: data_store.captures.get(capture.id).counters is not None, "it runs")
     job = data_store.reconstructions.submit(capture.id, SHORT)
     assert job.state is JobState.QUEUED
-    wait_for(lambda: data_store.captures.get(capture.id).counters.received > 400, "frames come")  # type: ignore[union-attr]
+    until(lambda: data_store.captures.get(capture.id).counters.received > 400, "frames come")  # type: ignore[union-attr]
     assert data_store.reconstructions.rows.get(job.id).state is JobState.QUEUED
     data_store.captures.stop(capture.id)
     done = ended(data_store, job)

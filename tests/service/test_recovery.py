@@ -13,10 +13,11 @@ from pathlib import Path
 import psutil
 import pytest
 from spiked_service.store.rows import CaptureState, Grade, JobState, Plan
+from waiting import until
 
 from spiked.recording import open_recording, verify
 
-from .survival import SMALL, assert_holds, kept, over, random_recording, received, wait_for
+from .survival import SMALL, assert_holds, kept, over, random_recording, received
 
 SHM = Path("/dev/shm")
 _SERVICE = """
@@ -88,7 +89,7 @@ def test_after_a_kill_recordings_are_whole_and_jobs_are_taken_up(tmp_path: Path)
     data = tmp_path / "data"
     with service(data, SMALL, f"replay:{tmp_path / 'noise.dat'}?repeat=9999") as one:
         live, record = one.ids
-        wait_for(lambda: min([*one.received().values(), 999]) > 600, "frames come to both")
+        until(lambda: min([*one.received().values(), 999]) > 600, "frames come to both")
         before = one.received()[record]
         one.kill()
     path = data / "captures" / record / "recording.dat"
@@ -103,7 +104,7 @@ def test_after_a_kill_recordings_are_whole_and_jobs_are_taken_up(tmp_path: Path)
         assert_holds(path, frames)
         assert "as they were written" not in str(verify(path).reasons)
         assert not any((SHM / f"spiked-{key}").exists() for key in (live, record))
-        wait_for(lambda: data_store.captures.get(live).reconstructions[0].state.over, "taken up again")
+        until(lambda: data_store.captures.get(live).reconstructions[0].state.over, "taken up again")
         snapshot = data_store.captures.get(live)
         job = snapshot.reconstructions[0]
         assert (job.live, job.attempts) == (False, 2)
@@ -116,7 +117,7 @@ def test_a_job_without_a_recording_fails_honestly_after_a_kill(tmp_path: Path) -
     data = tmp_path / "data"
     with kept(data) as data_store:
         capture_id = data_store.captures.start(Plan(SMALL, record=False)).id
-        wait_for(lambda: received(data_store, capture_id) > 100, "frames come")
+        until(lambda: received(data_store, capture_id) > 100, "frames come")
         row = data_store.captures.get(capture_id).reconstructions[0]
         # As a kill would leave it: the row says that it runs, and nothing of the capture's end is noted.
         data_store.catalogue.reconstructions.put(row)
@@ -127,7 +128,7 @@ def test_a_job_without_a_recording_fails_honestly_after_a_kill(tmp_path: Path) -
         data_store.catalogue.captures.put(capture)
         data_store.catalogue.reconstructions.put(row)
     with kept(data) as data_store:
-        wait_for(lambda: data_store.reconstructions.rows.get(row.id).state is JobState.FAILED, "it is told")
+        until(lambda: data_store.reconstructions.rows.get(row.id).state is JobState.FAILED, "it is told")
         assert "because the service ended while it ran" in data_store.reconstructions.rows.get(row.id).reason
         assert data_store.captures.get(capture_id).row.state is CaptureState.FAILED
 

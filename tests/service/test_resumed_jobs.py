@@ -16,6 +16,7 @@ from spiked_service.results.timeline import Timeline
 from spiked_service.results.versions import newest, pose_file
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.rows import JobState, Plan, ReconstructionRow, Stage
+from waiting import until
 
 from spiked.poses import PoseFile
 from spiked.recon import Reconstructor
@@ -23,7 +24,7 @@ from spiked.recon.checkpoint import CheckpointSaver, Interrupted
 from spiked.recon.checkpoint_file import exists
 from spiked.recording import open_recording
 
-from .survival import ended, kept, moving_recording, over, wait_for
+from .survival import ended, kept, moving_recording, over
 from .test_recovery import service
 
 SHORT = ReconstructionOptions(steps=20)
@@ -99,7 +100,7 @@ def refining_with_checkpoint(data_store: DataStore, job_id: str) -> None:
         row, folder = data_store.reconstructions.rows.get(job_id), data_store.folder.checkpoint(job_id)
         return row.stage is Stage.REFINING and exists(folder) and Interrupted.read(folder).state.header["progress"] > 0
 
-    wait_for(there, "it refines and has left a checkpoint")
+    until(there, "it refines and has left a checkpoint")
 
 
 def test_a_job_whose_worker_is_killed_goes_on(house: tuple[DataStore, str]) -> None:
@@ -107,10 +108,10 @@ def test_a_job_whose_worker_is_killed_goes_on(house: tuple[DataStore, str]) -> N
     job = data_store.reconstructions.submit(capture_id, LONG)
     refining_with_checkpoint(data_store, job.id)
     os.kill(data_store.reconstructions.processes()[job.id], signal.SIGKILL)
-    wait_for(lambda: data_store.reconstructions.rows.get(job.id).state is JobState.QUEUED, "it is queued again")
+    until(lambda: data_store.reconstructions.rows.get(job.id).state is JobState.QUEUED, "it is queued again")
     assert "; resumed from its checkpoint (attempt 2)" in data_store.reconstructions.rows.get(job.id).reason
     saved = Interrupted.read(data_store.folder.checkpoint(job.id)).state.header["progress"]
-    wait_for(lambda: data_store.reconstructions.rows.get(job.id).progress >= saved, "it is where it was")
+    until(lambda: data_store.reconstructions.rows.get(job.id).progress >= saved, "it is where it was")
     assert "resumed from its checkpoint: refining" in log_of(data_store, job)
     used = data_store.folder.checkpoint(job.id)
     assert sum(path.stat().st_size for path in used.iterdir()) > 100_000
@@ -143,12 +144,12 @@ def test_jobs_of_a_killed_service_go_on(tmp_path: Path, end: str) -> None:
     if end == "killed":
         with service(data) as one:
             state = data / "reconstructions" / job.id / "checkpoint" / "state"
-            wait_for(lambda: state.exists() and Interrupted.read(state.parent).state.header["progress"] > 0, "saved")
+            until(lambda: state.exists() and Interrupted.read(state.parent).state.header["progress"] > 0, "saved")
             one.kill()
     saved = Interrupted.read(data / "reconstructions" / job.id / "checkpoint").state.header["progress"]
     assert saved > 0
     with kept(data) as data_store:
-        wait_for(lambda: data_store.reconstructions.rows.get(job.id).progress >= saved, "it is where it was")
+        until(lambda: data_store.reconstructions.rows.get(job.id).progress >= saved, "it is where it was")
         assert "resumed from its checkpoint: refining" in log_of(data_store, job)
         data_store.reconstructions.cancel(job.id)
         assert ended(data_store, job).state is JobState.CANCELLED

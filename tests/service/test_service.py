@@ -3,7 +3,6 @@
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import httpx
 import psutil
 import pytest
+from waiting import until
 
 SHM = Path("/dev/shm")
 ENDED_S = 20.0
@@ -18,14 +18,6 @@ SMALL = "sim:?width=96&height=64"
 TRACKABLE = "sim:?width=160&height=100"
 """Large enough for a path, from `PATH_FRAMES` on."""
 PATH_FRAMES = 600
-
-
-def wait_for(condition: Callable[[], bool], what: str) -> None:
-    """Poll until the condition holds; the test fails if it does not within a minute."""
-    deadline = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline, f"waited in vain until {what}"
-        time.sleep(0.05)
 
 
 def one_capture(daemon: Any) -> dict[str, Any]:
@@ -42,7 +34,7 @@ def streaming(daemon: Any) -> dict[str, Any]:
         capture = one_capture(daemon)
         return capture["state"] == "streaming" and capture["counters"]["received"] > 100
 
-    wait_for(flows, "frames come")
+    until(flows, "frames come")
     assert set(daemon.workers()) == {"acquisition", "recorder", "reconstruction", "preview"}
     return one_capture(daemon)
 
@@ -110,11 +102,11 @@ def test_a_camera_that_is_not_plugged_in_is_waited_for(daemon: Callable[..., Any
         counters = one.http.get(capture).json()["counters"] or {"device": None}
         return counters["device"] == "absent" and counters["device_reason"] == waits
 
-    wait_for(told, "it is said that the camera is not there")
-    wait_for(lambda: one.output.readline() == f"waiting  {waits}\n", "whoever follows is told")
+    until(told, "it is said that the camera is not there")
+    until(lambda: one.output.readline() == f"waiting  {waits}\n", "whoever follows is told")
     assert one.http.get(capture).json()["reason"] == one.http.get("captures").json()["items"][0]["reason"] == waits
     one.http.post(f"{capture}:stop")
-    wait_for(lambda: one.http.get(capture).json()["state"] in ("complete", "failed"), "it can be stopped all the same")
+    until(lambda: one.http.get(capture).json()["state"] in ("complete", "failed"), "it can be stopped all the same")
     over = one.http.get(capture).json()
     assert (over["state"], over["reason"]) == ("complete", "no frames: the camera was absent")
 
@@ -141,13 +133,13 @@ def test_when_acquisition_and_recorder_die_together_what_came_is_kept_and_recons
     def capture() -> dict[str, Any]:
         return dict(one.http.get(f"captures/{started['id']}").json())
 
-    wait_for(lambda: bool(capture()["counters"]) and capture()["counters"]["received"] > 600, "frames come")
+    until(lambda: bool(capture()["counters"]) and capture()["counters"]["received"] > 600, "frames come")
     workers = one.workers()
     workers["recorder"].suspend()  # a process can be killed at any moment: here before it sees the other's death
     workers["acquisition"].kill()
-    wait_for(lambda: "acquisition" not in one.workers(), "its death is seen")
+    until(lambda: "acquisition" not in one.workers(), "its death is seen")
     workers["recorder"].kill()
-    wait_for(lambda: capture()["state"] == "failed", "the capture has failed")
+    until(lambda: capture()["state"] == "failed", "the capture has failed")
     kept = capture()
     assert kept["verdict"]["grade"] == "degraded"
     assert (kept["recording"]["frames"], kept["recording"]["lost"]) == (kept["counters"]["next_frame"], 0)
@@ -157,7 +149,7 @@ def test_when_acquisition_and_recorder_die_together_what_came_is_kept_and_recons
     def jobs() -> list[dict[str, Any]]:
         return list(one.http.get("reconstructions").json()["items"])
 
-    wait_for(lambda: all(job["state"] in ("complete", "failed") for job in jobs()), "no job waits for ever")
+    until(lambda: all(job["state"] in ("complete", "failed") for job in jobs()), "no job waits for ever")
 
 
 def test_one_capture_at_a_time_and_the_account_of_frames(daemon: Callable[..., Any]) -> None:
@@ -166,7 +158,7 @@ def test_one_capture_at_a_time_and_the_account_of_frames(daemon: Callable[..., A
     assert started.status_code == 201
     assert started.headers["location"].endswith(started.json()["id"])
     assert one.http.post("captures", json={"source": SMALL}).status_code == 409
-    wait_for(lambda: one_capture(one)["state"] in ("complete", "failed"), "the capture ends")
+    until(lambda: one_capture(one)["state"] in ("complete", "failed"), "the capture ends")
     capture = one_capture(one)
     assert (capture["state"], capture["reason"]) == ("complete", "")
     assert capture["counters"]["received"] == capture["counters"]["next_frame"] == 400
@@ -180,11 +172,11 @@ def test_one_capture_at_a_time_and_the_account_of_frames(daemon: Callable[..., A
 def test_stop_ends_the_source_and_then_the_reconstruction(daemon: Callable[..., Any]) -> None:
     one = daemon("--device", "sim:")
     capture = streaming(one)
-    wait_for(lambda: one_capture(one)["reconstruction"]["version"] > 0, "there is a map to refine")
+    until(lambda: one_capture(one)["reconstruction"]["version"] > 0, "there is a map to refine")
     assert one.http.post(f"captures/{capture['id']}:stop").status_code == 202
-    wait_for(lambda: one_capture(one)["state"] == "finishing", "the source ends")
+    until(lambda: one_capture(one)["state"] == "finishing", "the source ends")
     one.http.post(f"captures/{capture['id']}:stop")
-    wait_for(lambda: one_capture(one)["state"] == "complete", "the reconstruction ends")
+    until(lambda: one_capture(one)["state"] == "complete", "the reconstruction ends")
     assert one_capture(one)["reconstruction"]["progress"] < 1
     assert one.workers() == {}
 
@@ -250,11 +242,11 @@ def test_the_death_of_the_acquisition_is_told_and_its_ring_removed(daemon: Calla
     one = daemon("--device", SMALL)
     capture = streaming(one)
     one.workers()["acquisition"].kill()
-    wait_for(lambda: one_capture(one)["reason"] != "", "the death is told")
+    until(lambda: one_capture(one)["reason"] != "", "the death is told")
     assert one_capture(one)["reason"] == "the acquisition worker was killed by signal 9"
-    wait_for(lambda: not ring_of(capture).exists(), "the ring is gone")
+    until(lambda: not ring_of(capture).exists(), "the ring is gone")
     one.http.post(f"captures/{capture['id']}:stop")
-    wait_for(lambda: one_capture(one)["state"] == "failed", "the reconstruction ends with what there is")
+    until(lambda: one_capture(one)["state"] == "failed", "the reconstruction ends with what there is")
     assert one.workers() == {}
 
 
@@ -265,14 +257,14 @@ def test_the_death_of_the_reconstruction_leaves_the_recording_and_begins_again_f
     one.http.post("captures", json={"source": TRACKABLE, "options": {"steps": 10}})
     capture = streaming(one)
     one.workers()["reconstruction"].kill()
-    wait_for(lambda: one_capture(one)["warnings"] != [], "the death is told")
+    until(lambda: one_capture(one)["warnings"] != [], "the death is told")
     assert one_capture(one)["warnings"][0].startswith("the reconstruction worker was killed by signal 9; restarted")
     before = one_capture(one)["counters"]["received"]
-    wait_for(lambda: one_capture(one)["counters"]["received"] > before + PATH_FRAMES, "frames still arrive")
+    until(lambda: one_capture(one)["counters"]["received"] > before + PATH_FRAMES, "frames still arrive")
     one.http.post(f"captures/{capture['id']}:stop")
-    wait_for(lambda: one_capture(one)["state"] == "complete", "the capture ends well")
+    until(lambda: one_capture(one)["state"] == "complete", "the capture ends well")
     assert one_capture(one)["verdict"]["grade"] == "good"
-    wait_for(lambda: one_capture(one)["reconstruction"]["ended_at"] is not None, "its reconstruction ends")
+    until(lambda: one_capture(one)["reconstruction"]["ended_at"] is not None, "its reconstruction ends")
     reconstruction = one_capture(one)["reconstruction"]
     assert reconstruction["state"] == "complete", reconstruction["reason"]
     assert one_capture(one)["reconstruction"]["frames"] == one_capture(one)["recording"]["frames"]
@@ -285,7 +277,7 @@ def test_the_death_of_the_preview_is_mended(daemon: Callable[..., Any]) -> None:
     streaming(one)
     dead = one.workers()["preview"]
     dead.kill()
-    wait_for(lambda: one.workers().get("preview", dead).pid != dead.pid, "another preview runs")
+    until(lambda: one.workers().get("preview", dead).pid != dead.pid, "another preview runs")
     capture = one_capture(one)
     assert capture["state"] == "streaming"
     assert capture["warnings"] == ["the preview worker was killed by signal 9; it was restarted"]

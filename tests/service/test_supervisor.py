@@ -12,10 +12,11 @@ from spiked_service.workers.backoff import Backoff
 from spiked_service.workers.messages import AcquisitionCommand, PreviewCommand, Role
 from spiked_service.workers.process import StandbyWorker
 from spiked_service.workers.supervisor import WorkerSupervisor
+from waiting import until
 
 from spiked.ring import clean_stale
 
-from .survival import SMALL, children, wait_for
+from .survival import SMALL, children
 
 NO_RING = PreviewCommand(capture_id="none", ring="no-such-ring", thumbnail=None)
 """Its worker exits with an error within a second."""
@@ -100,7 +101,7 @@ def test_a_cancelled_worker_is_not_started_again(tmp_path: Path, monkeypatch: py
     assert not owner.supervisor.restart()
     owner.supervisor.start(NO_RING)
     assert not owner.supervisor.running
-    wait_for(lambda: children() == [], "the standby worker has exited")
+    until(lambda: children() == [], "the standby worker has exited")
 
 
 def test_the_standby_worker_becomes_the_successor(tmp_path: Path) -> None:
@@ -116,8 +117,8 @@ def test_the_standby_worker_becomes_the_successor(tmp_path: Path) -> None:
     os.kill(pid, signal.SIGKILL)
     assert exits.get(timeout=EXIT_S) == "the acquisition worker was killed by signal 9"
     supervisor.restart()
-    wait_for(lambda: supervisor.pid == standby, "the standby worker runs")
+    until(lambda: supervisor.pid == standby, "the standby worker runs")
     supervisor.dismiss()
     supervisor.join(EXIT_S)
-    wait_for(lambda: children() == [], "all have exited")
+    until(lambda: children() == [], "all have exited")
     clean_stale()

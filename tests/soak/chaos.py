@@ -21,6 +21,7 @@ import msgpack
 import psutil
 import pytest
 import zmq
+from waiting import until
 from websockets.sync.client import connect
 
 from spiked.recording import Verdict, verify
@@ -29,15 +30,6 @@ DEADLINE_S = 180.0
 SOURCE = "sim:?width=96&height=64&rate=1000&pace=1"
 SHM = Path("/dev/shm")
 OVER = ("complete", "failed")
-
-
-def wait_for(condition: Callable[[], Any], what: str) -> Any:
-    """Poll until it holds."""
-    deadline = time.monotonic() + DEADLINE_S
-    while not (found := condition()):
-        assert time.monotonic() < deadline, f"waited in vain until {what}"
-        time.sleep(0.05)
-    return found
 
 
 class Clock:
@@ -88,7 +80,7 @@ class Victim:
             now = self.daemon.http.get(f"captures/{capture}").json()
             return now["state"] in OVER or bool(now["counters"] and now["counters"]["received"] > 50)
 
-        wait_for(flows, f"capture {capture} flows")
+        until(flows, f"capture {capture} flows")
         return str(capture)
 
     def do(self, action: str) -> None:
@@ -172,7 +164,7 @@ class Victim:
     def check(self) -> None:
         """What must hold whatever was done."""
         assert self.daemon.process.poll() is None, "the daemon died"
-        told = wait_for(self._ready, "the service is ready")
+        told = until(self._ready, "the service is ready")
         assert told["status"] != "failed"
         addresses = self.daemon.http.get("system").json()["zmq"]
         assert "messages" in ask(addresses["state"])
@@ -190,9 +182,9 @@ class Victim:
             if capture["state"] not in OVER:
                 for _ in range(2):
                     self.daemon.http.post(f"captures/{capture['id']}:stop")
-        wait_for(lambda: all(capture["state"] in OVER for capture in self.captures()), "all captures are over")
+        until(lambda: all(capture["state"] in OVER for capture in self.captures()), "all captures are over")
         self._work_off()
-        wait_for(lambda: not self.daemon.workers(), "no worker is left")
+        until(lambda: not self.daemon.workers(), "no worker is left")
         for capture in self.captures():
             assert not (SHM / f"spiked-{capture['id']}").exists()
             self._check_recording(capture)

@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 
 sys.path.append(str(Path(__file__).parent))
-from chaos import OVER, Clock, Victim, fill, wait_for
+from chaos import OVER, Clock, Victim, fill
+from waiting import until
 
 from ..small_disk import small_disk
 
@@ -66,7 +67,7 @@ def test_a_clock_that_jumps(daemon: Callable[..., Any], tmp_path: Path, monkeypa
         def goes_on(before: int = before) -> bool:
             return bool(victim.daemon.http.get(f"captures/{capture}").json()["counters"]["received"] > before + 100)
 
-        wait_for(goes_on, f"frames come {offset_s} s away")
+        until(goes_on, f"frames come {offset_s} s away")
         victim.check()
     system = victim.daemon.http.get("system").json()
     assert 0 <= system["uptime_s"] < 600
@@ -86,7 +87,7 @@ def test_a_full_disk_ends_the_capture_and_not_the_service(daemon: Callable[..., 
 
         try:
             time.sleep(1)
-            ended = wait_for(over, "the capture ends for want of room")
+            ended = until(over, "the capture ends for want of room")
             assert ended["verdict"]["grade"] != "good" and ended["verdict"]["reasons"], ended
             assert victim.daemon.process.poll() is None
             assert victim.daemon.http.get("captures").status_code == 200

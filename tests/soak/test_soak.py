@@ -13,6 +13,7 @@ from typing import Any
 
 import psutil
 import pytest
+from waiting import until
 
 CLIENTS = Path(__file__).with_name("clients.py")
 EVENT_CLIENTS, VIEW_CLIENTS = 50, 8
@@ -76,14 +77,6 @@ def clients(*arguments: str) -> Iterator[Callable[[], list[dict[str, Any]]]]:
         process.stdout.close()
 
 
-def wait_for(condition: Callable[[], Any], what: str) -> Any:
-    deadline = time.monotonic() + START_S
-    while not (found := condition()):
-        assert time.monotonic() < deadline, f"waited in vain until {what}"
-        time.sleep(0.1)
-    return found
-
-
 def recorded(folder: Path, width: int, height: int) -> Path:
     """1,280 frames of a simulated camera."""
     command = [sys.executable, "-m", "spiked_service", "simulate", "-o", str(folder), "--frames", "1280"]
@@ -101,7 +94,7 @@ def a_scene(daemon: Any, recording: Path) -> str:
         jobs = daemon.http.get("reconstructions", params={"capture_id": capture}).json()["items"]
         return jobs and jobs[0]["state"] in ("complete", "failed") and jobs[0]
 
-    job = wait_for(done, "there is a scene")
+    job = until(done, "there is a scene")
     assert job["state"] == "complete" and job["version"] > 0, job
     return str(job["id"])
 
@@ -127,7 +120,7 @@ def soak(
         started = daemon.http.post("captures", json={"source": source, "options": {"steps": 20}})
         assert started.status_code == 201, started.text
         capture = f"captures/{started.json()['id']}"
-        wait_for(lambda: "recorder" in daemon.workers(), "the recorder runs")
+        until(lambda: "recorder" in daemon.workers(), "the recorder runs")
         memory = Memory(daemon)
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
@@ -135,7 +128,7 @@ def soak(
             time.sleep(1)
         daemon.http.post(f"{capture}:stop")
         daemon.http.post(f"{capture}:stop")
-        final = wait_for(lambda: (now := daemon.http.get(capture).json())["recording"] and now, "it is recorded")
+        final = until(lambda: (now := daemon.http.get(capture).json())["recording"] and now, "it is recorded")
         views, events = viewers(), listeners()
 
     counters = final["counters"]

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from virtual_camera.faults import Fault, Kind
 from virtual_camera.host import CameraSettings
 from virtual_camera.rig import Report, VirtualCameras
+from waiting import until
 
 from spiked.recording import open_recording
 from spiked.recording.time_base import offset
@@ -29,7 +30,6 @@ from spiked.simulate.record import simulate
 RATE = 2000
 FRAMES = 1000
 FOV_DEG = 60.0
-PATIENCE_S = 240.0
 OVER = ("complete", "failed")
 MOST_FRAMES_OFF = 1
 """Error of the offset of two cameras, at most: docs/recordings.md has up to 0.26 frames."""
@@ -41,13 +41,6 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("usb") / "room"
     simulate(SimulatedCamera(Sensor(400, 250, 20_000.0), seed=3), folder, "room", FRAMES, views=2)
     return folder / "room.dat"
-
-
-def wait_for(condition: Callable[[], Any], what: str) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline_s, f"not so within {PATIENCE_S:g} s: {what}"
-        time.sleep(0.05)
 
 
 def sent(room: Path, numbers: range) -> NDArray[np.uint8]:
@@ -69,10 +62,10 @@ def test_a_capture_over_rest_gets_every_frame_and_is_reconstructed(
     capture_id = http.post("captures", json=body).json()["id"]
 
     waits = "the camera usb0 is not there: waiting for it"
-    wait_for(lambda: http.get(f"captures/{capture_id}").json()["reason"] == waits, "the daemon waits for the camera")
+    until(lambda: http.get(f"captures/{capture_id}").json()["reason"] == waits, "the daemon waits for the camera")
     rig.plug()
     over = ("finishing", "complete", "failed")
-    wait_for(lambda: http.get(f"captures/{capture_id}").json()["state"] in over, "all frames came")
+    until(lambda: http.get(f"captures/{capture_id}").json()["state"] in over, "all frames came")
     device = http.get("devices").json()["items"][0]
     assert (device["state"], device["port"], device["serial"]) == ("idle", "2-1", "000000000001")
     doctor = {item["name"]: item for item in http.get("doctor").json()["items"]}
@@ -84,7 +77,7 @@ def test_a_capture_over_rest_gets_every_frame_and_is_reconstructed(
     assert capture["reason"] == ""
     assert capture["counters"]["received"] == FRAMES
     assert sum(capture["counters"]["lost"].values()) == 0
-    wait_for(lambda: http.get(f"captures/{capture_id}").json()["recording"], "the recording is closed")
+    until(lambda: http.get(f"captures/{capture_id}").json()["recording"], "the recording is closed")
     recorded = (tmp_path / "data" / "captures" / capture_id / "recording.dat").read_bytes()
     assert recorded == sent(room, range(FRAMES)).tobytes()
 
@@ -92,7 +85,7 @@ def test_a_capture_over_rest_gets_every_frame_and_is_reconstructed(
         found: dict[str, Any] = http.get(f"reconstructions/{capture['reconstruction_ids'][0]}").json()
         return found
 
-    wait_for(lambda: job()["poses"] > 0, "the reconstruction follows")
+    until(lambda: job()["poses"] > 0, "the reconstruction follows")
     assert job()["state"] in ("running", "complete")
 
 
@@ -106,15 +99,15 @@ def test_a_capture_goes_on_when_the_camera_is_back(
     def counters() -> dict[str, Any]:
         return http.get(f"captures/{capture_id}").json().get("counters") or {}
 
-    wait_for(lambda: counters().get("received", 0) > 100, "frames come")
+    until(lambda: counters().get("received", 0) > 100, "frames come")
     rig.unplug()
-    wait_for(lambda: counters()["device"].startswith("absent"), "it is seen that the camera is gone")
+    until(lambda: counters()["device"].startswith("absent"), "it is seen that the camera is gone")
     waits = "the camera usb0 was unplugged: waiting for it"
     assert http.get(f"captures/{capture_id}").json()["reason"] == waits
     assert captures_told(http)[-1] == ("absent", waits), "who listens to the capture's events only does not learn it"
     before = counters()["received"]
     rig.plug(port="2-5")
-    wait_for(lambda: counters()["received"] > before + 500, "frames come again")
+    until(lambda: counters()["received"] > before + 500, "frames come again")
     after = counters()
     assert after["device"].startswith("streaming")
     assert after["lost"]["device"] > 0
@@ -158,14 +151,14 @@ def test_a_killed_acquisition_is_followed_and_the_capture_goes_on(
 
     for _ in range(2):
         before = received()
-        wait_for(lambda: received() > before + 500, "frames come")  # noqa: B023
+        until(lambda: received() > before + 500, "frames come")  # noqa: B023
         acquisition = service.workers()["acquisition"].pid
         os.kill(acquisition, signal.SIGKILL)
-        wait_for(lambda: service.workers().get("acquisition") not in (None, acquisition), "another")  # noqa: B023
+        until(lambda: service.workers().get("acquisition") not in (None, acquisition), "another")  # noqa: B023
     before = received()
-    wait_for(lambda: received() > before + 500, "frames come again")
+    until(lambda: received() > before + 500, "frames come again")
     http.post(f"captures/{capture_id}:stop")
-    wait_for(lambda: capture()["state"] in ("complete", "failed"), "it ends")
+    until(lambda: capture()["state"] in ("complete", "failed"), "it ends")
     over = capture()
     observed = "the acquisition worker was killed by signal 9; it was restarted, and frames in between are lost"
     assert [warning for warning in over["warnings"] if "killed" in warning] == [observed] * 2
@@ -220,7 +213,7 @@ def test_frames_are_timed_within_a_millisecond_on_a_busy_machine(
     spec = f"usb0?rate={RATE}&transfer_kib=256"
     http = daemon("--device", spec, "--no-capture", seen=rig).http
     capture_id = http.post("captures", json={"source": spec, "frames": 10 * RATE, "reconstruct": False}).json()["id"]
-    wait_for(lambda: http.get(f"captures/{capture_id}").json()["state"] in ("complete", "failed"), "it ends")
+    until(lambda: http.get(f"captures/{capture_id}").json()["state"] in ("complete", "failed"), "it ends")
     recording = open_recording(tmp_path / "data" / "captures" / capture_id / "recording.dat")
 
     numbers = recording.compact(0, recording.frames)[:, :8].copy().view("<i8")[:, 0]
@@ -263,7 +256,7 @@ def test_two_cameras_share_a_time_base(
     began_s = []
     recordings = []
     for number, capture_id in enumerate(ids):
-        wait_for(lambda one=capture_id: http.get(f"captures/{one}").json()["state"] in OVER, "it ends")  # type: ignore[misc]
+        until(lambda one=capture_id: http.get(f"captures/{one}").json()["state"] in OVER, "it ends")  # type: ignore[misc]
         recording = open_recording(tmp_path / "data" / "captures" / capture_id / "recording.dat")
         numbers = recording.compact(0, recording.frames)[:, :8].copy().view("<i8")[:, 0]
         assert recording.frames == 10 * RATE and not recording.gaps
@@ -294,7 +287,7 @@ def test_a_rate_that_is_not_the_stated_one_is_a_warning(
         warnings = http.get("captures").json()["items"][0]["warnings"]
         return [warning for warning in warnings if "not at the stated 2,000" in warning]
 
-    wait_for(observed, "the rate is observed")
+    until(observed, "the rate is observed")
     measured = re.search(r"frames come at ([\d,]+) a second", observed()[0])
     assert measured
     assert int(measured[1].replace(",", "")) == pytest.approx(1.05 * RATE, rel=0.01)
@@ -307,7 +300,7 @@ def test_a_capture_that_begins_with_an_old_frame_gets_all_its_frames(
     old = (Fault(0, Kind.JUNK, count=4), Fault(1, Kind.DROP, count=241_231))
     http = daemon("--no-capture", "--device", "usb0", seen=cameras(CameraSettings(str(room), faults=old))).http
     capture_id = http.post("captures", json={"source": "usb0", "frames": 3000, "reconstruct": False}).json()["id"]
-    wait_for(lambda: http.get(f"captures/{capture_id}").json()["state"] in ("complete", "failed"), "it ends")
+    until(lambda: http.get(f"captures/{capture_id}").json()["state"] in ("complete", "failed"), "it ends")
     capture = http.get(f"captures/{capture_id}").json()
     assert (capture["state"], capture["verdict"]["grade"]) == ("complete", "good")
     assert [text for text in capture["warnings"] if text.startswith("1 old frame lay in the camera")]
@@ -324,7 +317,7 @@ def test_what_is_not_permitted_is_a_warning_of_capture_and_device(
     rig = cameras(CameraSettings(str(room), rate_hz=RATE, buffer_frames=2 * RATE))
     less = ("setpriv", "--bounding-set=-sys_nice,-ipc_lock", "prlimit", "--rtprio=0:0", "--memlock=65536:65536")
     http = daemon("--device", f"usb0?fov={FOV_DEG:g}&rate={RATE}", seen=rig, under=less).http
-    wait_for(lambda: len(http.get("captures").json()["items"][0]["warnings"]) == 2, "it is observed")
+    until(lambda: len(http.get("captures").json()["items"][0]["warnings"]) == 2, "it is observed")
     warnings = http.get("captures").json()["items"][0]["warnings"]
     assert "real-time priority" in warnings[0] and "paged out" in warnings[1]
     assert http.get("devices").json()["items"][0]["warnings"] == warnings

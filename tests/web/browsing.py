@@ -3,14 +3,13 @@
 import base64
 import io
 import os
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from waiting import until
 
 Picture = NDArray[np.float64]
 PATIENCE_S = 60.0
@@ -21,15 +20,6 @@ STEPS = 600 if "SCREENSHOTS" in os.environ else 150
 """Of refinement: a scene to be looked at, or one to be tested with."""
 MOST_BYTES = 300_000
 """Of a screenshot."""
-
-
-def until(condition: Callable[[], Any], what: str, patience_s: float = PATIENCE_S) -> Any:
-    """Wait for something and return it."""
-    deadline_s = time.monotonic() + patience_s
-    while not (value := condition()):
-        assert time.monotonic() < deadline_s, f"not so within {patience_s:g} s: {what}"
-        time.sleep(0.1)
-    return value
 
 
 def finished(http: Any, capture_id: str) -> dict[str, Any]:

@@ -1,19 +1,13 @@
 """The queue of reconstructions over HTTP: names, holding and moving."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from waiting import until
 
 from spiked.client import ApiError, CaptureOut, ReconstructionOptions, ReconstructionOut
-
-
-def until(condition: Callable[[], Any], what: str) -> None:
-    deadline = time.monotonic() + 120
-    while not condition():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.05)
 
 
 @pytest.fixture

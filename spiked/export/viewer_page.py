@@ -73,7 +73,6 @@ def _about(source: ExportSource) -> dict[str, Any]:
     rate = 1.0 if sensor is None else sensor.frame_rate_hz
     return {
         "name": source.title or source.name,
-        "unit": source.unit,
         "sensor": _seen_by(sensor),
         "times_s": path.times_s[rows].tolist(),
         "frames": np.round(path.times_s[rows] * rate - 0.5).astype(int).tolist(),

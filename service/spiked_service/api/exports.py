@@ -8,7 +8,7 @@ from pathlib import Path
 from fastapi import Request, Response
 
 from spiked.errors import ConfigurationError, SpikedError
-from spiked.export import ExportKind, ExportOptions
+from spiked.export import ExportKind, ExportOptions, viewer_page
 from spiked_service.api import files
 from spiked_service.api.results import Result, Results
 from spiked_service.base.limits import OverloadedError
@@ -53,7 +53,14 @@ class Exports:
         result = self._results.of(row, version)
         result = result.metric() if metric else result
         title = row.name or self._captures.get(row.capture_id).row.name
-        known = (row.id, files.stamp(result.scene), kind.name, options, result.frame, title)
+        known = (
+            row.id,
+            files.stamp(result.scene),
+            kind.name,
+            options,
+            result.frame,
+            title if kind is viewer_page.KIND else "",
+        )
         number = result.published.version
         made = self._place / f"{row.id}-{number:06d}-{zlib.crc32(repr(known).encode()):08x}"
         if not made.exists():

@@ -20,6 +20,7 @@ from spiked_service.api.results import Result
 from spiked_service.api.schemas.views import MAX_PIXELS, PathModel, PointOut, ViewRequest
 from spiked_service.api.trajectories import Range
 from spiked_service.results.image_encoding import ImageFormat, encode
+from spiked_service.results.rate_statistics import NotInImageError
 from spiked_service.results.scene_scale import read_scale
 from spiked_service.results.view_renderer import Output, Pose, ViewRenderer, shown
 
@@ -71,13 +72,15 @@ def views_response(result: Result, request: ViewRequest, kind: ImageFormat, rend
 def point_at(result: Result, x: int, y: int, frame: int | None, renderer: ViewRenderer) -> PointOut:
     """What the scene has at pixel (x, y) of a frame, by default of the newest with a pose.
 
-    Raises as `views_response` does, and ConfigurationError for a pixel that the camera does not have.
+    Raises as `views_response` does, and NotInImageError.
     """
     seen = result.camera
+    if result.sensor is None:
+        raise NotReadyError("the camera of this capture is not known yet")
     if seen is None:
-        raise NotReadyError("the optics of this capture are not known yet")
+        raise ConfigurationError("the optics of this capture are not known, so no pixel has a ray")
     if x >= seen.width or y >= seen.height:
-        raise ConfigurationError(f"there is no pixel {x}, {y} in {seen.width}x{seen.height} pixels")
+        raise NotInImageError(f"there is no pixel {x}, {y} in {seen.width}x{seen.height} pixels")
     shown_frame = newest_frame(result) if frame is None else frame
     poses, rate = result.poses(), result.frame_rate_hz
     pose = _of_frame(poses, shown_frame, rate, result.published.poses > len(poses))

@@ -90,7 +90,10 @@ class NewCaptures:
         return LiveCapture(row, self._folder, self._catalogue, self._reconstructions, self._notifier, self._changed)
 
     def undo(self, capture: LiveCapture) -> None:
-        """Remove a capture that has not begun."""
-        self._catalogue.captures.remove(capture.id)
-        self._folder.remove(self._folder.capture(capture.id))
+        """Remove a capture that has not begun. A row that cannot be removed is logged."""
         self._disk_space.release(self._folder.recording(capture.id))
+        self._folder.remove(self._folder.capture(capture.id))
+        try:
+            self._catalogue.freeing(self._catalogue.captures.remove, capture.id)
+        except StoreError as error:
+            self._notifier.log("error", f"capture {capture.id}, which has not begun, is still listed: {error}")

@@ -83,12 +83,11 @@ def _reconcile(
         try:
             path = copy_of(row_id)
             before, copy = known.get(row_id), read_copy(path)
-            if before is None and copy is None:
-                path = outdated(path)
-                copy = read_copy(path)
             if copy is not None and before is not None and copy == before.encode():
                 continue
             row = None if copy is None else _parsed(table, row_id, copy, path, log)
+            if before is None and row is None and (copy := read_copy(outdated(path))) is not None:
+                row = _parsed(table, row_id, copy, outdated(path), log)
             if before is None and row is None:
                 orphans.append(row_id)
             elif before is None:

@@ -201,7 +201,11 @@ class Reconstructions:
             begun = self.rows.pin_maps(begun_anew(row, options or row.options))
             self.policy.reset_retries(row.id)
             self.rows.drop_checkpoint(row.id)
-            self.rows.requeue(begun)
+            try:
+                self.rows.requeue(begun)
+            except StoreError:
+                self.rows.unpin_maps(row)
+                raise
             self._wake.notify_all()
             return begun
 

@@ -106,9 +106,8 @@ class ReconstructionRepository:
     def save(self, row: ReconstructionRow) -> ReconstructionRow:
         """Save and publish a row. A row that cannot be saved is kept in memory and retried."""
         row = replace(self._named(row), queue_place=None, eta_s=None if row.state.over else row.eta_s)
-        if row.state.over:  # the maps that it used may go
-            for folder in self._folder.maps(row.id, len(row.maps)):
-                shutil.rmtree(folder, ignore_errors=True)
+        if row.state.over:
+            self.unpin_maps(row)
         with self._lock:
             self._set_running(row)
             try:
@@ -252,6 +251,11 @@ class ReconstructionRepository:
                 raise StoreError(f"the map cannot be linked into {folder}: {error.strerror}") from error
             found.append(MapRef(map_row.id, published.version))
         return replace(row, maps=tuple(found))
+
+    def unpin_maps(self, row: ReconstructionRow) -> None:
+        """Let the maps of a job go that has ended."""
+        for folder in self._folder.maps(row.id, len(row.maps)):
+            shutil.rmtree(folder, ignore_errors=True)
 
     def map_camera(self, reconstruction_id: str) -> Camera:
         """The camera that made a map. Raises UnknownIdError, and ConfigurationError for what is no map."""

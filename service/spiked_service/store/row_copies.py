@@ -10,8 +10,9 @@ _OUTDATED = ".outdated"
 class RowCopies:
     """What one transaction at a time does to the copies. Not safe for threads: the catalogue's lock is held.
 
-    A copy is replaced after the commit, so that a change that was not saved is in neither. One that cannot be written
-    is put aside as outdated, because a copy otherwise wins over a row that differs from it.
+    A copy is replaced after the commit, so that a change that was refused is in neither; a kill in between undoes a
+    change that was not answered yet. A copy that cannot be written is put aside as outdated, because a copy otherwise
+    wins over a row that differs from it.
     """
 
     def __init__(self) -> None:
@@ -38,21 +39,29 @@ class RowCopies:
                     _part(path).unlink(missing_ok=True)
 
     def place(self) -> None:
-        """Bring the copies up to date with what was committed. Raises OSError for one that cannot be removed."""
-        try:
-            for path, document in self._changes.items():
-                if document is None:
+        """Bring the copies up to date with what was committed.
+
+        Raises the first OSError of those that cannot be, when all others are.
+        """
+        errors = []
+        for path, document in self._changes.items():
+            try:
+                if document is not None:
+                    self._replace(path)
+                else:
                     path.unlink(missing_ok=True)
                     outdated(path).unlink(missing_ok=True)
-                else:
-                    self._replace(path)
-        finally:
-            self._forget()
+            except OSError as error:
+                errors.append(error)
+        self._forget()
+        if errors:
+            raise errors[0]
 
     def drop(self) -> None:
         """Leave the copies as they are: the transaction was rolled back."""
         for path in self._written:
-            _part(path).unlink(missing_ok=True)
+            with suppress(OSError):  # swept at the next start
+                _part(path).unlink(missing_ok=True)
         self._forget()
 
     def _replace(self, path: Path) -> None:

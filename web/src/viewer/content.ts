@@ -7,7 +7,6 @@ import type { Path } from "../features/scene/path";
 /** As `spiked.export.viewer_page` writes it. */
 interface Written {
   name: string;
-  unit: string;
   sensor: Sensor | null;
   times_s: number[];
   frames: number[];
@@ -17,7 +16,6 @@ interface Written {
 
 export interface Content {
   name: string;
-  unit: string;
   sensor: Sensor | null;
   path: Path;
   scene: Changes;
@@ -33,7 +31,6 @@ export async function readContent(): Promise<Content> {
   const written = JSON.parse(text("about")) as Written;
   return {
     name: written.name,
-    unit: written.unit,
     sensor: written.sensor,
     scene,
     path: {

@@ -58,8 +58,6 @@ function controls(viewer: Viewer, { name, scene, path, sensor }: Content): HTMLE
     moment.value = `${time}`;
     clock.textContent = `${(1000 * time).toFixed(1)} ms`;
   };
-  moment.addEventListener("input", () => place(moment.valueAsNumber));
-
   let playing = 0;
   const play = element("button", { type: "button", textContent: "Play" });
   const stop = (): void => {
@@ -67,6 +65,10 @@ function controls(viewer: Viewer, { name, scene, path, sensor }: Content): HTMLE
     playing = 0;
     play.textContent = "Play";
   };
+  moment.addEventListener("input", () => {
+    stop();
+    place(moment.valueAsNumber);
+  });
   play.addEventListener("click", () => {
     if (playing !== 0) {
       stop();
@@ -114,8 +116,9 @@ function controls(viewer: Viewer, { name, scene, path, sensor }: Content): HTMLE
   const title = element("h1", { textContent: name });
   const about = element("p", { textContent: `${count(scene.filled.length)} splats` });
   layers();
-  if (path.times.length === 0 || sensor === null) return [title, about, home];
+  if (path.times.length === 0) return [title, about, home];
   viewer.setPath(path, "state");
+  if (sensor === null) return [title, about, labelled("Path", drawn), home];
   place(first);
   return [title, about, play, moment, clock, labelled("Through the camera", riding), labelled("Path", drawn), home];
 }

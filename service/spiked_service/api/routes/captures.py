@@ -54,7 +54,7 @@ def capture_routes(captures: Captures, sources: Sources, route_class: type[APIRo
         """State, counters and recording of a capture."""
         return CaptureOut.of(captures.get(capture_id))
 
-    @router.patch("/{capture_id:id}", responses=problems(404))
+    @router.patch("/{capture_id:id}", responses=problems(404, 507))
     def change_capture(capture_id: str, body: CaptureChange) -> CaptureOut:
         """Change its name, notes, tags or metadata, or exclude it from retention."""
         tags = None if body.tags is None else tuple(dict.fromkeys(body.tags))

@@ -109,7 +109,7 @@ def _add_profile_routes(
         """What captures of the device take from its profile."""
         return _profile_out(profiles.file(_find(sources, device_id)))
 
-    @router.put("/{device_id:device}/profile", responses=problems(404, 409))
+    @router.put("/{device_id:device}/profile", responses=problems(404, 409, 507))
     def set_device_profile(device_id: DeviceId, body: ProfileModel) -> ProfileOut:
         """Replace the profile of the device; captures that run keep theirs. It is checked and survives a restart.
 
@@ -130,7 +130,7 @@ def _add_profile_routes(
         profiles.remove(_find(sources, device_id))
         tidy()
 
-    @router.post("/{device_id:device}/profile:calibrate", responses=problems(404, 409))
+    @router.post("/{device_id:device}/profile:calibrate", responses=problems(404, 409, 507))
     def calibrate_device(
         device_id: DeviceId, body: CalibrationRequest, idempotency_key: IdempotencyKey = None
     ) -> CalibratedOut:

@@ -86,7 +86,11 @@ def preview_routes(
         requested = image_format(format, accept)
         if kind is PictureKind.RENDER:
             result = results.of(results.newest(capture_id))
-            return views_response(result, _view_at(result, frame, white, gain, undistorted), requested, views)
+            view = _view_at(result, frame, white, gain, undistorted)
+            answer = views_response(result, view, requested, views)
+            if view.camera is not None:
+                answer.headers["X-Frame"] = str(view.camera.frame)
+            return answer
         if frame is None and captures.get(capture_id).row.state.acquiring:
             if undistorted:
                 raise ConfigurationError("the newest frames are shown as the lens images them; give a recorded frame")

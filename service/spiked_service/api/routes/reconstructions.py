@@ -93,7 +93,7 @@ def _add_end_routes(router: APIRouter, reconstructions: Reconstructions) -> None
         reconstructions.cancel(reconstruction_id)
         return ReconstructionOut.of(rows.get(reconstruction_id))
 
-    @router.post("/{reconstruction_id:id}:restart", status_code=HTTPStatus.ACCEPTED, responses=problems(404, 409))
+    @router.post("/{reconstruction_id:id}:restart", status_code=HTTPStatus.ACCEPTED, responses=problems(404, 409, 507))
     def restart_reconstruction(
         reconstruction_id: str, body: RestartRequest | None = None, idempotency_key: IdempotencyKey = None
     ) -> ReconstructionOut:

@@ -23,11 +23,13 @@ const KINDS: readonly { value: PreviewKind; label: string; hint: string }[] = [
   { value: "render", label: "Render", hint: "The reconstructed scene, seen from the newest tracked pose" },
 ];
 const STATS_MS = 1000;
+/** After this long the last moment of a drag counts. */
+const SETTLED_MS = 120;
 
 function useStats(capture: Capture | null, region: Region | null, moment: number | null): Stats | null {
   const [value, setValue] = useState<{ key: string; stats: Stats } | null>(null);
   const id = capture?.id ?? null;
-  const key = `${id ?? ""} ${moment ?? ""} ${JSON.stringify(region)}`;
+  const key = `${id ?? ""} ${JSON.stringify(region)}`;
   const over = capture === null || isFinished(capture);
   const begun = over || (capture.counters?.received ?? 0) > 0;
   useEffect(() => {
@@ -39,10 +41,11 @@ function useStats(capture: Capture | null, region: Region | null, moment: number
         () => undefined, // the picture says that there is nothing yet
       );
     };
-    ask();
+    const first = setTimeout(ask, moment === null ? 0 : SETTLED_MS);
     const timer = over ? undefined : setInterval(ask, STATS_MS);
     return () => {
       current = false;
+      clearTimeout(first);
       clearInterval(timer);
     };
   }, [id, over, begun, key, region, moment]);
@@ -97,7 +100,11 @@ export function PictureView({ capture }: { capture: Capture | null }): JSX.Eleme
           <NoPicture capture={capture} kind={kind} moment={moment} />
         ) : (
           <div className="stack">
-            <img ref={image} src={picture.url} alt={`Newest frames, ${kind}`} />
+            <img
+              ref={image}
+              src={picture.url}
+              alt={moment === null ? `Newest frames, ${kind}` : `Frame ${moment}, ${kind}`}
+            />
             {marked && sensor !== null && hot.length > 0 && (
               <svg
                 className="marks"
@@ -129,7 +136,7 @@ export function PictureView({ capture }: { capture: Capture | null }): JSX.Eleme
           region={region}
           stats={measured}
           over={isFinished(capture)}
-          moment={moment}
+          frame={moment ?? picture.frame}
           onRegion={setChosen}
         />
       )}

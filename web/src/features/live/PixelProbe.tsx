@@ -3,46 +3,61 @@
 import { type JSX, useEffect, useState } from "react";
 
 import { point as askPoint, spikes as askSpikes } from "../../shared/api/calls";
+import { ApiError } from "../../shared/api/http";
 import type { ScenePoint, Spikes } from "../../shared/api/types";
 import { count, percent } from "../../shared/state/format";
 import { intervals } from "./region";
 
-/** An answer about a pixel; null while it is asked for, "none" if there is none. */
-function useAnswer<T>(key: string, ask: () => Promise<T>): T | "none" | null {
-  const [got, setGot] = useState<{ key: string; answer: T | "none" } | null>(null);
+/** After this long the last moment of a drag counts. */
+const SETTLED_MS = 120;
+const RETRY_MS = 1500;
+/** Answers that say that there is nothing: a frame or a place that does not exist. */
+const NOTHING = [404, 422];
+
+/** The answer about a pixel, that of the moment before until the next has come; "none" if there is none, null before any. */
+function useAnswer<T>(pixel: string, frame: number | null, ask: (frame: number) => Promise<T>): T | "none" | null {
+  const [got, setGot] = useState<{ pixel: string; answer: T | "none" } | null>(null);
   useEffect(() => {
+    if (frame === null) return;
+    let timer: ReturnType<typeof setTimeout>;
     let current = true;
-    ask().then(
-      (answer) => current && setGot({ key, answer }),
-      () => current && setGot({ key, answer: "none" }), // it was not recorded, lost, or has no scene
-    );
+    const again = (): void => {
+      ask(frame).then(
+        (answer) => current && setGot({ pixel, answer }),
+        (error: unknown) => {
+          if (!current) return;
+          if (error instanceof ApiError && NOTHING.includes(error.status)) setGot({ pixel, answer: "none" });
+          else timer = setTimeout(again, RETRY_MS);
+        },
+      );
+    };
+    timer = setTimeout(again, SETTLED_MS);
     return () => {
       current = false;
+      clearTimeout(timer);
     };
-    // eslint-disable-next-line react-hooks/exhaustive-deps -- the key says what is asked
-  }, [key]);
-  return got?.key === key ? got.answer : null;
+    // eslint-disable-next-line react-hooks/exhaustive-deps -- pixel and frame say what is asked
+  }, [pixel, frame]);
+  return got?.pixel === pixel ? got.answer : null;
 }
 
 export function PixelProbe({
   capture,
   x,
   y,
-  moment,
+  frame,
   rateHz,
 }: {
   capture: string;
   x: number;
   y: number;
-  /** Frame to look at; null: the middle of the recording. */
-  moment: number | null;
+  /** The one that is shown; null before it is known. */
+  frame: number | null;
   rateHz: number;
 }): JSX.Element {
-  const key = `${capture} ${x} ${y} ${moment ?? ""}`;
-  const spikes = useAnswer(key, () => askSpikes(capture, x, y, moment));
-  const middle = spikes === null || spikes === "none" ? null : spikes.first_frame + Math.floor(spikes.frames / 2);
-  const frame = moment ?? middle;
-  const point = useAnswer(`${key} ${frame ?? ""}`, () => askPoint(capture, x, y, frame));
+  const pixel = `${capture} ${x} ${y}`;
+  const spikes = useAnswer(pixel, frame, (at) => askSpikes(capture, x, y, at));
+  const point = useAnswer(pixel, frame, (at) => askPoint(capture, x, y, at));
   return (
     <>
       {spikes === "none" && <p className="dim">Its spikes at this moment are not recorded.</p>}

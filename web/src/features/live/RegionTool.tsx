@@ -62,7 +62,7 @@ export function RegionPanel({
   region,
   stats,
   over,
-  moment,
+  frame,
   onRegion,
 }: {
   capture: string;
@@ -70,7 +70,8 @@ export function RegionPanel({
   region: Region | null;
   stats: Stats | null;
   over: boolean;
-  moment: number | null;
+  /** That is shown. */
+  frame: number | null;
   onRegion: (region: Region | null) => void;
 }): JSX.Element {
   if (region === null)
@@ -125,7 +126,7 @@ export function RegionPanel({
       )}
       {isPixel(region) &&
         (over ? (
-          <PixelProbe capture={capture} x={region.x} y={region.y} moment={moment} rateHz={sensor.frame_rate_hz} />
+          <PixelProbe capture={capture} x={region.x} y={region.y} frame={frame} rateHz={sensor.frame_rate_hz} />
         ) : (
           <p className="dim">Its spikes over time and its depth are shown when the capture has ended.</p>
         ))}

@@ -16,6 +16,8 @@ export interface Picture {
 
 const PERIOD_MS = 300;
 const PATIENT_MS = 1500;
+/** Answers that say that there is no picture: others are asked again. */
+const NOTHING = [404, 422];
 
 /** Kinds sent over the WebSocket; others are rendered on request. */
 const PUSHED: readonly PreviewKind[] = ["interval", "rate"];
@@ -58,7 +60,7 @@ export function usePicture(
           if (url !== null) URL.revokeObjectURL(url);
           url = next;
         } else {
-          if (over) setAnswered({ key, over, picture: null });
+          if (over && NOTHING.includes(response.status)) setAnswered({ key, over, picture: null });
           wait = PATIENT_MS;
         }
       } catch {

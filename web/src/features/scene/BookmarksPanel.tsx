@@ -3,6 +3,7 @@
 import { type JSX, useState } from "react";
 
 import { address } from "../../shared/api/calls";
+import type { Reconstruction } from "../../shared/api/types";
 import { count } from "../../shared/state/format";
 import { toast } from "../../shared/state/toasts";
 import { Icon } from "../../shared/ui/icons";
@@ -14,20 +15,25 @@ const BETWEEN_S = 3;
 /** Longest video that the service makes. */
 const MOST_S = 120;
 
-function videoThrough(jobId: string, bookmarks: readonly Bookmark[]): string {
-  const poses = bookmarks.map((one) => poseOfView(one.camera));
+/** Nothing without two bookmarks of this reconstruction: another one has a unit of length of its own. */
+function videoThrough(jobId: string, version: number | null, bookmarks: readonly Bookmark[]): string | null {
+  const poses = bookmarks.filter((one) => one.reconstruction === jobId).map((one) => poseOfView(one.camera));
+  if (poses.length < 2) return null;
   const through = poses.map(({ position, quaternion_wxyz }) => [...position, ...quaternion_wxyz]);
-  return address.video(jobId, through, Math.min(BETWEEN_S * (bookmarks.length - 1), MOST_S));
+  return address.video(jobId, version, through, Math.min(BETWEEN_S * (poses.length - 1), MOST_S));
 }
 
 export function BookmarksPanel({
   captureId,
-  jobId,
+  job,
+  version,
   currentView,
   onView,
 }: {
   captureId: string;
-  jobId: string;
+  job: Reconstruction;
+  /** The one that is shown; null: the newest. */
+  version: number | null;
   currentView: () => { camera: number[]; frame: number | null };
   onView: (camera: number[], frame: number | null) => void;
 }): JSX.Element {
@@ -40,6 +46,7 @@ export function BookmarksPanel({
       toast("This browser does not allow the page to store bookmarks.", { tone: "problem" });
     }
   };
+  const video = videoThrough(job.id, version, bookmarks);
   return (
     <section className="bookmarks" aria-label="Bookmarks">
       <div className="row">
@@ -50,7 +57,7 @@ export function BookmarksPanel({
             const names = new Set(bookmarks.map((one) => one.name));
             let number = bookmarks.length + 1;
             while (names.has(`View ${number}`)) number += 1;
-            keep([...bookmarks, { name: `View ${number}`, ...currentView() }]);
+            keep([...bookmarks, { name: `View ${number}`, reconstruction: job.id, ...currentView() }]);
           }}
         >
           <Icon name="bookmark" /> Add
@@ -76,15 +83,16 @@ export function BookmarksPanel({
           ))}
         </ul>
       )}
-      {bookmarks.length > 1 && (
-        <a
-          className="button"
-          href={videoThrough(jobId, bookmarks)}
-          download
-          title={`MP4, made on the server: ${BETWEEN_S} s from each to the next, through the optics of the camera`}
-        >
-          <Icon name="download" /> Video through them
-        </a>
+      {video !== null && (
+        <>
+          <a className="button" href={video} download>
+            <Icon name="download" /> Video through them
+          </a>
+          <p className="dim hint">
+            {BETWEEN_S} s from each to the next, with the optics of the camera. The server makes it when you ask, which
+            takes about as long as the video.
+          </p>
+        </>
       )}
     </section>
   );

@@ -18,6 +18,10 @@ export interface CleanProps {
   job: Reconstruction;
   /** Whether the newest version is shown: only that one is edited. */
   newest: boolean;
+  /** Whether the scene alone is seen, by the free camera. */
+  free: boolean;
+  /** Whether all splats are shown. */
+  whole: boolean;
 }
 
 export function CleanPanel(props: CleanProps): JSX.Element {
@@ -30,7 +34,7 @@ export function CleanPanel(props: CleanProps): JSX.Element {
   );
 }
 
-function Cleaning({ viewer, job, newest }: CleanProps & { viewer: Viewer }): JSX.Element {
+function Cleaning({ viewer, job, newest, free, whole }: CleanProps & { viewer: Viewer }): JSX.Element {
   const [shares, setShares] = useState(NO_CUT);
   const [busy, setBusy] = useState(false);
   const [undo, setUndo] = useState<{ after: number; to: number } | null>(null);
@@ -42,15 +46,19 @@ function Cleaning({ viewer, job, newest }: CleanProps & { viewer: Viewer }): JSX
     return () => viewer.showBox(null);
   }, [viewer, cropped, box]);
 
-  const edit = async (begin: () => ReturnType<typeof calls.clean>, say: (found: Edited) => string): Promise<void> => {
+  const edit = async (
+    begin: () => ReturnType<typeof calls.clean>,
+    say: (found: Edited) => string,
+  ): Promise<boolean> => {
     setBusy(true);
-    await attempt(async () => {
+    const done = await attempt(async () => {
       const found = await begin();
       setUndo({ after: found.version, to: job.version });
       setShares(NO_CUT);
       toast(say(found));
     });
     setBusy(false);
+    return done;
   };
   const ready = isEnded(job) && newest && !busy;
   return (
@@ -110,6 +118,8 @@ function Cleaning({ viewer, job, newest }: CleanProps & { viewer: Viewer }): JSX
       <LassoTool
         viewer={viewer}
         ready={ready}
+        free={free}
+        whole={whole}
         onRemove={(outline) =>
           edit(
             () => calls.clean(job.id, { version: job.version, floaters: false, shrink: false, box: null, outline }),

@@ -144,11 +144,18 @@ export function Inspector(props: InspectorProps): JSX.Element {
       <Legend colouring={props.colouring} />
       <Loops closures={props.closures} onTime={props.onTime} />
       <MeasurePanel viewer={props.viewer} jobId={job.id} />
-      <CleanPanel viewer={props.viewer} job={job} newest={pinned === null} />
+      <CleanPanel
+        viewer={props.viewer}
+        job={job}
+        newest={pinned === null}
+        free={!props.ride && props.comparison === null}
+        whole={shown?.whole ?? false}
+      />
       <BookmarksPanel
         key={capture.id}
         captureId={capture.id}
-        jobId={job.id}
+        job={job}
+        version={pinned?.version ?? null}
         currentView={props.currentView}
         onView={props.onView}
       />

@@ -11,13 +11,21 @@ import type { Viewer } from "./Viewer";
 export function LassoTool({
   viewer,
   ready,
+  free,
+  whole,
   onRemove,
 }: {
   viewer: Viewer;
   ready: boolean;
-  onRemove: (outline: Outline) => Promise<void>;
+  /** Whether the scene alone is seen, by the free camera. */
+  free: boolean;
+  /** Whether all splats are shown, so that those inside can be counted. */
+  whole: boolean;
+  /** Whether it was done. */
+  onRemove: (outline: Outline) => Promise<boolean>;
 }): JSX.Element {
-  const [armed, setArmed] = useState(false);
+  const [drawing, setArmed] = useState(false);
+  const armed = drawing && free;
   const [line, setLine] = useState<readonly Point[]>([]);
   const [found, setFound] = useState<{ outline: Outline; splats: number } | null>(null);
   const forget = (): void => {
@@ -39,18 +47,28 @@ export function LassoTool({
     setLine(outline === null ? [] : corners);
     setFound(outline);
   };
+  const remove = (): void => {
+    if (found === null) return;
+    const now = viewer.outline(line); // the view may have moved below the line since it was drawn
+    if (now === null) forget();
+    else if (now.splats === found.splats) void onRemove(now.outline).then((done) => done && forget());
+    else setFound(now);
+  };
   const overlay = armed && (
     <svg
       className="lasso"
       role="img"
       aria-label="Draw around what is to be removed"
       onPointerDown={(event) => {
+        if (event.button !== 0 || !event.isPrimary) return;
         event.currentTarget.setPointerCapture(event.pointerId);
         setFound(null);
         setLine([placeOf(event)]);
       }}
       onPointerMove={(event) => {
-        if (event.currentTarget.hasPointerCapture(event.pointerId)) setLine([...line, placeOf(event)]);
+        if (!event.currentTarget.hasPointerCapture(event.pointerId)) return;
+        const place = placeOf(event);
+        setLine((before) => [...before, place]);
       }}
       onPointerUp={close}
       onPointerCancel={forget}
@@ -62,7 +80,8 @@ export function LassoTool({
     <fieldset className="crop">
       <legend>Lasso</legend>
       <ActionButton
-        disabled={!ready && !armed}
+        disabled={(!ready || !free) && !armed}
+        title={free ? undefined : "Leave the comparison or the ride along first"}
         aria-pressed={armed}
         onClick={() => {
           forget();
@@ -73,13 +92,12 @@ export function LassoTool({
       </ActionButton>
       {armed && found === null && <p className="dim hint">Draw a line around them in the scene; Escape ends it.</p>}
       {armed && found !== null && (
-        <ActionButton
-          disabled={!ready || found.splats === 0}
-          onClick={() => {
-            void onRemove(found.outline).then(forget);
-          }}
-        >
-          {found.splats === 0 ? "No splats inside" : `Remove ${count(found.splats)} splats`}
+        <ActionButton disabled={!ready || (whole && found.splats === 0)} onClick={remove}>
+          {!whole
+            ? "Remove the splats inside"
+            : found.splats === 0
+              ? "No splats inside"
+              : `Remove ${count(found.splats)} splats`}
         </ActionButton>
       )}
       {stage !== null && createPortal(overlay, stage)}

@@ -170,7 +170,8 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
     if (viewer === null) return;
     const link = document.createElement("a");
     link.href = URL.createObjectURL(await viewer.picture(size));
-    const sized = size === null ? "" : `-${size.width}x${size.height}`;
+    const saved = size === null ? null : viewer.sizeOf(size);
+    const sized = saved === null ? "" : `-${saved.width}x${saved.height}`;
     link.download = `spiked-${capture.id}-v${viewer.version}${sized}.png`;
     link.click();
     URL.revokeObjectURL(link.href);

@@ -9,7 +9,10 @@ export interface Size {
   height: number;
 }
 
+/** Sides of a picture, pixels. */
+const LEAST = 16;
 const LARGEST = 8192;
+const isSide = (value: number): boolean => Number.isInteger(value) && value >= LEAST && value <= LARGEST;
 const SIZES: readonly Size[] = [
   { width: 1920, height: 1080 },
   { width: 3840, height: 2160 },
@@ -18,12 +21,14 @@ const nameOf = ({ width, height }: Size): string => `${width} × ${height}`;
 
 export function ScreenshotTool({ onScreenshot }: { onScreenshot: (size: Size | null) => void }): JSX.Element {
   const [chosen, setChosen] = useState("shown");
-  const [own, setOwn] = useState<Size>({ width: 2400, height: 1600 });
-  const size = chosen === "shown" ? null : (SIZES.find((one) => nameOf(one) === chosen) ?? own);
+  const [own, setOwn] = useState({ width: "2400", height: "1600" });
+  const typed = { width: Number(own.width), height: Number(own.height) };
+  const size = chosen === "shown" ? null : (SIZES.find((one) => nameOf(one) === chosen) ?? typed);
+  const possible = size === null || (isSide(size.width) && isSide(size.height));
   return (
     <section aria-label="Screenshot">
       <div className="row">
-        <button type="button" onClick={() => onScreenshot(size)}>
+        <button type="button" disabled={!possible} onClick={() => onScreenshot(size)}>
           <Icon name="camera" /> Screenshot
         </button>
         <select aria-label="Size of the screenshot" value={chosen} onChange={(event) => setChosen(event.target.value)}>
@@ -43,13 +48,10 @@ export function ScreenshotTool({ onScreenshot }: { onScreenshot: (size: Size | n
               {side === "width" ? "Width" : "Height"}{" "}
               <input
                 type="number"
-                min={16}
+                min={LEAST}
                 max={LARGEST}
                 value={own[side]}
-                onChange={(event) => {
-                  const typed = Math.round(event.target.valueAsNumber);
-                  if (typed > 0) setOwn({ ...own, [side]: Math.min(typed, LARGEST) });
-                }}
+                onChange={(event) => setOwn({ ...own, [side]: event.target.value })}
               />
             </label>
           ))}

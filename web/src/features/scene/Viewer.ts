@@ -36,6 +36,7 @@ import { MarkLines } from "./MarkLines";
 import { OVERLAY_ORDER, PathLines } from "./PathLines";
 import { distanceAlong } from "./picker";
 import { type Preset, presetDirection } from "./presets";
+import type { Size } from "./ScreenshotTool";
 import { show as showMode, type ViewMode } from "./viewModes";
 
 export type Steering = "orbit" | "fly";
@@ -615,35 +616,40 @@ export class Viewer {
     this.draw();
   }
 
-  /** The canvas as a PNG file, or the same view in another size. While riding along the height follows from the width. */
-  picture(size: { width: number; height: number } | null = null): Promise<Blob> {
+  /** The canvas as a PNG file, or the same view in another size, see `sizeOf`. Throws for one that cannot be drawn. */
+  picture(size: Size | null = null): Promise<Blob> {
+    if (size === null) return this.drawn(this.canvas.clientHeight);
+    const { width, height } = this.sizeOf(size);
+    const { maxPixelRadius } = this.spark;
+    try {
+      this.spark.maxPixelRadius = (maxPixelRadius * height) / Math.max(this.canvas.height, 1);
+      this.renderer.setPixelRatio(1);
+      this.renderer.setSize(width, height, false);
+      this.camera.aspect = width / height;
+      this.camera.updateProjectionMatrix();
+      const { drawingBufferWidth, drawingBufferHeight } = this.renderer.getContext();
+      if (drawingBufferWidth !== width || drawingBufferHeight !== height)
+        throw new Error(`This browser draws no picture of ${width} × ${height}: choose a smaller one.`);
+      return this.drawn(height);
+    } finally {
+      this.spark.maxPixelRadius = maxPixelRadius;
+      this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
+      this.resize();
+    }
+  }
+
+  private drawn(height: number): Promise<Blob> {
     const camera = this.riding ? this.rider : this.camera;
-    if (size !== null) this.takeSize(size);
-    this.path.dashFor(camera, size?.height ?? this.canvas.clientHeight);
+    this.path.dashFor(camera, height);
     this.renderer.render(this.world, camera);
-    const { drawingBufferWidth, drawingBufferHeight } = this.renderer.getContext();
-    const taken = new Promise<Blob>((resolve, reject) => {
+    return new Promise((resolve, reject) => {
       this.canvas.toBlob((blob) => (blob === null ? reject(new Error("The canvas gave no picture.")) : resolve(blob)));
     });
-    if (size === null) return taken;
-    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
-    this.resize();
-    const { width, height } = this.sizeOf(size);
-    if (drawingBufferWidth !== width || drawingBufferHeight !== height)
-      throw new Error(`This browser draws no picture of ${width} × ${height}: choose a smaller one.`);
-    return taken;
   }
 
-  private sizeOf({ width, height }: { width: number; height: number }): { width: number; height: number } {
+  /** The size of a picture: while riding along, its height follows from the width. */
+  sizeOf({ width, height }: Size): Size {
     const shape = this.riding && this.sensor !== null ? this.sensor.height / this.sensor.width : height / width;
     return { width, height: Math.round(width * shape) };
-  }
-
-  private takeSize(size: { width: number; height: number }): void {
-    const { width, height } = this.sizeOf(size);
-    this.renderer.setPixelRatio(1);
-    this.renderer.setSize(width, height, false);
-    this.camera.aspect = width / height;
-    this.camera.updateProjectionMatrix();
   }
 }

@@ -5,6 +5,8 @@ export interface Bookmark {
   /** As `Viewer.view` gives it. */
   camera: number[];
   frame: number | null;
+  /** Whose scene it is a view of; unknown of those of an earlier release. */
+  reconstruction?: string;
 }
 
 const MOST = 50;

@@ -5,8 +5,10 @@ import { MathUtils, type PerspectiveCamera, Quaternion } from "three";
 import { poseOf, type ServicePose } from "./axes";
 import type { Slots } from "./changes";
 
-/** Corners nearer to the one before than this many pixels are left out. */
+/** Corners nearer to the one before than this many pixels are left out, or a multiple of it for a long line. */
 const APART_PX = 4;
+/** Corners that the service takes. */
+const MOST_CORNERS = 1000;
 
 /** As `:clean` takes it: slopes and the view in OpenCV axes. */
 export interface Outline {
@@ -16,14 +18,14 @@ export interface Outline {
 
 export type Point = readonly [number, number];
 
-/** The same line with corners further apart. */
-export function thinnedLine(points: readonly Point[]): Point[] {
+/** The same line with corners further apart, and no more than the service takes. */
+export function thinnedLine(points: readonly Point[], apart = APART_PX): Point[] {
   const kept: Point[] = [];
   for (const point of points) {
     const before = kept.at(-1);
-    if (before === undefined || Math.hypot(point[0] - before[0], point[1] - before[1]) >= APART_PX) kept.push(point);
+    if (before === undefined || Math.hypot(point[0] - before[0], point[1] - before[1]) >= apart) kept.push(point);
   }
-  return kept;
+  return kept.length <= MOST_CORNERS ? kept : thinnedLine(points, 2 * apart);
 }
 
 /** The outline of points in pixels of a canvas of this size, seen by a camera of three.js. */

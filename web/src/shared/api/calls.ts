@@ -276,8 +276,9 @@ export const address = {
   exported: (id: string, format: string, metric: boolean): string =>
     `${API}/reconstructions/${id}/exports/${format}${query(metric ? { metric } : {})}`,
   /** An MP4 through poses: x, y, z, qw, qx, qy, qz of each. */
-  video: (id: string, through: readonly (readonly number[])[], seconds: number): string =>
+  video: (id: string, version: number | null, through: readonly (readonly number[])[], seconds: number): string =>
     `${API}/reconstructions/${id}/exports/video${query({
+      version,
       seconds,
       through: through.map((pose) => pose.map((value) => value.toFixed(6)).join(",")).join(";"),
     })}`,

@@ -5149,6 +5149,15 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
         };
     };
     remove_device_profile_api_v1_devices__device_id__profile_delete: {
@@ -5346,6 +5355,15 @@ export interface operations {
             };
             /** @description The service is overloaded, or stops. */
             503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -6052,6 +6070,15 @@ export interface operations {
             };
             /** @description The service is overloaded, or stops. */
             503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
                 headers: {
                     [name: string]: unknown;
                 };
@@ -8777,6 +8804,15 @@ export interface operations {
             };
             /** @description The service is overloaded, or stops. */
             503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
                 headers: {
                     [name: string]: unknown;
                 };

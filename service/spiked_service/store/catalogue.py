@@ -74,7 +74,8 @@ class Catalogue:
     """Rows by id. Every method may be called from any thread, raises StoreError, and is one short transaction.
 
     A row is kept as one JSON document; columns made from it serve the queries. In a data folder a copy of the document
-    lies beside the files that it is about: as new as what was answered, so it replaces a row that was lost.
+    lies beside the files that it is about: as new as what was answered, so it replaces a row that was lost; see
+    docs/decisions/0054-copies-after-the-commit.md.
     `synchronous = NORMAL`: a kill loses nothing, a power cut at most the last moments, and what lies on disk then is
     put right when the service starts.
     """

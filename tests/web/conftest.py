@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 from spiked_service.api.routes.page import PAGE
@@ -60,7 +61,8 @@ Visit = Callable[..., Any]
 def visit(browser: Any) -> Iterator[Visit]:
     """Opens addresses in pages of their own: `visit(address, theme="dark", viewport=PHONE)`.
 
-    A page that throws, or that breaks its content security policy, fails the test. Requests may fail: services go away.
+    A page that throws, breaks its content security policy or asks another machine for anything fails the test. Requests
+    may fail: services go away.
     """
     opened: list[Any] = []
     faults: list[str] = []
@@ -74,6 +76,11 @@ def visit(browser: Any) -> Iterator[Visit]:
         ):
             faults.append(message.text)
 
+    def on_request(request: Any) -> None:
+        asked = urlsplit(request.url)
+        if asked.scheme in ("http", "https", "ws", "wss") and asked.hostname not in ("127.0.0.1", "localhost"):
+            faults.append(f"a request leaves the machine: {request.url}")
+
     def go(address: str, *, theme: str = "dark", viewport: dict[str, int] = DESKTOP, touch: bool = False) -> Any:
         context = browser.new_context(viewport=viewport, color_scheme=theme, has_touch=touch, accept_downloads=True)
         opened.append(context)
@@ -81,6 +88,8 @@ def visit(browser: Any) -> Iterator[Visit]:
         page.set_default_timeout(1000 * PATIENCE_S)
         page.on("pageerror", lambda error: faults.append(str(error)))
         page.on("console", on_console)
+        page.on("request", on_request)
+        page.on("websocket", on_request)
         page.goto(address)
         return page
 

@@ -1,7 +1,7 @@
 """Two scenes beside each other, with one camera."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,8 @@ SECOND = ".second canvas"
 
 
 @pytest.fixture(scope="module")
-def other_id(studied: Studied) -> str:
-    """Another reconstruction of the studied capture, with half the steps."""
+def other_id(studied: Studied) -> Iterator[str]:
+    """Another reconstruction of the studied capture, with half the steps; gone for the tests of other files."""
     plan = {"capture_id": studied.capture_id, "options": {"steps": STEPS // 2}}
     other: str = studied.http.post("reconstructions", json=plan).json()["id"]
 
@@ -41,7 +41,8 @@ def other_id(studied: Studied) -> str:
         return bool(state["state"] == "complete")
 
     until(ended, "another reconstruction", 300)
-    return other
+    yield other
+    assert studied.http.delete(f"reconstructions/{other}").status_code == 204
 
 
 @pytest.fixture

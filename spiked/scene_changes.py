@@ -28,7 +28,9 @@ MOST_SLOTS = 50_000_000
 """More is no scene but a damaged header."""
 _LARGEST_HALF = 60_000.0
 """Values are stored up to this: near the largest of 16-bit floats."""
-_FINEST = 2
+LEVEL_SHARES = (1 / 16, 1 / 4, 1)
+"""Shares of the splats at each level of detail."""
+FINEST = len(LEVEL_SHARES) - 1
 """Level of detail with all splats."""
 _KINDS = ("<u4", "<f4", "<f2", "<f2", "i1", "u1")
 """Types of the columns."""
@@ -120,7 +122,7 @@ class SceneChanges:
 def whole_scene(scene: Scene, white: float, version: int) -> SceneChanges:
     """All splats of a scene, in slots of their own, at the finest level of detail; radiance `white` is colour 1."""
     slots = np.arange(len(scene), dtype=np.uint32)
-    return SceneChanges(True, 0, version, _FINEST, len(scene), slots[:0], slots, *travelling(scene, white))
+    return SceneChanges(True, 0, version, FINEST, len(scene), slots[:0], slots, *travelling(scene, white))
 
 
 def travelling(scene: Scene, white: float) -> tuple[NDArray[Any], ...]:

@@ -36,6 +36,8 @@ class ExportKind:
     extra: str = "export"
     """That installs them: `pip install 'spiked[EXTRA]'`."""
     media_type: str = "application/octet-stream"
+    titled: bool = False
+    """Whether the title of the source is in it."""
     replaces: tuple[str, ...] = ()
     """Patterns of the files of an earlier folder that a new one replaces; the folder may then hold no others."""
 

@@ -103,4 +103,5 @@ KIND = ExportKind(
     suffix=".html",
     fill=_fill,
     media_type="text/html",
+    titled=True,
 )

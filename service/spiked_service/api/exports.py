@@ -8,14 +8,14 @@ from pathlib import Path
 from fastapi import Request, Response
 
 from spiked.errors import ConfigurationError, SpikedError
-from spiked.export import ExportKind, ExportOptions, viewer_page
+from spiked.export import ExportKind, ExportOptions
 from spiked_service.api import files
 from spiked_service.api.results import Result, Results
 from spiked_service.base.limits import OverloadedError
 from spiked_service.captures.captures import Captures
 from spiked_service.store.disk_space import DiskFullError
 from spiked_service.store.folder import DataFolder
-from spiked_service.store.rows import ReconstructionRow
+from spiked_service.store.rows import CaptureRow, ReconstructionRow
 from spiked_service.workers.messages import ExportCommand, WorkerError, WorkerEvent
 from spiked_service.workers.process import WorkerProcess
 
@@ -52,26 +52,26 @@ class Exports:
         kind.check()
         result = self._results.of(row, version)
         result = result.metric() if metric else result
-        title = row.name or self._captures.get(row.capture_id).row.name
-        known = (
-            row.id,
-            files.stamp(result.scene),
-            kind.name,
-            options,
-            result.frame,
-            title if kind is viewer_page.KIND else "",
-        )
+        capture = self._captures.get(row.capture_id).row
+        title = row.name or capture.name
+        known = (row.id, files.stamp(result.scene), kind.name, options, result.frame, title if kind.titled else "")
         number = result.published.version
         made = self._place / f"{row.id}-{number:06d}-{zlib.crc32(repr(known).encode()):08x}"
         if not made.exists():
-            self._make(self._command(row, title, result, kind, options, made))
+            self._make(self._command(row, capture, title, result, kind, options, made))
         name = f"{row.id}-{number:06d}-{kind.name}{kind.suffix or '.zip'}"
         return files.ranged(request, made, name, kind.sent_as, **{"X-Scene-Version": str(number)})
 
     def _command(
-        self, row: ReconstructionRow, title: str, result: Result, kind: ExportKind, options: ExportOptions, out: Path
+        self,
+        row: ReconstructionRow,
+        capture: CaptureRow,
+        title: str,
+        result: Result,
+        kind: ExportKind,
+        options: ExportOptions,
+        out: Path,
     ) -> ExportCommand:
-        capture = self._captures.get(row.capture_id).row
         closed = capture.recording is not None and not capture.state.acquiring
         return ExportCommand(
             capture_id=row.capture_id,

@@ -14,15 +14,11 @@ from scipy.spatial import cKDTree
 
 from spiked.errors import SceneError
 from spiked.scene import Scene
-from spiked.scene_changes import SceneChanges, travelling
+from spiked.scene_changes import FINEST, LEVEL_SHARES, SceneChanges, travelling
 
 TOLERANCE = 0.03
 """Difference of a splat, as a share of white at its centre, that is not sent; 0 sends every difference. Of 0.01, 0.03
 and 0.06, the largest with which the shown scene stays within 45 dB of the true one (decision 20)."""
-LEVEL_SHARES = (1 / 16, 1 / 4, 1)
-"""Shares of the splats at each level of detail."""
-FINEST = len(LEVEL_SHARES) - 1
-"""Level of detail with all splats."""
 _DARKEST = 0.3
 """Brightness, share of white, that moving or hiding splats count with at least: dark ones hide bright ones."""
 _SAMPLED = 16

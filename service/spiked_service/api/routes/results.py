@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.routing import APIRoute
 
+from spiked.scene_changes import FINEST
 from spiked_service.api.auth.scopes import needs
 from spiked_service.api.problems import problems
 from spiked_service.api.results import Results, SceneFormat
@@ -28,7 +29,6 @@ from spiked_service.api.schemas.views import PointOut, ViewRequest
 from spiked_service.api.trajectories import Range, TrajectoryFormat
 from spiked_service.api.views import image_format, point_at, views_response
 from spiked_service.reconstructions.repository import ReconstructionRepository
-from spiked_service.results.shown_scene import FINEST
 from spiked_service.results.view_renderer import ViewRenderer
 from spiked_service.settings.tokens import Scope
 from spiked_service.store.rows import ReconstructionRow
@@ -194,8 +194,7 @@ def _result_routes(
     """Add the routes to `router`; `find` takes the id in its path and returns the reconstruction."""
     _add_trajectory_route(router, find, results, operations.trajectory)
     _add_scene_routes(router, find, results, operations.scene, operations.changes)
-    _add_view_route(router, find, results, views, operations.render)
-    _add_point_route(router, find, results, views, operations.point)
+    _add_view_routes(router, find, results, views, operations.render, operations.point)
     return router
 
 
@@ -268,17 +267,18 @@ def _add_scene_routes(
         return results.scenes.changes(request, results.of(row, version), since, level)
 
 
-def _add_view_route(
+def _add_view_routes(
     router: APIRouter,
     find: Callable[..., ReconstructionRow],
     results: Results,
     views: ViewRenderer,
-    operation: _Operation,
+    render: _Operation,
+    point: _Operation,
 ) -> None:
     @router.post(
         "/views",
-        name=operation.name,
-        description=operation.description,
+        name=render.name,
+        description=render.description,
         responses=_VIEWS,
         response_class=Response,
         openapi_extra=needs(Scope.READ),
@@ -292,15 +292,7 @@ def _add_view_route(
     ) -> Response:
         return views_response(results.of(row, version), body, image_format(format, accept), views)
 
-
-def _add_point_route(
-    router: APIRouter,
-    find: Callable[..., ReconstructionRow],
-    results: Results,
-    views: ViewRenderer,
-    operation: _Operation,
-) -> None:
-    @router.get("/point", name=operation.name, description=operation.description, responses=problems(404))
+    @router.get("/point", name=point.name, description=point.description, responses=problems(404))
     def get_point(
         row: Annotated[ReconstructionRow, Depends(find)],
         x: Column,

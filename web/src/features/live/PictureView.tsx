@@ -8,6 +8,7 @@ import { count } from "../../shared/state/format";
 import { isFinished } from "../../shared/state/store";
 import { Icon } from "../../shared/ui/icons";
 import { Empty, Segmented } from "../../shared/ui/parts";
+import { SETTLED_MS } from "./asking";
 import { Histogram } from "./Histogram";
 import { RegionOverlay, RegionPanel } from "./RegionTool";
 import { type Region, same, within } from "./region";
@@ -23,8 +24,6 @@ const KINDS: readonly { value: PreviewKind; label: string; hint: string }[] = [
   { value: "render", label: "Render", hint: "The reconstructed scene, seen from the newest tracked pose" },
 ];
 const STATS_MS = 1000;
-/** After this long the last moment of a drag counts. */
-const SETTLED_MS = 120;
 
 function useStats(capture: Capture | null, region: Region | null, moment: number | null): Stats | null {
   const [value, setValue] = useState<{ key: string; stats: Stats } | null>(null);

@@ -6,13 +6,8 @@ import { point as askPoint, spikes as askSpikes } from "../../shared/api/calls";
 import { ApiError } from "../../shared/api/http";
 import type { ScenePoint, Spikes } from "../../shared/api/types";
 import { count, percent } from "../../shared/state/format";
+import { isNothing, PATIENT_MS, SETTLED_MS } from "./asking";
 import { intervals } from "./region";
-
-/** After this long the last moment of a drag counts. */
-const SETTLED_MS = 120;
-const RETRY_MS = 1500;
-/** Answers that say that there is nothing: a frame or a place that does not exist. */
-const NOTHING = [404, 422];
 
 /** The answer about a pixel, that of the moment before until the next has come; "none" if there is none, null before any. */
 function useAnswer<T>(pixel: string, frame: number | null, ask: (frame: number) => Promise<T>): T | "none" | null {
@@ -26,8 +21,8 @@ function useAnswer<T>(pixel: string, frame: number | null, ask: (frame: number) 
         (answer) => current && setGot({ pixel, answer }),
         (error: unknown) => {
           if (!current) return;
-          if (error instanceof ApiError && NOTHING.includes(error.status)) setGot({ pixel, answer: "none" });
-          else timer = setTimeout(again, RETRY_MS);
+          if (error instanceof ApiError && isNothing(error.status)) setGot({ pixel, answer: "none" });
+          else timer = setTimeout(again, PATIENT_MS);
         },
       );
     };

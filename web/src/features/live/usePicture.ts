@@ -6,6 +6,7 @@ import { address } from "../../shared/api/calls";
 import { reach } from "../../shared/api/http";
 import type { Capture, PreviewKind } from "../../shared/api/types";
 import { isFinished, useService } from "../../shared/state/store";
+import { isNothing, PATIENT_MS } from "./asking";
 
 export interface Picture {
   url: string;
@@ -15,9 +16,6 @@ export interface Picture {
 }
 
 const PERIOD_MS = 300;
-const PATIENT_MS = 1500;
-/** Answers that say that there is no picture: others are asked again. */
-const NOTHING = [404, 422];
 
 /** Kinds sent over the WebSocket; others are rendered on request. */
 const PUSHED: readonly PreviewKind[] = ["interval", "rate"];
@@ -60,7 +58,7 @@ export function usePicture(
           if (url !== null) URL.revokeObjectURL(url);
           url = next;
         } else {
-          if (over && NOTHING.includes(response.status)) setAnswered({ key, over, picture: null });
+          if (over && isNothing(response.status)) setAnswered({ key, over, picture: null });
           wait = PATIENT_MS;
         }
       } catch {

@@ -18,12 +18,12 @@ import { MAX_WIDTH_PX, type LineStyle, SPEED_STYLES, STATE_STYLES, STATES } from
 import type { Closures } from "./useClosures";
 import type { Comparison } from "./useComparison";
 import type { Shown } from "./useScene";
-import type { Layers, Steering, Viewer } from "./Viewer";
+import type { Layers, Size, Steering, Viewer } from "./Viewer";
 import { ViewPanel, type Shows } from "./ViewPanel";
 import { CleanPanel } from "./CleanPanel";
 import { ComparePanel } from "./ComparePanel";
 import { MeasurePanel } from "./MeasurePanel";
-import { ScreenshotTool, type Size } from "./ScreenshotTool";
+import { ScreenshotTool } from "./ScreenshotTool";
 import type { Preset } from "./presets";
 
 const LAYER_NAMES: Record<keyof Layers, string> = {

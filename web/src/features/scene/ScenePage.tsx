@@ -26,11 +26,10 @@ import { Scrubber } from "./Scrubber";
 import { type Comparison as Compared, useComparison } from "./useComparison";
 import { usePath } from "./usePath";
 import { useClosures } from "./useClosures";
-import type { Size } from "./ScreenshotTool";
 import { useScene } from "./useScene";
 import { useSceneKeys } from "./useSceneKeys";
 import { useVersions } from "./useVersions";
-import { type Layers, type Steering, Viewer } from "./Viewer";
+import { type Layers, type Size, type Steering, Viewer } from "./Viewer";
 import { VIEW_MODES } from "./viewModes";
 
 const LAYERS: Layers = { splats: true, path: true, loops: true, frustum: true, grid: true, axes: true };

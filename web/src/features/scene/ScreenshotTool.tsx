@@ -3,11 +3,7 @@
 import { type JSX, useState } from "react";
 
 import { Icon } from "../../shared/ui/icons";
-
-export interface Size {
-  width: number;
-  height: number;
-}
+import type { Size } from "./Viewer";
 
 /** Sides of a picture, pixels. */
 const LEAST = 16;

@@ -36,10 +36,15 @@ import { MarkLines } from "./MarkLines";
 import { OVERLAY_ORDER, PathLines } from "./PathLines";
 import { distanceAlong } from "./picker";
 import { type Preset, presetDirection } from "./presets";
-import type { Size } from "./ScreenshotTool";
 import { show as showMode, type ViewMode } from "./viewModes";
 
 export type Steering = "orbit" | "fly";
+
+/** Of a picture, pixels. */
+export interface Size {
+  width: number;
+  height: number;
+}
 
 export interface Layers {
   splats: boolean;

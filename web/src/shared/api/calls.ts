@@ -139,15 +139,15 @@ export const stats = (
       params: { path: { capture_id: id }, query: { ...region, frame } },
     }),
   );
-/** When a pixel fired, around a frame or in the middle of the recording. */
-export const spikes = (id: string, x: number, y: number, frame: number | null): Promise<Spikes> =>
+/** When a pixel fired around a frame. */
+export const spikes = (id: string, x: number, y: number, frame: number): Promise<Spikes> =>
   answered(
     client.GET("/api/v1/captures/{capture_id}/spikes", {
       params: { path: { capture_id: id }, query: { x, y, frame } },
     }),
   );
-/** What the scene of the newest reconstruction has at a pixel. */
-export const point = (id: string, x: number, y: number, frame: number | null): Promise<ScenePoint> =>
+/** What the scene of the newest reconstruction has at a pixel of a frame. */
+export const point = (id: string, x: number, y: number, frame: number): Promise<ScenePoint> =>
   answered(
     client.GET("/api/v1/captures/{capture_id}/point", {
       params: { path: { capture_id: id }, query: { x, y, frame } },

@@ -718,6 +718,7 @@ class PoseStepName(StrEnum):
 
     alignment = "alignment"
     gradient = "gradient"
+    difference = "difference"
 
 
 class Problem(BaseModel):

@@ -37,6 +37,8 @@ class PoseStepName(StrEnum):
     """Gauss-Newton over the whole path with landmarks marginalised."""
     GRADIENT = "gradient"
     """The rasteriser's exact gradient by the pose of each sub-frame (Eq 6 to 12), divided by its curvature."""
+    DIFFERENCE = "difference"
+    """The same gradient of the difference of two renders 32 frames apart (Eq 6 to 8), which ends less near."""
 
 
 @dataclass(frozen=True)

@@ -108,8 +108,8 @@ class Refinement:
         )
 
     def _make_pose_step(self, name: PoseStepName) -> PoseStep:
-        if name is PoseStepName.GRADIENT:
-            return PoseGradient(self._trainer, self._options.seed)
+        if name is not PoseStepName.ALIGNMENT:
+            return PoseGradient(self._trainer, self._options.seed, difference=name is PoseStepName.DIFFERENCE)
         free = self._options.parts.alternation is not None  # it takes knots of its own
         return GaussNewton(self._trainer, None if free else self._prior())
 

@@ -36,15 +36,16 @@ def check(scene: PictureScene, source: Source, names: list[str]) -> None:
     assert (scene.intrinsics, (scene.width, scene.height)) == (source.intrinsics, source.size)
 
 
+@pytest.mark.parametrize("kind", ["colmap", "tanks-and-temples", "deblur-nerf"])
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
-def test_a_colmap_scene_comes_back_exactly(source: Source, text: bool, tmp_path: Path) -> None:
+def test_a_colmap_scene_comes_back_exactly(source: Source, text: bool, kind: str, tmp_path: Path) -> None:
     names = written(tmp_path / "barn", source)
     place = tmp_path / "barn" / ("sparse" if text else "sparse/0")
     shuffled = [*range(1, len(names)), 0]
     poses = source.poses(numbered(source))[shuffled]
     write_colmap(place, [names[k] for k in shuffled], poses, source, text)
     assert recognise(tmp_path)[0].name == "colmap"
-    scene = only_scene("tanks-and-temples", tmp_path)
+    scene = only_scene(kind, tmp_path)
     check(scene, source, names)
     assert scene.name == "barn"
     assert scene.median_depth == pytest.approx(1, abs=0.2)

@@ -1,5 +1,8 @@
 """The methods and their parts: the paper's end to end, its pose gradient, mixtures with ours, and names."""
 
+import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +12,7 @@ from spiked_service.cli.main import app
 from typer.testing import CliRunner
 
 from spiked.errors import ConfigurationError
+from spiked.evaluate import score_trajectory
 from spiked.pose import exp_so3, log_so3
 from spiked.recon import (
     METHODS,
@@ -23,12 +27,14 @@ from spiked.recon import (
 from spiked.recon.alternation import continued
 from spiked.recon.mapping.pose_steps import PoseGradient
 from spiked.recon.untracked import UntrackedOdometry
+from spiked.recording import open_recording
 from spiked.sensor import Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
 from spiked.spline import Spline
 from spiked.trajectory import Trajectory
 
 FRAMES = 320
+MEASURE = Path(__file__).parents[2] / "evaluation" / "measure_methods.py"
 
 
 class Room:
@@ -120,9 +126,10 @@ def test_its_first_view_begins_at_the_depth_that_is_given(room: Room) -> None:
     [
         Options(steps=60, method=MethodName.NOPE_SGS, loss=LossName.CHARGE, pose_step=PoseStepName.ALIGNMENT),
         Options(steps=60, method=MethodName.NOPE_SGS, mapping=MapOptions(sub_frames=2)),
+        Options(steps=60, method=MethodName.NOPE_SGS, pose_step=PoseStepName.DIFFERENCE),
         Options(steps=100, pose_step=PoseStepName.GRADIENT, loss=LossName.BINOMIAL, window_frames=16),
     ],
-    ids=["theirs with our parts", "theirs with fewer sub-frames", "ours with their parts"],
+    ids=["theirs with our parts", "theirs with fewer sub-frames", "theirs with differences", "ours with their parts"],
 )
 def test_parts_of_the_methods_are_mixed(room: Room, options: Options) -> None:
     given = options.method is MethodName.SPIKED
@@ -130,6 +137,34 @@ def test_parts_of_the_methods_are_mixed(room: Room, options: Options) -> None:
     assert len(made.scene()) > 1000
     assert made.trainer.options.loss is (options.loss or LossName.ACCUMULATION_BINOMIAL)
     assert made.trainer.options.sub_frames == (None if given else options.mapping.sub_frames or 4)
+
+
+@pytest.mark.slow
+def test_the_pose_gradient_corrects_a_disturbed_path_of_living(shared: Path, tmp_path: Path) -> None:
+    """0.2 degrees and 0.5 % of the radius: the table "A disturbed path" of docs/paper.md."""
+    options = ("--only", "living", "--steps", "200", "--pose-steps", "250", "--window-frames", "64")
+    command = [sys.executable, MEASURE, "poses", shared / "streams", *options, "--json", tmp_path / "rows.json"]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    rows = {row["what"]: row for row in json.loads((tmp_path / "rows.json").read_text())}
+    assert (rows["disturbed"]["deg"], rows["disturbed"]["percent"]) == pytest.approx((0.2, 0.5), rel=0.05)
+    gradient = rows["pose gradient, each render"]
+    assert gradient["deg"] < 0.05 and gradient["percent"] < 0.3
+
+
+@pytest.mark.slow
+def test_the_method_of_the_paper_converges_from_tracks_on_living(shared: Path) -> None:
+    """The table "from tracks" of docs/paper.md: 0.23 to 0.25 % with three seeds."""
+    folder = shared / "streams" / "living"
+    recording = open_recording(folder / "living.dat")
+    options = Options(steps=600, method=MethodName.NOPE_SGS, initialisation=Initialisation.TRACKS)
+    made = Reconstructor(recording.sensor, options, recording=recording)
+    made.feed(0, recording.read(0, recording.frames))
+    made.finish()
+    truth = Trajectory.read_tum(folder / "groundtruth.tum")
+    rate_hz = recording.sensor.frame_rate_hz
+    score = score_trajectory(truth=truth, estimate=made.trajectory(), frame_rate_hz=rate_hz)
+    assert score.coverage > 0.99 and score.errors is not None
+    assert score.errors.ate_percent < 0.35
 
 
 def test_a_path_is_continued_at_constant_velocity() -> None:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,11 @@ from typer.testing import CliRunner
 
 from spiked.datasets import KINDS
 from spiked.errors import SpikedError
-from spiked.recording import RecordingWriter
-from spiked.sensor import Intrinsics, Sensor
+from spiked.pose import Array
+from spiked.recording import RecordingWriter, open_recording
+from spiked.render import Camera, rasteriser_for
+from spiked.scene import Scene
+from spiked.sensor import Image, Intrinsics, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
 from spiked.trajectory import Trajectory
 
@@ -154,24 +158,48 @@ def test_a_stream_of_a_recording_of_our_own_is_left_as_it_is(tmp_path: Path) -> 
     assert (tmp_path / "own.json").read_bytes() == before
 
 
-@pytest.mark.slow
-def test_spikes_made_of_a_scene_of_pictures_are_reconstructed(tmp_path: Path) -> None:
-    scene = tmp_path / "tanks" / "room"
+Views = tuple[Trajectory, Intrinsics, Callable[[Array, Array], Image]]
+"""Poses, optics, and what draws a picture with values in [0, 1] from a pose."""
+
+
+def views_of_the_room() -> Views:
+    """96 views along an arc through the built-in room."""
     camera = SimulatedCamera(SENSOR, 3, MotionKind.ARC, flow_px=0.3, step_px=0.8)
     frames = np.arange(0, 384, 4)
-    rotations, centres = camera.truth(frames)
-    poses = np.tile(np.eye(4), (len(frames), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = rotations, centres
-    names = [f"{number}.png" for number in range(len(frames))]
-    for name, pose in zip(names, poses, strict=True):
-        light = camera.view(pose[:3, :3], pose[:3, 3], undistorted=True) / camera.gain
-        save_picture(scene / "images" / name, np.round(255 * np.clip(light, 0, 1)).astype(np.uint8))
-    path = Trajectory(frames / 1.0, rotations, centres)
-    source = Source(np.zeros((1, SENSOR.height, SENSOR.width), np.uint8), camera.intrinsics, path)
-    write_colmap(scene / "sparse" / "0", names, poses, source)
-    made = ("--simulate", "--picture-rate 5000 --gamma linear")
+    path = Trajectory(frames / 1.0, *camera.truth(frames))
+    return path, camera.intrinsics, lambda r, c: camera.view(r, c, undistorted=True) / camera.gain
+
+
+def views_of_living(shared: Path) -> Views:
+    """96 views of `living`, at the poses of every eighth frame."""
+    sensor = open_recording(shared / "streams" / "living" / "living.dat").sensor
+    truth = Trajectory.read_tum(shared / "streams" / "living" / "groundtruth.tum")
+    frames = np.arange(0, 768, 8)
+    assert sensor.intrinsics is not None
+    rasteriser = rasteriser_for(Camera(sensor.intrinsics, sensor.width, sensor.height))
+    scene = Scene.read_ply(shared / "scenes" / "living.ply")
+    path = Trajectory(frames / 1.0, truth.rotations[frames], truth.centres[frames])
+    return path, sensor.intrinsics, lambda r, c: rasteriser.forward(scene, r[None], c[None]).values
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("views", ["room", "living"])
+def test_spikes_made_of_a_scene_of_pictures_are_reconstructed(
+    views: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    scene = tmp_path / "tanks" / "room"
+    path, intrinsics, draw = (
+        views_of_the_room() if views == "room" else views_of_living(request.getfixturevalue("shared"))
+    )
+    names = [f"{number}.png" for number in range(len(path))]
+    for name, rotation, centre in zip(names, path.rotations, path.centres, strict=True):
+        picture = np.round(255 * np.clip(draw(rotation, centre), 0, 1)).astype(np.uint8)
+        save_picture(scene / "images" / name, picture)
+    source = Source(np.zeros((1, SENSOR.height, SENSOR.width), np.uint8), intrinsics, path)
+    write_colmap(scene / "sparse" / "0", names, path.matrices(), source)
+    given = ("--simulate", "--picture-rate 5000 --gamma linear")
     out = tmp_path / "out"
-    done = spiked("run", "tanks-and-temples", tmp_path / "tanks", "-o", out, *made, "--steps", "200")
+    done = spiked("run", "tanks-and-temples", tmp_path / "tanks", "-o", out, *given, "--steps", "200")
     assert done.exit_code == 0, f"{done.output} {done.exception}"
     with (out / "table.csv").open() as file:
         (row,) = csv.DictReader(file)

@@ -13,7 +13,7 @@ from pydantic import BaseModel
 
 from spiked.errors import SceneError
 from spiked.evaluate import ViewScore, score_trajectory, score_views, similarity_of_trajectories
-from spiked.lpips import LPIPS_LEAST_SIDE_PX, Lpips, lpips_available
+from spiked.lpips import LPIPS_LEAST_SIDE_PX, LPIPS_NETWORK, Lpips, lpips_available
 from spiked.recording import Recording, open_recording
 from spiked.render import Camera
 from spiked.render.cpu import Rasteriser
@@ -78,7 +78,7 @@ def evaluate(
                 if pictures is not None and not through_lens:
                     _write_pictures(pictures, views)
     for name, value in figures.items():
-        output.print(f"{name:18s} {value:.4f}")
+        output.print(f"{name:18s} {value:.4f}" + (f"   by {LPIPS_NETWORK}" if name == "lpips" else ""))
     if json_out is not None:
         with outputs.writing("--json", json_out):
             json_out.write_text(json.dumps(figures, indent=1), encoding="utf-8")

@@ -13,6 +13,7 @@ from pathlib import Path
 from pydantic import BaseModel, Field
 
 from spiked.datasets import DatasetKind
+from spiked.lpips import LPIPS_NETWORK
 from spiked_service.base.version import installed_version
 
 COLUMNS = {
@@ -60,6 +61,8 @@ class Table:
             cells = [_cell(name, row.figures.get(name)) for name in COLUMNS]
             lines.append(f"| {_escaped(row.name)} | " + " | ".join(cells) + f" | {_escaped(row.outcome)} |")
         lines += ["", "Figures are those of `spiked evaluate`; empty where the data set says no truth.", ""]
+        if any("lpips" in row.figures for row in self.rows):
+            lines += [f"LPIPS by {LPIPS_NETWORK}; smaller is better.", ""]
         notes = [f"* {_escaped(note)}" for row in self.rows for note in row.notes]
         lines += [*notes, ""] if notes else []
         lines += [f"Layout: {self.kind.certainty}. Licence of the data: {self.kind.licence}.", ""]

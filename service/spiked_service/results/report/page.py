@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from spiked.lpips import LPIPS_NETWORK
 from spiked.trajectory import Trajectory
 from spiked_service.results.image_encoding import ImageFormat
 from spiked_service.results.report import svg
@@ -26,7 +27,7 @@ _EVALUATED = {
     "psnr_db": ("PSNR", "dB, mean of held-out views"),
     "worst_psnr_db": ("PSNR, worst view", "dB"),
     "ssim": ("SSIM", "mean of held-out views"),
-    "lpips": ("LPIPS", "mean of held-out views"),
+    "lpips": ("LPIPS", f"mean of held-out views, by {LPIPS_NETWORK}; smaller is better"),
 }
 """Figures of `spiked evaluate`: name and meaning; others are shown by their own names."""
 _STATES = {

@@ -3224,7 +3224,7 @@ export interface components {
          * @description What corrects the poses while the map is fitted.
          * @enum {string}
          */
-        PoseStepName: "alignment" | "gradient";
+        PoseStepName: "alignment" | "gradient" | "difference";
         /**
          * Problem
          * @description RFC 9457 problem details.

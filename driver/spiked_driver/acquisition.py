@@ -17,6 +17,8 @@ _STEADY_NS = 4_000_000_000
 """Time for which a deviating frame rate must be steady, without a loss of the host, before it is reported; ns."""
 _SAME_RATE = 0.003
 """Relative deviation below which a rate counts as steady."""
+_UNEVEN_NS = 12_000_000_000
+"""Time after which a deviating frame rate is reported that is not steady; ns."""
 
 
 class StopEvent(Protocol):
@@ -175,6 +177,7 @@ class _Timing:
         self._due = False
         self._begun = False  # the beginning of the clock's line was published
         self._suspect: tuple[float, int] | None = None  # a rate that is not the stated one, and since when
+        self._wrong_since_ns: int | None = None  # since when rates are not the stated one
         self._steady_ns = 0
 
     def arrived(self, next_frame: int, seen_ns: int) -> None:
@@ -182,12 +185,12 @@ class _Timing:
         self._steady_ns = self._steady_ns or seen_ns
         self._due |= self._clock.arrived(next_frame - 1, seen_ns)
         if self._due and self._clock.settled:
-            self._publish()
+            self._publish(seen_ns)
 
     def disturbed(self) -> None:
         """Restart the rate check: a busy host has delayed or lost frames."""
         self._steady_ns = time.monotonic_ns()
-        self._suspect = None
+        self._suspect = self._wrong_since_ns = None
 
     def interrupted(self) -> None:
         """The frame count was interrupted: publish, then start a new clock line."""
@@ -198,10 +201,11 @@ class _Timing:
 
     def finish(self) -> None:
         """Publish the last clock pair."""
-        if self._clock.fit(time.monotonic_ns()):
-            self._publish()
+        now_ns = time.monotonic_ns()
+        if self._clock.fit(now_ns):
+            self._publish(now_ns)
 
-    def _publish(self) -> None:
+    def _publish(self, now_ns: int) -> None:
         self._due = False
         last = self._writer.next_frame - 1
         first = self._clock.first_frame
@@ -212,21 +216,27 @@ class _Timing:
             assert unix_ns is not None, "a line was fitted"
             self._writer.clock_pair(ClockPair(frame, unix_ns))
         self._begun = True
-        self._check_rate(time.monotonic_ns())
+        self._check_rate(now_ns)
 
     def _check_rate(self, now_ns: int) -> None:
         rate_hz = self._clock.wrong_rate()
         if rate_hz is None or now_ns - self._steady_ns < _STEADY_NS:
-            self._suspect = None
+            self._suspect = self._wrong_since_ns = None
             return
         if self._suspect is None or abs(rate_hz / self._suspect[0] - 1) > _SAME_RATE:
             self._suspect = rate_hz, now_ns
-        if now_ns - self._suspect[1] > _STEADY_NS and self._warn is not None:
-            self._warn(
-                f"frames come at {rate_hz:,.0f} a second by their count and this machine's clock, not at the stated "
-                f"{self._stated_hz:,.0f}: set the option rate={rate_hz:.0f}, or all times are wrong"
-            )
-            self._warn = None
+        self._wrong_since_ns = self._wrong_since_ns or now_ns
+        steady = now_ns - self._suspect[1] > _STEADY_NS
+        if self._warn is None or not (steady or now_ns - self._wrong_since_ns > _UNEVEN_NS):
+            return
+        what = f"by their count and this machine's clock, not at the stated {self._stated_hz:,.0f}"
+        if steady:
+            advice = f"set the option rate={rate_hz:.0f}, or all times are wrong"
+            told = f"frames come at {rate_hz:,.0f} a second {what}: {advice}"
+        else:
+            told = f"frames come unevenly, now at {rate_hz:,.0f} a second {what}: times are those of the stated rate"
+        self._warn(told)
+        self._warn = None
 
 
 def _wait_for_consumers(source: Source, writer: RingWriter, stop: StopEvent, consumers: int) -> EndReason | None:

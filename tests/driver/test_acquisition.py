@@ -1,5 +1,6 @@
 """From a simulated camera, with and without faults, through the ring to a reader."""
 
+import re
 import threading
 import time
 from dataclasses import replace
@@ -102,6 +103,46 @@ def test_random_losses_have_about_the_stated_fraction_and_repeat_with_the_seed()
     gaps = [item for item, _ in first if isinstance(item, Gap)]
     assert gaps == [item for item, _ in second if isinstance(item, Gap)]
     assert sum(gap.count for gap in gaps) == lost
+
+
+class Paced(SimulatedSource):
+    """A simulated camera whose frames come at stated times, without waiting for them."""
+
+    def __init__(self, stated_hz: float, periods_ns: np.ndarray) -> None:
+        super().__init__(replace(SENSOR, width=16, height=16, frame_rate_hz=stated_hz), frames=len(periods_ns), pace=0)
+        self._seen_ns = time.monotonic_ns() + np.cumsum(periods_ns)
+
+    @property
+    def can_block(self) -> bool:
+        """As a camera: its frames are timed."""
+        return False
+
+    def read_into(self, view: np.ndarray) -> Chunk | Gap | End | None:
+        """With the time of the last frame."""
+        item = super().read_into(view)
+        if isinstance(item, Chunk):
+            return replace(item, seen_ns=int(self._seen_ns[item.first + item.frames - 1]))
+        return item
+
+
+@pytest.mark.parametrize(
+    ("stated_hz", "uneven", "said"),
+    [
+        (70.0, 0.0, None),
+        (75.0, 0.0, "frames come at 70 a second by their count and this machine's clock, not at the stated 75: set"),
+        (20_000.0, 0.6, r"frames come unevenly, now at \d+ a second .*: times are those of the stated rate"),
+    ],
+    ids=["as stated", "another", "another, unevenly"],
+)
+def test_a_rate_that_is_not_the_stated_one_is_told(stated_hz: float, uneven: float, said: str | None) -> None:
+    """70 frames a second for 30 s; uneven ones change their rate every second."""
+    change = np.repeat(np.random.default_rng(0).uniform(-1, 1, 30), 70)
+    told: list[str] = []
+    source = Paced(stated_hz, (1e9 / 70 * (1 + uneven * change)).astype(np.int64))
+    with RingWriter.create(source.sensor, slots=1024) as writer:
+        acquire(source, writer, threading.Event(), warn=told.append)
+    assert len(told) == (said is not None)
+    assert said is None or re.match(said, told[0])
 
 
 def test_a_loss_at_the_end_comes_before_the_end() -> None:

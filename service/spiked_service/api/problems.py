@@ -128,7 +128,7 @@ _WHAT_TO_DO: dict[int, str] = {
     413: "send a smaller body; upload recordings in chunks",
     415: "use a Content-Type of /openapi.json",
     416: "request a range that starts inside the file",
-    422: "fix the field named in detail; see /openapi.json or /docs",
+    422: "correct the request; /docs and /openapi.json describe its fields",
     429: "wait for the time in Retry-After",
     503: "repeat the request after the time in Retry-After",
     507: "free disk space in the data folder, or remove and purge captures",

@@ -9,7 +9,7 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from spiked.client import CaptureOut, CaptureRequest, CaptureState, GroupOut, Spiked
+from spiked.client import CaptureOut, CaptureRequest, CaptureState, Grade, GroupOut, Spiked
 from spiked.errors import ConfigurationError
 from spiked_service.base.signals import handling
 from spiked_service.cli import outputs
@@ -50,9 +50,10 @@ def record(
 
     Several devices are started together or not at all: if one cannot start, the error names it. Ctrl-C or SIGTERM
     stops all of them. At the end each recording is printed with its frames and losses, and, of all but the first, the
-    time from the first frame of the first recording to its own, with its standard deviation.
+    time from the first frame of the first recording to its own, with its standard deviation. A device that is absent
+    is waited for.
 
-    The exit code is 1 if a capture failed.
+    The exit code is 1 if a capture failed or its recording is bad, for instance without a frame.
 
     Examples:
 
@@ -90,7 +91,11 @@ def _status(captures: list[CaptureOut], stopped: bool) -> int:
     """The exit status."""
     if stopped and any(one.state not in _OVER for one in captures):
         return INTERRUPTED
-    return int(any(one.state is CaptureState.failed for one in captures))
+    return int(any(one.state is CaptureState.failed or _grade(one) is Grade.bad for one in captures))
+
+
+def _grade(capture: CaptureOut) -> Grade | None:
+    return None if capture.verdict is None else capture.verdict.grade
 
 
 class _Run:
@@ -175,11 +180,13 @@ def _show(run: _Run) -> None:
     )
     for one in run.captures:
         recording = one.recording
-        line = f"{one.source}: capture {one.id}, {one.state.value}"
+        grade = _grade(one) if one.state is CaptureState.complete else None
+        line = f"{one.source}: capture {one.id}, {(grade or one.state).value}"
         if recording is not None:
-            line += f", {recording.frames:,} frames, {recording.lost:,} lost"
-        if one.reason:
-            line += f": {one.reason}"
+            planned = f" of {one.frames_planned:,}" if one.frames_planned else ""
+            line += f", {recording.frames:,}{planned} frames, {recording.lost:,} lost"
+        if reasons := [one.reason or "", *([] if one.verdict is None else one.verdict.reasons)]:
+            line += "".join(f"; {reason}" for reason in reasons if reason)
         output.print(line, markup=False)
         for warning in one.warnings:
             report_warning(f"{one.source}: {warning}")

@@ -1,5 +1,6 @@
-"""Handlers of signals for a while."""
+"""Handlers of signals for a while, and an end by a signal that cleans up."""
 
+import os
 import signal
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -7,13 +8,62 @@ from types import FrameType
 
 Handler = Callable[[int, FrameType | None], object]
 
+_ENDING = (signal.SIGTERM, signal.SIGHUP)
+
+
+class _Ended(BaseException):
+    """A signal ends the program."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
 
 @contextmanager
 def handling(handlers: Mapping[signal.Signals, Handler]) -> Iterator[None]:
-    """These handle their signals; afterwards those before do again."""
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    """These handle their signals; afterwards those before do again.
+
+    SIGHUP stays ignored if it was: `nohup` lets a program outlive its terminal.
+    """
+    taken = {number: handler for number, handler in handlers.items() if not _ignored(number)}
+    before = {number: signal.signal(number, handler) for number, handler in taken.items()}
     try:
         yield
     finally:
         for number, earlier in before.items():
             signal.signal(number, earlier)
+
+
+@contextmanager
+def cleaning_up() -> Iterator[None]:
+    """SIGTERM and the end of the terminal end this as Ctrl-C does: unfinished files are removed.
+
+    Then the program ends by the signal itself, as its parent expects.
+    """
+
+    def end(number: int, frame: FrameType | None) -> None:
+        raise _Ended(number)
+
+    try:
+        with handling(dict.fromkeys(_ENDING, end)):
+            yield
+    except _Ended as ended:
+        signal.signal(ended.number, signal.SIG_DFL)
+        os.kill(os.getpid(), ended.number)
+
+
+@contextmanager
+def holding() -> Iterator[None]:
+    """Signals that end the program wait for the end of this.
+
+    For imports: packages that catch BaseException around theirs (trimesh does) would swallow Ctrl-C.
+    """
+    came: list[int] = []
+    with handling(dict.fromkeys((signal.SIGINT, *_ENDING), lambda number, frame: came.append(number))):
+        yield
+    if came:
+        signal.raise_signal(came[0])
+
+
+def _ignored(number: signal.Signals) -> bool:
+    return number is signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN

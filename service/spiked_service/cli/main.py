@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from spiked.errors import SpikedError
+from spiked_service.base.signals import cleaning_up
 from spiked_service.base.version import installed_version
 from spiked_service.cli.command_table import LazyGroup
 from spiked_service.cli.console import output, report_error
@@ -41,7 +42,8 @@ def main() -> None:
     """Run `spiked` with the arguments of this process."""
     os.environ["PYTHONSAFEPATH"] = "1"  # child processes must not import modules from the current folder
     try:
-        app()
+        with cleaning_up():
+            app()
     except SpikedError as error:
         report_error(error)
         sys.exit(2)

@@ -11,6 +11,7 @@ from spiked.export import KINDS, ExportKind, ExportOptions, ExportSource, find_k
 from spiked.export.source import KEY_VIEWS
 from spiked.scene import Scene
 from spiked.spz import decode
+from spiked_service.base.signals import holding
 from spiked_service.cli import outputs
 from spiked_service.cli.console import output
 from spiked_service.results.report.folder import FolderReport
@@ -80,7 +81,8 @@ def export(
 
     - `spiked scale out --length 3.0 1.42 && spiked export out mesh-glb --metric --resolution 384`
     """
-    kind.check()
+    with holding():
+        kind.check()
     place = out or _place(result, f"{kind.name}{'-metric' if metric else ''}{kind.suffix}")
     (outputs.try_folder if kind.folder else outputs.try_file)("--out", place)
     source = _source(result, recording, metric)

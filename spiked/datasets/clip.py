@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from spiked.calibration import Calibration
 from spiked.errors import DatasetError
-from spiked.recording import RecordingWriter, Sidecar, sidecar_path, write_sidecar
+from spiked.recording import Sidecar, sidecar_path, whole_recording, write_sidecar
 from spiked.recording.geometry import Assumable
 from spiked.sensor import Intrinsics, Sensor
 from spiked.trajectory import Trajectory
@@ -105,7 +105,7 @@ class Clip:
         return path
 
     def _copy(self, path: Path, more: dict[str, Any]) -> None:
-        with RecordingWriter(path, self.sensor.compact(), **more) as writer:
+        with whole_recording(path, self.sensor.compact(), **more) as writer:
             for block in self.blocks():
                 writer.append(block)
             count = writer.frames

@@ -15,7 +15,7 @@ from spiked.recording.sidecar import (
     write_sidecar,
 )
 from spiked.recording.verify import Verdict, Verification, verify
-from spiked.recording.writer import RecordingWriter
+from spiked.recording.writer import RecordingWriter, whole_recording
 
 __all__ = [
     "LIVE",
@@ -43,5 +43,6 @@ __all__ = [
     "recover",
     "sidecar_path",
     "verify",
+    "whole_recording",
     "write_sidecar",
 ]

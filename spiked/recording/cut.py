@@ -11,7 +11,7 @@ from spiked.recording.index import index_path, read_index
 from spiked.recording.reader import Recording
 from spiked.recording.recover import damaged_blocks
 from spiked.recording.sidecar import ClockPair, Gap, read_sidecar, sidecar_path
-from spiked.recording.writer import RecordingWriter
+from spiked.recording.writer import whole_recording
 
 __all__ = ["cut_recording"]
 
@@ -40,7 +40,7 @@ def cut_recording(recording: Recording, out: Path, begin: int, end: int) -> tupl
     if indexed:
         _check(recording, begin, end)
     durability = Durability(index=True) if indexed else PLAIN
-    with RecordingWriter(out, recording.sensor, durability=durability, **_fields(recording, out, begin)) as writer:
+    with whole_recording(out, recording.sensor, durability=durability, **_fields(recording, out, begin)) as writer:
         for pair in _clock(recording, begin, end):
             writer.clock_pair(pair.frame, pair.unix_ns)
         row = begin - sum(min(gap.count, max(0, begin - gap.first)) for gap in recording.gaps)

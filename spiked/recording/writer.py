@@ -1,8 +1,8 @@
 """Writes recordings that stay valid if the writer is killed at any byte."""
 
 import os
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -254,3 +254,20 @@ class RecordingWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+
+@contextmanager
+def whole_recording(path: Path, sensor: Sensor, **more: Any) -> Iterator[RecordingWriter]:
+    """A recording that is made of something else: after an error, or Ctrl-C, nothing of it is left.
+
+    A part of it would pass for a shorter recording. `more` as of `RecordingWriter`. Raises RecordingError.
+    """
+    files = path, sidecar_path(path), index_path(path)
+    new = not any(file.exists() for file in files)
+    try:
+        with RecordingWriter(path, sensor, **more) as writer:
+            yield writer
+    except BaseException:
+        for file in files if new else ():
+            file.unlink(missing_ok=True)
+        raise

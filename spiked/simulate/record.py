@@ -1,6 +1,7 @@
 """Write what a simulated camera sees as a recording with its truth: the folder that `evaluate` scores against."""
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from spiked.errors import ConfigurationError, RecordingError
 from spiked.pose import exp_so3
-from spiked.recording import RecordingWriter
+from spiked.recording import whole_recording
 from spiked.scene import Scene
 from spiked.sensor import BitOrder, Layout, Sensor
 from spiked.simulate.camera import DEFAULT_GAIN, SimulatedCamera
@@ -107,7 +108,7 @@ def simulate(
 
 @contextmanager
 def writing_into(folder: Path, sensor: Sensor) -> Iterator[None]:
-    """Make a folder for a simulated recording, which must be new or empty.
+    """Make a folder for a simulated recording, which must be new or empty, and is empty again after an error.
 
     Raises RecordingError if it cannot be written, then and later, and ConfigurationError for a sensor whose frames are
     not compact and LSB first.
@@ -119,9 +120,20 @@ def writing_into(folder: Path, sensor: Sensor) -> Iterator[None]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         check_empty(folder)
-        yield
+        with _emptied_after_an_error(folder):
+            yield
     except OSError as error:
         raise RecordingError(f"cannot write the simulated recording in {folder}: {error.strerror}") from error
+
+
+@contextmanager
+def _emptied_after_an_error(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except BaseException:
+        for made in folder.iterdir():
+            shutil.rmtree(made) if made.is_dir() else made.unlink()
+        raise
 
 
 def check_empty(folder: Path) -> None:
@@ -140,7 +152,7 @@ def write_frames(
 ) -> None:
     """Write a recording with its sidecar; `next_frames` gives as many frames as it is asked for [n, frame_bytes]."""
     note = "simulated; cfa is of the upright image"
-    with RecordingWriter(data, sensor, note=note, simulation=simulation) as out:
+    with whole_recording(data, sensor, note=note, simulation=simulation) as out:
         for begin in range(0, frames, _CHUNK):
             count = min(_CHUNK, frames - begin)
             out.append(next_frames(count))

@@ -1,6 +1,9 @@
 """`spiked cut`: a range of a recording."""
 
 import json
+import resource
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -100,3 +103,17 @@ def test_what_is_no_range_is_said(tmp_path: Path, text: str) -> None:
     for option in (f"--frames={text}", f"--seconds={text}"):
         done = CliRunner().invoke(app, ["cut", str(file), "-o", str(tmp_path / "part.dat"), option])
         assert done.exit_code == 2 and "range" in done.output
+
+
+def test_nothing_is_left_of_a_cut_without_room(tmp_path: Path) -> None:
+    """Its first frames would pass for the whole range."""
+    written(tmp_path / "rec.dat", Sensor(400, 248, RATE), index=True)
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
+
+    command = [sys.executable, "-m", "spiked_service", "cut", "rec.dat", "-o", "part.dat", "--frames", "0:300"]
+    done = subprocess.run(command, check=False, cwd=tmp_path, preexec_fn=limit, capture_output=True, text=True)
+    assert done.returncode == 2 and "part.dat: cannot be written" in done.stderr
+    assert not list(tmp_path.glob("part.*"))
+    assert "Traceback" not in done.stderr

@@ -57,6 +57,19 @@ def test_nothing_is_written_over(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["precious"]
 
 
+@pytest.mark.parametrize("until", [64, 150], ids=["between frames", "before the views"])
+def test_nothing_is_left_of_a_simulation_that_is_interrupted(until: int, tmp_path: Path) -> None:
+    """Its first frames would pass for a recording of fewer, without truth."""
+
+    def interrupt(done: int) -> None:
+        if done == until:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate(SimulatedCamera(Sensor(64, 40, 20000.0)), tmp_path, "walk", 150, views=1, progress=interrupt)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_other_layouts_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="convert"):
         simulate(SimulatedCamera(Sensor(64, 40, 20000.0, Layout.ROW_TAGGED)), tmp_path / "walk", "walk", 8)

@@ -105,24 +105,34 @@ class ReconstructionRepository:
 
     def save(self, row: ReconstructionRow) -> ReconstructionRow:
         """Save and publish a row. A row that cannot be saved is kept in memory and retried."""
-        row = replace(self._named(row), queue_place=None, eta_s=None if row.state.over else row.eta_s)
         if row.state.over:
             self.unpin_maps(row)
         with self._lock:
-            self._set_running(row)
+            row = self._named(row)
             try:
-                self._catalogue.reconstructions.put(row)
-                self._unsaved.pop(row.id, None)
+                row = self._write(row)
             except StoreError as error:
                 if row.id not in self._unsaved:
                     self._notifier.log("error", str(error), row.capture_id, row.id)
-                self._unsaved[row.id] = row
-            if row.state is JobState.QUEUED and row.id not in self._unsaved:
-                self._estimates.forget(row.id)  # published with its place by `_publish_queue`
-            else:
-                self._notifier.job(row)
-            self._publish_queue()
+                self._unsaved[row.id] = row = _stored(row)
+            self._tell(row)
         return row
+
+    def _write(self, row: ReconstructionRow) -> ReconstructionRow:
+        """Put a row into the catalogue, and return it as it is there. Raises StoreError."""
+        row = _stored(row)
+        self._catalogue.reconstructions.put(row)
+        self._unsaved.pop(row.id, None)
+        return row
+
+    def _tell(self, row: ReconstructionRow) -> None:
+        """Publish a row that was written, and what changed in the queue."""
+        self._set_running(row)
+        if row.state is JobState.QUEUED and row.id not in self._unsaved:
+            self._estimates.forget(row.id)  # published with its place by `_publish_queue`
+        else:
+            self._notifier.job(row)
+        self._publish_queue()
 
     def publish_edit(self, reconstruction_id: str, version: int, edit: Callable[[Publisher], Published]) -> Published:
         """Publish another version of a reconstruction that has ended, made of its newest, `version`.
@@ -163,8 +173,7 @@ class ReconstructionRepository:
         """
         with self._lock:
             self.check_not_edited(row.id)
-            self._catalogue.reconstructions.put(replace(row, queue_place=None))
-            self.save(row)
+            self._tell(self._write(self._named(row)))
 
     def forget_scale(self, row: ReconstructionRow) -> None:
         """Forget the scale of a reconstruction that begins anew, since its unit of length will be another one.
@@ -200,9 +209,9 @@ class ReconstructionRepository:
                 notes=row.notes if notes is None else f"{notes}",
                 held=row.held if held is None else bool(held),
             )
-            self._catalogue.reconstructions.put(replace(edited, queue_place=None))  # or nothing has changed
+            written = self._write(edited)
             self._texts[row.id] = edited.name, edited.notes
-            self.save(edited)
+            self._tell(written)
             if isinstance(place, int):
                 self._move(row.id, place)
             return self.get(row.id)
@@ -314,3 +323,8 @@ class ReconstructionRepository:
             return
         for row in self._estimates.changed(placed):
             self._notifier.job(row)
+
+
+def _stored(row: ReconstructionRow) -> ReconstructionRow:
+    """A row as the catalogue has it: places in the queue, and expectations of what is over, are not kept."""
+    return replace(row, queue_place=None, eta_s=None if row.state.over else row.eta_s)

@@ -248,10 +248,14 @@ def _parse_header(raw: bytes, path: Path | str) -> tuple[list[tuple[str, str]], 
             case ["comment", "radiance", value, *_]:
                 white = _radiance(value, path)
             case ["element", element, number]:
+                if not number.isdecimal():
+                    raise SceneError(f"{path}: its header has {number!r} of {element}, which is no number")
                 count = int(number) if element == "vertex" else count
             case ["property", kind, name] if element == "vertex":
                 if kind not in _KINDS:
                     raise SceneError(f"{path}: property {name} has unknown type {kind}")
+                if name in dict(names):
+                    raise SceneError(f"{path}: its header has the property {name} twice")
                 names.append((name, _KINDS[kind]))
             case _:
                 pass

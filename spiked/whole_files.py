@@ -47,13 +47,13 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_folder(path: Path, replaces: Sequence[str] = ()) -> Iterator[Path]:
+def whole_folder(path: Path, replaces: Sequence[str] = (), stale: Sequence[str] = ()) -> Iterator[Path]:
     """An empty folder of the same name to fill, which becomes `path` at the end.
 
     After an error what was written is removed, and an earlier folder is as it was. Of an earlier folder the files of
-    the same names are replaced, and the others stay; with `replaces` the files that match these patterns are replaced,
-    and there may be no others. Raises SceneError if there are, and OSError; that of a full disk says how much was
-    written.
+    the same names are replaced, those that match a pattern of `stale` are removed, and the others stay; with `replaces`
+    the files that match these patterns are replaced, and there may be no others. Raises SceneError if there are, and
+    OSError; that of a full disk says how much was written.
     """
     path = path.resolve()
     earlier = path.is_dir()
@@ -68,7 +68,7 @@ def whole_folder(path: Path, replaces: Sequence[str] = ()) -> Iterator[Path]:
             yield folder
             _sync(folder)
         if earlier:
-            _move(folder, path, replaces)
+            _move(folder, path, (*replaces, *stale))
         else:
             folder.replace(path)
     except BaseException:

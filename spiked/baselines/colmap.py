@@ -7,6 +7,7 @@ folder is an ordinary COLMAP project: `images/`, `sparse/0`.
 import importlib.util
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -82,9 +83,11 @@ def run_colmap(
     """
     if importlib.util.find_spec("pycolmap") is None:
         raise ConfigurationError("COLMAP is not installed: install spiked with the extra 'colmap', which has pycolmap")
-    (folder / "images").mkdir(parents=True, exist_ok=True)
+    if (folder / "images").is_dir():
+        shutil.rmtree(folder / "images")  # COLMAP reads all pictures there
+    (folder / "images").mkdir(parents=True)
     for number, picture in enumerate(pictures):
-        cv2.imwrite(str(folder / "images" / _name(number)), picture.pixels)
+        (folder / "images" / _name(number)).write_bytes(cv2.imencode(".png", picture.pixels)[1].tobytes())
     model, lens = colmap_lens(intrinsics.distortion)
     parameters = [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, *lens.values()]
     threads = threads or len(os.sched_getaffinity(0))

@@ -323,7 +323,11 @@ class Spiked(MapMethods, ResultMethods):
             self._connection.request("PUT", f"uploads/{upload.id}/calibration", content=content, headers=headers)
         with path.open("rb") as file:
             while upload.offset_bytes < size:
-                upload = self._send(upload, file.seek(upload.offset_bytes), file.read(_CHUNK_BYTES))
+                offset = file.seek(upload.offset_bytes)
+                chunk = file.read(_CHUNK_BYTES)
+                if not chunk:
+                    raise SpikedError(f"{path} became shorter than {size} bytes while it was sent; send it again")
+                upload = self._send(upload, offset, chunk)
                 if progress is not None:
                     progress(upload.offset_bytes, size)
         return self._connection.post(f"uploads/{upload.id}:complete", None, CaptureOut)

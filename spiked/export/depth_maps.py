@@ -92,4 +92,5 @@ KIND = ExportKind(
     loses="what is behind the first surface",
     suffix="",
     fill=fill,
+    stale=("depth/*", "normal/*", "colour/*"),
 )

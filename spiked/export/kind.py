@@ -40,6 +40,8 @@ class ExportKind:
     """Whether the title of the source is in it."""
     replaces: tuple[str, ...] = ()
     """Patterns of the files of an earlier folder that a new one replaces; the folder may then hold no others."""
+    stale: tuple[str, ...] = ()
+    """Patterns of the files of an earlier folder that do not belong to a new one; others stay."""
 
     @property
     def folder(self) -> bool:
@@ -58,7 +60,7 @@ class ExportKind:
         Raises SpikedError for a source that lacks what the format needs, SceneError for a folder that holds files of
         something else, and OSError.
         """
-        with whole_folder(path, self.replaces) if self.folder else whole_file(path) as part:
+        with whole_folder(path, self.replaces, self.stale) if self.folder else whole_file(path) as part:
             return self.fill(source, part, options)
 
     def check(self) -> None:

@@ -47,4 +47,5 @@ KIND = ExportKind(
     loses="splats; poses between the pictures",
     suffix="",
     fill=fill,
+    stale=("images/*",),
 )

@@ -15,7 +15,7 @@ from spiked.recording.sidecar import (
     write_sidecar,
 )
 from spiked.recording.verify import Verdict, Verification, verify
-from spiked.recording.writer import RecordingWriter, whole_recording
+from spiked.recording.writer import RecordingWriter, remove_recording, whole_recording
 
 __all__ = [
     "LIVE",
@@ -41,6 +41,7 @@ __all__ = [
     "read_sidecar",
     "recorded_calibration",
     "recover",
+    "remove_recording",
     "sidecar_path",
     "verify",
     "whole_recording",

@@ -262,12 +262,21 @@ def whole_recording(path: Path, sensor: Sensor, **more: Any) -> Iterator[Recordi
 
     A part of it would pass for a shorter recording. `more` as of `RecordingWriter`. Raises RecordingError.
     """
-    files = path, sidecar_path(path), index_path(path)
-    new = not any(file.exists() for file in files)
+    new = not any(file.exists() for file in _files_of(path))
     try:
         with RecordingWriter(path, sensor, **more) as writer:
             yield writer
     except BaseException:
-        for file in files if new else ():
-            file.unlink(missing_ok=True)
+        if new:
+            remove_recording(path)
         raise
+
+
+def remove_recording(path: Path) -> None:
+    """Remove a recording with its sidecar and index, as far as they exist. Raises OSError."""
+    for file in _files_of(path):
+        file.unlink(missing_ok=True)
+
+
+def _files_of(path: Path) -> tuple[Path, ...]:
+    return path, sidecar_path(path), index_path(path)

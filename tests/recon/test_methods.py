@@ -25,7 +25,7 @@ from spiked.recon import (
     Reconstructor,
 )
 from spiked.recon.alternation import continued
-from spiked.recon.mapping.pose_steps import PoseGradient
+from spiked.recon.mapping.pose_steps import LONGEST_STEP, PoseGradient
 from spiked.recon.untracked import UntrackedOdometry
 from spiked.recording import open_recording
 from spiked.sensor import Sensor
@@ -89,6 +89,22 @@ def test_the_pose_gradient_through_the_sub_frames_is_that_of_finite_differences(
             return step.model(path.move(sign * direction[:, :3], sign * direction[:, 3:]), view_id).loss
 
         assert (gradient * direction).sum() == pytest.approx((moved(1) - moved(-1)) / 2, rel=0.03)
+
+
+def test_a_path_that_is_far_off_stays_finite(known: Reconstructor) -> None:
+    """Half a radian: its views show nothing of what they should, and their curvature says nothing."""
+    trainer = known.trainer
+    assert known.path is not None
+    times = np.arange(1.0, FRAMES - 1)
+    path = Spline.fit(times, *known.path.poses(times), 16, 1)
+    ids = trainer.views.mappable(path)
+    path = path.move(*np.random.default_rng(0).normal(scale=0.5, size=(2, len(path.centres), 3)))
+    step = PoseGradient(trainer, 0)
+    for done in range(10):
+        moved = step.improve(path, ids, 1, done / 10)
+        assert np.abs(moved.centres - path.centres).max() <= LONGEST_STEP
+        path = moved
+    assert np.isfinite(path.rotations).all()
 
 
 def test_the_method_of_the_paper_runs_without_tracks_and_poses(room: Room) -> None:

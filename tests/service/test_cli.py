@@ -229,8 +229,19 @@ def test_ctrl_c_keeps_what_there_is(room: Path, tmp_path: Path) -> None:
         process.send_signal(signal.SIGINT)
         told = process.stderr.read()
     assert process.returncode == 130, told
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["outcome"] == "interrupted"
+    assert any(warning.startswith("interrupted after 512 of 512 frames") for warning in report["warnings"])
     assert len(Trajectory.read_tum(tmp_path / "out" / "trajectory.tum")) > 480
     assert len(Scene.read_ply(tmp_path / "out" / "scene.ply")) > 100
+
+
+def test_frames_that_the_time_did_not_reach_are_told(room: Path, tmp_path: Path) -> None:
+    done = run("reconstruct", room / "room.dat", "-o", tmp_path / "out", "--seconds", "0.001")
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["frames"] < 512 and f"first {report['frames']} of 512 frames" in done.stdout
+    assert any("of 512 frames, and the others are left out" in warning for warning in report["warnings"])
+    assert report["outcome"] in ("cut short", "failed")
 
 
 def test_ctrl_c_in_the_middle_of_a_line(room: Path, tmp_path: Path) -> None:

@@ -54,6 +54,22 @@ def test_poses_and_figures_are_written(place: Path, tmp_path: Path) -> None:
     assert np.allclose([view["position"] for view in figures["views"]], path.centres, atol=1e-6)
 
 
+def test_the_path_of_a_map_is_not_replaced(place: Path) -> None:
+    before = (place / "map" / "trajectory.tum").read_bytes()
+    assert "holds a reconstruction, whose path would be lost" in said(
+        place / "map", place / "again.dat", "-o", place / "map"
+    )
+    assert (place / "map" / "trajectory.tum").read_bytes() == before
+
+
+def test_figures_do_not_replace_the_sidecar_of_a_recording(place: Path) -> None:
+    before = (place / "again.json").read_bytes()
+    assert "again.json is part of a recording" in said(
+        place / "map", place / "again.dat", "--json", place / "again.json"
+    )
+    assert (place / "again.json").read_bytes() == before
+
+
 def test_a_part_of_a_recording_keeps_its_times(place: Path, tmp_path: Path) -> None:
     done = run(place / "map", place / "again.dat", "-o", tmp_path, "--start", "100", "--frames", "150")
     assert done.exit_code == 0, done.output

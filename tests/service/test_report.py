@@ -224,8 +224,10 @@ def test_an_interrupted_run_is_said_to_be_one(result: Path, tmp_path: Path) -> N
     assert "incomplete" in page.said and "512 frames" in page.said and page.figures["poses"] == [512]
     assert sorted(file.name for file in out.iterdir()) == ["checkpoint", "report.html"]
     for name in ("report.json", "trajectory.tum", "scene.ply"):
-        shutil.copy(result / name, out)
-    assert "spiked reconstruct --resume completes it" in report_of(out).said
+        shutil.copy(result / name, out)  # of a run before: what is shown is the one that was interrupted
+    page = report_of(out)
+    assert "spiked reconstruct --resume completes it" in page.said
+    assert page.figures["poses"] == [512] and page.figures["splats"] != report_of(result).figures["splats"]
 
 
 def test_maps_of_several_recordings_and_localisations(tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_files(room: Path, whole: Pa
     assert report["options"]["steps"] == 30
     done = run("reconstruct", "--resume", tmp_path / "out")
     assert done.returncode == 2
-    assert "has no checkpoint: the run there is complete" in done.stderr
+    assert "has no checkpoint: the run there is over" in done.stderr
 
 
 @pytest.fixture
@@ -145,7 +145,9 @@ def test_ctrl_c_leaves_a_checkpoint_too(room: Path, whole: Path, tmp_path: Path)
         process.send_signal(signal.SIGINT)
         told = process.stderr.read()
     assert process.returncode == 130, told
-    assert (tmp_path / "out" / "report.json").exists()
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["outcome"] == ("interrupted" if report.get("poses") else "failed")
+    assert report["warnings"][-1].startswith("interrupted after ")
     done = run("reconstruct", "--resume", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     for name in RESULTS:

@@ -10,6 +10,8 @@ from pathlib import Path
 
 from spiked.errors import ConfigurationError
 
+_OF_RECORDINGS = (".dat", ".json", ".index")
+"""Suffixes of a recording's files."""
 _LOCK = ".lock"
 """In a folder that one command at a time may work in."""
 
@@ -37,6 +39,8 @@ def try_file(option: str, file: Path) -> None:
     with writing(option, file):
         if file.is_dir():
             raise ConfigurationError(f"{option} {file} is a folder; name a file")
+        if file.exists() and file.suffix in _OF_RECORDINGS and file.with_suffix(".dat").exists():
+            raise ConfigurationError(f"{option} {file} is part of a recording and would be lost; name another file")
         if file.exists():
             os.close(os.open(file, os.O_WRONLY | os.O_APPEND))
             return

@@ -1,5 +1,6 @@
 """A run of `spiked reconstruct` that can be resumed: its checkpoints, and the options it was begun with."""
 
+import uuid
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -15,7 +16,7 @@ from spiked.recon.checkpoint_file import CHECKPOINT, exists
 from spiked.recording import Recording, RecordingGeometry, open_recording
 from spiked_service.cli import outputs
 from spiked_service.cli.console import messages, report_warning
-from spiked_service.results.map_reports import recording_section
+from spiked_service.results.map_reports import RUN, recording_section
 
 RESULTS = "scene.ply", "trajectory.tum", "report.json", "overview.png"
 """Files in OUT."""
@@ -24,7 +25,7 @@ _NOT_STORED = "file", "out", "resume", "watch", "watch_port"
 _GEOMETRY = TypeAdapter(RecordingGeometry)
 
 
-@dataclass(frozen=True)
+@dataclass
 class ReconstructionRun:
     """A reconstruction of a recording, begun or resumed."""
 
@@ -32,13 +33,41 @@ class ReconstructionRun:
     reconstructor: Reconstructor
     out: Path
     checkpoints: CheckpointSaver
+    id: str
+    """What tells it from other runs in the same folder."""
     budget_s: float | None
     map: Path | None = None
     """Folder of the map that is extended."""
+    _outcome: str | None = None
+    """Other than that of the reconstructor."""
+
+    @property
+    def frames(self) -> int:
+        """Frames of the recording, lost ones included."""
+        return self.recording.capture_index(self.recording.frames - 1) + 1
+
+    def note_the_end(self, interrupted: bool) -> None:
+        """Warn of results that are not those of the whole run."""
+        made = self.reconstructor
+        if interrupted:
+            self._outcome = "interrupted"
+            made.warnings.append(
+                f"interrupted after {made.frames:,} of {self.frames:,} frames and {made.trainer.mapper.steps:,} steps "
+                "of the map: these are results on the way"
+            )
+        elif made.frames < self.frames:
+            self._outcome = "cut short"
+            made.warnings.append(
+                f"the time was over after {made.frames:,} of {self.frames:,} frames, and the others are left out: "
+                "raise --seconds"
+            )
 
     def report(self) -> dict[str, object]:
         """The content of report.json: the reconstructor's, and where the recording is and how it was read."""
-        return {**self.reconstructor.report(), "recording": recording_section(self.recording)}
+        made = self.reconstructor.report()
+        if made["outcome"] == "complete" and self._outcome is not None:
+            made["outcome"] = self._outcome
+        return {**made, "recording": recording_section(self.recording), RUN: self.id}
 
     @classmethod
     def begun(
@@ -46,11 +75,12 @@ class ReconstructionRun:
     ) -> "ReconstructionRun":
         """A new run: a checkpoint of an earlier one in `out` is removed."""
         folder = out / CHECKPOINT
+        parameters = {**parameters, RUN: uuid.uuid4().hex}
         saver = CheckpointSaver(folder, recording, parameters, report_warning)
         if exists(folder):
             report_warning(f"{out} held the checkpoint of an interrupted run; this run begins anew and replaces it")
             saver.remove()
-        return cls(recording, reconstructor, out, saver, parameters["seconds"], _map_of(parameters))
+        return cls(recording, reconstructor, out, saver, parameters[RUN], parameters["seconds"], _map_of(parameters))
 
     @classmethod
     def resumed(cls, context: typer.Context, folder: Path, file: Path | None, out: Path | None) -> "ReconstructionRun":
@@ -58,8 +88,8 @@ class ReconstructionRun:
         if out is not None and out.absolute() != folder.absolute():
             raise ConfigurationError(f"--resume {folder} writes its results there: leave out --out {out}")
         if not exists(folder / CHECKPOINT):
-            complete = (folder / "report.json").exists()
-            why = "the run there is complete" if complete else "no run was interrupted there after its first seconds"
+            ended = (folder / "report.json").exists()
+            why = "the run there is over" if ended else "no run was interrupted there after its first seconds"
             raise ConfigurationError(
                 f"--resume {folder} has no checkpoint: {why}; to reconstruct anew leave out --resume"
             )
@@ -75,7 +105,7 @@ class ReconstructionRun:
         messages.print(f"resumed: {interrupted.stage}", markup=False)
         budget_s = parameters["seconds"]
         left_s = None if budget_s is None else max(0.0, budget_s - reconstructor.work_s)
-        return cls(recording, reconstructor, folder, saver, left_s, _map_of(parameters))
+        return cls(recording, reconstructor, folder, saver, parameters.get(RUN, ""), left_s, _map_of(parameters))
 
 
 def parameters_of(context: typer.Context, geometry: RecordingGeometry) -> dict[str, Any]:

@@ -26,6 +26,8 @@ MAP_FILES = ("report.json", "scene.ply", "trajectory.tum")
 """Files of a map."""
 PATHS = "paths"
 """Folder with the path of each recording, in the folder of a map of several."""
+EVALUATION = "evaluation.json"
+"""In an output folder: the figures of `spiked evaluate --json`."""
 _REPORT = "report.json"
 _MAKING = ".making-"
 """Names of folders with files that are not whole yet begin so."""
@@ -46,6 +48,8 @@ class MapFolder:
     """The path of each recording by its name; of one recording by the folder's."""
     versions: dict[str, str] = field(default_factory=dict)
     """Of the programs that made the map."""
+    outcome: str = "complete"
+    """Of the run that made it, or that it was interrupted or cut short."""
 
     @classmethod
     def read(cls, folder: Path) -> "MapFolder":
@@ -59,15 +63,15 @@ class MapFolder:
             report = _Report.model_validate_json((folder / "report.json").read_bytes())
         except (OSError, ValueError) as error:
             raise SceneError(f"cannot read the camera of the map in {folder / 'report.json'}: {error}") from error
-        if report.outcome != "complete":
-            raise SceneError(f"{folder} holds a reconstruction that has {report.outcome}: it is no map")
+        if report.outcome == "failed":
+            raise SceneError(f"{folder} holds a reconstruction that has failed: it is no map")
         sensor, (fx, fy) = report.sensor, report.focal_px
         cx, cy = report.principal_point_px or (sensor.width / 2, sensor.height / 2)
         scene, path = Scene.read_ply(folder / "scene.ply"), Trajectory.read_tum(folder / "trajectory.tum")
         paths = {one.name: Trajectory.read_tum(folder / PATHS / f"{one.name}.tum") for one in report.paths}
         intrinsics = Intrinsics(fx, fy, cx, cy, distortion_of(report.distortion))
         paths = paths or {file_name(folder.resolve().name): path}
-        return cls(scene, path, sensor.width, sensor.height, intrinsics, paths, report.versions)
+        return cls(scene, path, sensor.width, sensor.height, intrinsics, paths, report.versions, report.outcome)
 
     @property
     def known(self) -> KnownMap:
@@ -125,8 +129,8 @@ def write_map(
 def replacing(folder: Path) -> Iterator[Path]:
     """A folder for the files of a new result, which take the place of those in `folder` when all are written.
 
-    After an error the result before is whole; after a kill there is no report, and half a map is none. The scale and
-    the paths of the result before are removed. Raises OSError.
+    After an error the result before is whole; after a kill there is no report, and half a map is none. Nothing of a
+    map before is left, with its scale, paths and evaluation; other files stay. Raises OSError.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for left in folder.glob(f"{_MAKING}*"):
@@ -136,6 +140,9 @@ def replacing(folder: Path) -> Iterator[Path]:
     try:
         yield making
         (folder / _REPORT).unlink(missing_ok=True)
+        for name in (*MAP_FILES, EVALUATION):
+            if not (making / name).exists():
+                (folder / name).unlink(missing_ok=True)
         remove_scale(folder)
         if (folder / PATHS).is_dir():
             shutil.rmtree(folder / PATHS)

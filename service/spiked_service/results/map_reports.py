@@ -17,6 +17,8 @@ from spiked_service.results.timeline import frames_at
 
 LOCALISATION, REGISTRATION, REPORT = "localisation.json", "registration.json", "report.json"
 """Names of the files in the folder of a job."""
+RUN = "run"
+"""Key of report.json, and of the parameters in a checkpoint: what tells a run from others in the same folder."""
 _GEOMETRY = TypeAdapter(RecordingGeometry)
 
 

@@ -21,6 +21,9 @@ STEP_SHARES = 0.3, 0.05
 With 1 and 0.1 a path diverges at first, and ends worse (decision 41)."""
 AVERAGED = 0.8
 """Decay rate of the running means of gradient and curvature, in steps of a knot; 0.9 is too slow (decision 41)."""
+LONGEST_STEP = 0.02
+"""Largest turn, rad, and way, in units of the map, of a knot in one step. Steps near the minimum are a hundredth of it;
+a path that diverges would take ever longer ones, until it is not finite."""
 CURVATURE_DAMPING = 1e-3
 """Added to the diagonal of the curvature, relative to it."""
 
@@ -120,7 +123,15 @@ class PoseGradient:
         damping = CURVATURE_DAMPING * np.einsum("kii->ki", curved) + 1e-9 * np.trace(curved, axis1=1, axis2=2)[:, None]
         curved = curved + (damping + np.finfo(float).tiny)[:, :, None] * np.eye(6)
         step[moved] = -begin * (end / begin) ** share * np.linalg.solve(curved, self._slope[moved, :, None])[..., 0]
-        return path.move(step[:, :3], step[:, 3:])
+        step = np.clip(np.nan_to_num(step), -1, 1)
+        turn, way = (part * _shortened(part) for part in (step[:, :3], step[:, 3:]))
+        return path.move(turn, way)
+
+
+def _shortened(step: Array) -> Array:
+    """Factors [n, 1] by which steps [n, 3] are no longer than `LONGEST_STEP`."""
+    length = np.linalg.norm(step, axis=1, keepdims=True)
+    return LONGEST_STEP / np.maximum(length, LONGEST_STEP)
 
 
 def first_view_knot(trainer: MapTrainer, path: Spline) -> int:

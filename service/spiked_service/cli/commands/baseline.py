@@ -20,8 +20,8 @@ from spiked_service.cli import recording_flags as g
 from spiked_service.cli.commands.reconstruct import MapOptionTexts, ProgressDisplay
 from spiked_service.cli.console import messages, output, report_error, report_warning
 from spiked_service.cli.flag_groups import with_groups
+from spiked_service.results.map_folder import replacing
 from spiked_service.results.recording_feed import reconstruct_recording
-from spiked_service.results.scene_scale import remove_scale
 from spiked_service.settings.map_options import changed
 
 RESULTS = "trajectory.tum", "report.json"
@@ -156,7 +156,6 @@ def baseline(
         posed = _by_colmap(recording, options, out, (fit.threads, fit.seed), all_frames=all_frames)
     report: dict[str, Any] = {"images": made.images, "poses": poses, "map": map, **posed.report}
     if map is MapSource.NONE:
-        (out / "scene.ply").unlink(missing_ok=True)
         _write(out, posed.trajectory, {"frames": recording.frames, "baseline": report})
         output.print(f"{out}: {len(posed.trajectory)} poses for {recording.frames} frames, no map", markup=False)
         return
@@ -216,10 +215,7 @@ def _map(recording: Recording, reconstructor: Reconstructor, out: Path, report: 
     for warning in reconstructor.warnings:
         report_warning(warning)
     path = reconstructor.trajectory()
-    with outputs.writing("--out", out):
-        out.mkdir(parents=True, exist_ok=True)
-        reconstructor.scene().write_ply(out / "scene.ply", reconstructor.white)
-    _write(out, path, {**reconstructor.report(), "baseline": report})
+    _write(out, path, {**reconstructor.report(), "baseline": report}, reconstructor)
     if reconstructor.failure is not None:
         report_error(SpikedError(f"no map was made: {reconstructor.failure}"))
         raise typer.Exit(1)
@@ -227,9 +223,9 @@ def _map(recording: Recording, reconstructor: Reconstructor, out: Path, report: 
     output.print(f"{out}: {len(path)} poses for {recording.frames} frames, {splats} splats", markup=False)
 
 
-def _write(out: Path, trajectory: Trajectory, report: dict[str, Any]) -> None:
-    with outputs.writing("--out", out):
-        out.mkdir(parents=True, exist_ok=True)
-        remove_scale(out)
-        trajectory.write_tum(out / "trajectory.tum")
-        (out / "report.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
+def _write(out: Path, trajectory: Trajectory, report: dict[str, Any], mapped: Reconstructor | None = None) -> None:
+    with outputs.writing("--out", out), replacing(out) as making:
+        if mapped is not None:
+            mapped.scene().write_ply(making / "scene.ply", mapped.white)
+        trajectory.write_tum(making / "trajectory.tum")
+        (making / "report.json").write_text(json.dumps(report, indent=1), encoding="utf-8")

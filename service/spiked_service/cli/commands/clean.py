@@ -1,5 +1,6 @@
 """`spiked clean`: a scene without floaters."""
 
+import json
 import shutil
 from pathlib import Path
 from typing import Annotated
@@ -9,10 +10,12 @@ from rich.progress import Progress
 
 from spiked.cleaning import Box, FloaterRemoval
 from spiked.cleaning import clean as clean_scene
+from spiked.errors import ConfigurationError
 from spiked_service.cli import outputs
 from spiked_service.cli.console import messages, output
-from spiked_service.results.map_folder import MAP_FILES, PATHS, MapFolder
-from spiked_service.results.scene_scale import SCALE, remove_scale
+from spiked_service.cli.maps import read_map
+from spiked_service.results.map_folder import MAP_FILES, PATHS, replacing
+from spiked_service.results.scene_scale import SCALE
 
 
 def clean(
@@ -41,7 +44,9 @@ def clean(
     - `spiked clean out -o desk --box -1 -1 0 1 0.5 3`
     """
     outputs.try_folder("--out", out, MAP_FILES)
-    found = MapFolder.read(map_folder)
+    if out.resolve() == map_folder.resolve():
+        raise ConfigurationError(f"--out {out} is the scene that is cleaned; name another folder")
+    found = read_map(map_folder)
     with Progress(console=messages, transient=True, disable=not messages.is_terminal) as bar:
         task = bar.add_task("cleaning", total=1.0)
         cleaned = clean_scene(
@@ -52,17 +57,16 @@ def clean(
             FloaterRemoval(shrink=shrink) if floaters or shrink else None,
             lambda share: bar.update(task, completed=share),
         )
-    with outputs.writing("--out", out):
-        out.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(map_folder / "trajectory.tum", out / "trajectory.tum")  # refuses the folder itself
-        (out / "report.json").unlink(missing_ok=True)
-        remove_scale(out)
+    counts = {"outside": cleaned.outside, "floaters": cleaned.floaters, "shrunk": cleaned.shrunk}
+    report = json.loads((map_folder / "report.json").read_bytes()) | {"splats": len(cleaned.scene), "cleaned": counts}
+    with outputs.writing("--out", out), replacing(out) as making:
+        shutil.copyfile(map_folder / "trajectory.tum", making / "trajectory.tum")
         if (map_folder / SCALE).is_file():
-            shutil.copyfile(map_folder / SCALE, out / SCALE)
+            shutil.copyfile(map_folder / SCALE, making / SCALE)
         if (map_folder / PATHS).is_dir():
-            shutil.copytree(map_folder / PATHS, out / PATHS, dirs_exist_ok=True)
-        cleaned.scene.write_ply(out / "scene.ply")
-        shutil.copyfile(map_folder / "report.json", out / "report.json")  # last: half a map is none
+            shutil.copytree(map_folder / PATHS, making / PATHS)
+        cleaned.scene.write_ply(making / "scene.ply")
+        (making / "report.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
     output.print(
         f"{out}: {len(cleaned.scene)} of {len(found.scene)} splats; removed {cleaned.outside} outside and "
         f"{cleaned.floaters} floaters, made {cleaned.shrunk} smaller",

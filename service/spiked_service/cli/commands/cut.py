@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from spiked.errors import RecordingError
-from spiked.recording import Recording
+from spiked.recording import Recording, remove_recording
 from spiked.recording.cut import cut_recording
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
@@ -53,8 +53,13 @@ def cut(
     truth = _truth(file, out)
     begin, end = _frames(recording, frames or seconds or Range(None, None), 1.0 if frames else rate)
     count, lost = cut_recording(recording, out, begin, end)
-    with outputs.writing("--out", out.parent):
-        cut_truth(file.resolve().parent, out.resolve().parent, truth, begin / rate, end / rate)
+    if truth:
+        try:
+            with outputs.writing("--out", out.parent):
+                cut_truth(file.resolve().parent, out.resolve().parent, truth, begin / rate, end / rate)
+        except BaseException:
+            remove_recording(out)  # so that the same command can be repeated
+            raise
     with_truth = f", {' and '.join(truth)}" if truth else ""
     output.print(f"{out}: frames {begin}:{end} of {file.name}: {count} frames, {lost} lost{with_truth}", markup=False)
 

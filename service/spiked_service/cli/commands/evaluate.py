@@ -19,6 +19,7 @@ from spiked.render import Camera
 from spiked.render.cpu import Rasteriser
 from spiked.scene import Scene
 from spiked.trajectory import Trajectory
+from spiked.whole_files import whole_folder, write_atomically
 from spiked_service.cli import outputs
 from spiked_service.cli.console import output
 
@@ -81,7 +82,7 @@ def evaluate(
         output.print(f"{name:18s} {value:.4f}" + (f"   by {LPIPS_NETWORK}" if name == "lpips" else ""))
     if json_out is not None:
         with outputs.writing("--json", json_out):
-            json_out.write_text(json.dumps(figures, indent=1), encoding="utf-8")
+            write_atomically(json_out, json.dumps(figures, indent=1).encode())
 
 
 @dataclass(frozen=True)
@@ -133,12 +134,12 @@ def _score_views(
 
 def _write_pictures(folder: Path, views: _Scored) -> None:
     """NAME-truth.png and NAME-render.png of each view."""
-    with outputs.writing("--pictures", folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    for name, truth, render in zip(views.names, views.truths, views.score.shown, strict=True):
-        for kind, picture in (("truth", truth), ("render", render)):
-            levels = np.rint(255 * picture).astype(np.uint8)
-            cv2.imwrite(str(folder / f"{name}-{kind}.png"), levels if levels.ndim == 2 else levels[..., ::-1])
+    with outputs.writing("--pictures", folder), whole_folder(folder, stale=("*-truth.png", "*-render.png")) as making:
+        for name, truth, render in zip(views.names, views.truths, views.score.shown, strict=True):
+            for kind, picture in (("truth", truth), ("render", render)):
+                levels = np.rint(255 * picture).astype(np.uint8)
+                shown = cv2.imencode(".png", levels if levels.ndim == 2 else levels[..., ::-1])[1]
+                (making / f"{name}-{kind}.png").write_bytes(shown.tobytes())
 
 
 class _View(BaseModel):

@@ -8,16 +8,18 @@ from typing import Annotated
 import typer
 from rich.progress import track
 
-from spiked.errors import RecordingError
+from spiked.errors import ConfigurationError, RecordingError
 from spiked.recon import Localisation, Localiser, MapIndex
 from spiked.recon.report import machine, versions
 from spiked.recording import Recording
 from spiked.sensor import Sensor
+from spiked.whole_files import whole_folder
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import messages, output, report_warning
 from spiked_service.cli.flag_groups import with_groups
-from spiked_service.results.map_folder import MapFolder, camera_in
+from spiked_service.cli.maps import read_map
+from spiked_service.results.map_folder import MAP_FILES, camera_in
 from spiked_service.results.map_reports import LOCALISATION, localisation_figures, recording_section
 from spiked_service.results.recording_feed import pieces
 
@@ -55,10 +57,14 @@ def localise(
     - `spiked localise out again.dat -o where --start 20000 --frames 1000`
     """
     if out is not None:
+        if any((out / name).exists() for name in MAP_FILES if name != "trajectory.tum"):
+            raise ConfigurationError(
+                f"--out {out} holds a reconstruction, whose path would be lost; name another folder"
+            )
         outputs.try_folder("--out", out, ("trajectory.tum", LOCALISATION))
     if json_out is not None:
         outputs.try_file("--json", json_out)
-    known = MapFolder.read(map_folder)
+    known = read_map(map_folder)
     described = g.open_described(file, geometry.stated(), profile)
     recording = described.recording
     for warning in recording.warnings:
@@ -80,11 +86,10 @@ def localise(
     if not found.recognised:
         raise typer.Exit(NOT_RECOGNISED)
     if out is not None:
-        with outputs.writing("--out", out):
-            out.mkdir(parents=True, exist_ok=True)
+        with outputs.writing("--out", out), whole_folder(out) as making:
             report = _report(found, index, recording, sensor)
-            (out / LOCALISATION).write_text(json.dumps(report, indent=1), encoding="utf-8")
-            found.trajectory(sensor.frame_rate_hz).write_tum(out / "trajectory.tum")
+            (making / LOCALISATION).write_text(json.dumps(report, indent=1), encoding="utf-8")
+            found.trajectory(sensor.frame_rate_hz).write_tum(making / "trajectory.tum")
         output.print(f"{out / 'trajectory.tum'}: {len(found.views)} poses", markup=False)
 
 

@@ -6,11 +6,13 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
+from spiked.errors import ConfigurationError
 from spiked.recon import Merged
 from spiked.recon import merge as merge_maps
 from spiked.recon.report import versions
 from spiked_service.cli import outputs
 from spiked_service.cli.console import messages, output
+from spiked_service.cli.maps import read_map
 from spiked_service.results.map_folder import MAP_FILES, MapFolder, joint_paths, write_map
 
 
@@ -32,7 +34,9 @@ def merge(
     Example: `spiked merge monday tuesday -o flat`
     """
     outputs.try_folder("--out", out, MAP_FILES)
-    maps = MapFolder.read(first), MapFolder.read(second)
+    if out.resolve() in (first.resolve(), second.resolve()):
+        raise ConfigurationError(f"--out {out} is one of the maps that are merged; name another folder")
+    maps = read_map(first), read_map(second)
     with Progress(console=messages, transient=True, disable=not messages.is_terminal) as bar:
         task = bar.add_task("merging", total=1.0)
         merged = merge_maps(
@@ -63,7 +67,7 @@ def _report(merged: Merged, folders: tuple[Path, Path], maps: tuple[MapFolder, M
         "focal_px": [intrinsics.fx, intrinsics.fy],
         "principal_point_px": [intrinsics.cx, intrinsics.cy],
         **lens,
-        "outcome": "complete",
+        "outcome": next((one.outcome for one in maps if one.outcome != "complete"), "complete"),
         "splats": len(merged.scene),
         "merged": {
             "maps": [

@@ -50,6 +50,7 @@ from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import messages, output, report_error, report_warning
 from spiked_service.cli.flag_groups import with_groups
+from spiked_service.cli.maps import read_map
 from spiked_service.cli.reconstruction_run import RESULTS, ReconstructionRun, parameters_of
 from spiked_service.results.map_folder import MapFolder, file_name, joint_paths, replacing, write_map
 from spiked_service.results.recording_feed import reconstruct_recording
@@ -127,7 +128,12 @@ def reconstruct(
     ] = None,
     poses: Annotated[Path | None, typer.Option(help="TUM file of known camera-to-world poses.")] = None,
     first_depth: Annotated[Path | None, _FIRST_DEPTH] = None,
-    seconds: Annotated[float | None, typer.Option(help="Time budget; reduces the number of steps.", min=0.0)] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            help="Time budget: reduces the number of steps; frames that are not read by then are left out.", min=0.0
+        ),
+    ] = None,
     *,
     chosen: ReconstructionFlags,
     map_option: MapOptionTexts = None,
@@ -227,11 +233,12 @@ def _carry_out(run: ReconstructionRun, page: "Watch | None") -> None:
     if known is not None and not interrupted and reconstructor.failure is None:
         run.checkpoints.save(reconstructor, now=True)  # after a kill only the rest is repeated
         joint, interrupted = _extended(known, reconstructor)
+    run.note_the_end(interrupted)
     if known is not None and isinstance(joint, Merged):
         _write_joint(run, known, joint)
     else:
         _write(run, {} if joint is None else {"map": str(run.map), "joined": False, "reason": str(joint)})
-    _report(reconstructor, run.out)
+    _report(run)
     if known is not None and joint is not None:
         _report_joint(run, known, joint)
     if interrupted:
@@ -244,7 +251,7 @@ def _carry_out(run: ReconstructionRun, page: "Watch | None") -> None:
 
 def _check_map(folder: Path, out: Path) -> None:
     """Raises SceneError and ConfigurationError for a map that cannot be extended, before hours of work."""
-    MapFolder.read(folder)
+    read_map(folder)
     if out.resolve() == folder.resolve():
         raise ConfigurationError(f"--out {out} is the map that is to be extended; name another folder")
 
@@ -291,8 +298,7 @@ def _report_joint(run: ReconstructionRun, known: MapFolder, joint: Merged | Spik
 def _run_through(run: ReconstructionRun, page: "Watch | None") -> bool:
     """Feed and refine with a progress display. Return whether it was interrupted."""
     recording, reconstructor = run.recording, run.reconstructor
-    total = recording.capture_index(recording.frames - 1) + 1
-    with _interruptible() as interrupt, ProgressDisplay(total) as display:
+    with _interruptible() as interrupt, ProgressDisplay(run.frames) as display:
         saved = False
 
         def show(status: Status) -> None:
@@ -314,15 +320,17 @@ def _run_through(run: ReconstructionRun, page: "Watch | None") -> bool:
     return interrupt.is_set()
 
 
-def _report(reconstructor: Reconstructor, out: Path) -> None:
+def _report(run: ReconstructionRun) -> None:
     """Print the warnings and the outcome."""
+    reconstructor = run.reconstructor
     for warning in reconstructor.warnings:
         report_warning(warning)
     status, failure = reconstructor.status(), reconstructor.failure
     reason = "" if status.state is State.TRACK else f": {status.reason}"
     outcome = f"{status.splats} splats, {status.state}{reason}" if failure is None else "failed"
     poses = len(reconstructor.trajectory())
-    output.print(f"{out}: {poses} poses for {status.frames} frames, {outcome}", markup=False)
+    read = f"{status.frames}" if status.frames >= run.frames else f"the first {status.frames} of {run.frames}"
+    output.print(f"{run.out}: {poses} poses for {read} frames, {outcome}", markup=False)
     if failure is not None:
         report_error(SpikedError(f"no path was found: {failure}"))
 

@@ -14,6 +14,7 @@ from spiked.render.cpu import Rasteriser
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics
 from spiked.trajectory import Trajectory
+from spiked.whole_files import whole_folder
 from spiked_service.cli import outputs
 from spiked_service.cli.console import messages, output
 from spiked_service.cli.recording_flags import DistortionText, parse_intrinsics
@@ -52,10 +53,9 @@ def render(
     splats, path = Scene.read_ply(scene), Trajectory.read_tum(poses)
     shown_white = splats.colour_of_white if white is None else white
     rows = evenly(len(path), count)
-    with outputs.writing("--out", out):
-        out.mkdir(parents=True, exist_ok=True)
+    with outputs.writing("--out", out), whole_folder(out, stale=(f"{6 * '[0-9]'}.*",)) as making:
         for row in track(rows, "rendering", console=messages, transient=True):
             shown = splats.seen_from(path.centres[row])
             image = rasteriser.forward(shown, path.rotations[row][None], path.centres[row][None])
-            (out / f"{row:06d}.{kind}").write_bytes(encode(image.values, kind, shown_white))
+            (making / f"{row:06d}.{kind}").write_bytes(encode(image.values, kind, shown_white))
     output.print(f"{out}: {len(rows)} pictures")

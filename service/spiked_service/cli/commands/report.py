@@ -9,10 +9,9 @@ import typer
 from spiked.recon.checkpoint_file import CHECKPOINT, exists
 from spiked_service.cli import outputs
 from spiked_service.cli.console import output
-from spiked_service.results.map_reports import REPORT
 from spiked_service.results.report.bundle import bundle_pieces
 from spiked_service.results.report.folder import FolderReport
-from spiked_service.results.report.interrupted import results_on_the_way
+from spiked_service.results.report.interrupted import is_of_interrupted_run, results_on_the_way
 from spiked_service.results.report.page import report_html
 from spiked_service.results.report.source import ReportSource
 
@@ -61,7 +60,7 @@ def report(
         raise typer.BadParameter("it is for a bundle: give --zip, too", param_hint="--with-recording")
     with ExitStack() as kept:
         made = None
-        if not (result / REPORT).exists() and exists(result / CHECKPOINT):
+        if exists(result / CHECKPOINT) and not is_of_interrupted_run(result):
             made = kept.enter_context(results_on_the_way(result, recording))
         source = FolderReport(result, recording, evaluation, with_recording, made).read()
         _write(source, file, bundle)

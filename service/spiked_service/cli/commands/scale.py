@@ -8,9 +8,10 @@ import typer
 from spiked.errors import ConfigurationError
 from spiked.frame_of_reference import FrameOfReference
 from spiked.tag_scale import TAG_FAMILIES, scale_by_tags
+from spiked.whole_files import whole_folder
 from spiked_service.cli import outputs
 from spiked_service.cli.console import output
-from spiked_service.results.map_folder import MapFolder
+from spiked_service.cli.maps import read_map
 from spiked_service.results.scene_scale import METRIC, SCALE, ScaleSource, SceneScale, read_scale, write_scale
 
 
@@ -46,7 +47,7 @@ def scale(
     if (tag is None) == (length is None):
         raise ConfigurationError("give --tag METRES, or --length METRES UNITS")
     outputs.try_folder("OUT", map_folder, (SCALE,))
-    found = MapFolder.read(map_folder)
+    found = read_map(map_folder)
     before = read_scale(map_folder)
     kept = before.up if up is None else up
     if length is not None:
@@ -64,9 +65,10 @@ def scale(
         frame = FrameOfReference(by_tags.metres_per_unit, kept)
         made = SceneScale(metres_per_unit=frame.metres_per_unit, sigma=by_tags.sigma, source=ScaleSource.TAG, up=kept)
     with outputs.writing("OUT", map_folder):
-        (map_folder / METRIC).mkdir(exist_ok=True)
-        frame.scene(found.scene).write_ply(map_folder / METRIC / "scene.ply")
-        frame.trajectory(found.trajectory).write_tum(map_folder / METRIC / "trajectory.tum")
+        with whole_folder(map_folder / METRIC, ("scene.ply", "trajectory.tum")) as metric:
+            frame.scene(found.scene).write_ply(metric / "scene.ply")
+            frame.trajectory(found.trajectory).write_tum(metric / "trajectory.tum")
+            (map_folder / SCALE).unlink(missing_ok=True)  # a kill between the two leaves no scale, not another one
         write_scale(map_folder, made)
     sure = "" if made.sigma is None else f" (+- {made.sigma:.2%})"
     output.print(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.blocks import aligned_window
+from spiked.errors import SceneError
 from spiked.evaluate import best_gain
 from spiked.rates import white_of
 from spiked.recon.frontend.demosaic import fill_mosaic
@@ -92,10 +93,14 @@ def _true_strips(held_out: Path, cells: dict[str, Path]) -> list[Strip]:
     """The middle one of the held-out views on the path and of those beside it, as `spiked evaluate` drew them."""
     if not held_out.exists():
         return []
-    views = json.loads(held_out.read_bytes())["views"]
+    try:
+        views = [dict(view) for view in json.loads(held_out.read_bytes())["views"]]
+        named = [(Path(view["file"]).stem, bool(view.get("on_trajectory", True))) for view in views]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SceneError(f"cannot read the held-out views {held_out}: {error!r}") from error
     found = []
     for on_path, where in ((True, "on the path"), (False, "beside the path")):
-        names = [Path(view["file"]).stem for view in views if bool(view.get("on_trajectory", True)) is on_path]
+        names = [name for name, beside in named if beside is on_path]
         if names:
             strip = _true_strip(names[len(names) // 2], where, cells)
             found += [] if strip is None else [strip]

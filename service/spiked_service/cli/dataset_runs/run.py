@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 from spiked.datasets import Clip, Dataset, DatasetKind, PictureScene
 from spiked.errors import ConfigurationError, DatasetError, SpikedError
 from spiked.recording import open_recording
-from spiked.whole_files import write_atomically
+from spiked.whole_files import FULL, write_atomically
 from spiked_service.cli import outputs
 from spiked_service.cli.commands.reconstruct import reconstruct
 from spiked_service.cli.commands.simulate import simulate
@@ -86,6 +86,8 @@ class DatasetRun:
     def carry_out(self) -> Table:
         """All recordings in turn, the table, and the zip. Raises InterruptedRunError and ConfigurationError."""
         items = self.dataset.items
+        for left in (self.out / "recordings").glob("*.part*"):
+            shutil.rmtree(left)  # of a run that was killed
         for number, item in enumerate(items, 1):
             folder = self.out / "results" / _folder_name(item.name)
             done = _finished(folder)
@@ -110,18 +112,22 @@ class DatasetRun:
         with outputs.writing("--out", self.out):
             result.mkdir(parents=True, exist_ok=True)
         log = self.out / "results" / f"{result.name}.log"
+        recording = None
         try:
             recording = self._recording(item, log)
         except (DatasetError, SpikedError) as error:
-            if isinstance(error, InterruptedRunError | ConfigurationError):
+            full = isinstance(error.__cause__, OSError) and error.__cause__.errno in FULL
+            if full or isinstance(error, InterruptedRunError | ConfigurationError):
                 raise
             row = Row(name=item.name, outcome=f"no recording: {error}")
         else:
             row = self._reconstructed(item, recording, result, log)
-            if not self.keep_recordings and not (isinstance(item, Clip) and item.is_recording):
-                shutil.rmtree(recording.parent)
         with outputs.writing("--out", self.out):
-            (result / _DONE).write_text(row.model_dump_json(indent=1), "utf-8")
+            write_atomically(result / _DONE, row.model_dump_json(indent=1).encode())
+        if recording is not None and not self.keep_recordings and not (isinstance(item, Clip) and item.is_recording):
+            going = recording.parent.with_name(f"{recording.parent.name}.part")  # half of it is none
+            recording.parent.rename(going)
+            shutil.rmtree(going)
         return row
 
     def _recording(self, item: Clip | PictureScene, log: Path) -> Path:
@@ -130,9 +136,6 @@ class DatasetRun:
         place, part = self.out / "recordings" / name, self.out / "recordings" / f"{name}.part"
         if place.is_dir():
             return next(place.glob("*.dat"))
-        for left in (part, part.with_suffix(".pictures")):
-            if left.exists():
-                shutil.rmtree(left)  # of a run that was killed
         with outputs.writing("--out", self.out):
             if isinstance(item, Clip):
                 item.write(part, self.kind.name)

@@ -17,14 +17,11 @@ from spiked.recording import Recording, open_recording, sidecar_path
 from spiked.render.cpu import Rasteriser
 from spiked.scene import Scene
 from spiked.trajectory import Trajectory
-from spiked_service.results.map_folder import PATHS
+from spiked_service.results.map_folder import EVALUATION, PATHS
 from spiked_service.results.map_reports import LOCALISATION, REPORT, recorded_geometry
 from spiked_service.results.report.figures import Figures
 from spiked_service.results.report.source import Pieces, Render, ReportSource, pairs, thinned, without_folders
 from spiked_service.results.view_renderer import Pose
-
-EVALUATION = "evaluation.json"
-"""In an output folder: the figures of `spiked evaluate --json`."""
 
 
 @dataclass(frozen=True)

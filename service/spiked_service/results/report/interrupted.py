@@ -8,12 +8,28 @@ from tempfile import TemporaryDirectory
 
 from pydantic import TypeAdapter
 
+from spiked.errors import SceneError
 from spiked.recon.checkpoint import Interrupted
 from spiked.recon.checkpoint_file import CHECKPOINT
 from spiked.recording import RecordingGeometry, open_recording
-from spiked_service.results.map_reports import REPORT, recording_section
+from spiked_service.results.map_reports import REPORT, RUN, recording_section
 
 _GEOMETRY = TypeAdapter(RecordingGeometry)
+
+
+def is_of_interrupted_run(folder: Path) -> bool:
+    """Whether the results in a folder with a checkpoint are of the run that it is of, and not of one before.
+
+    Raises CheckpointError and SceneError.
+    """
+    try:
+        document = json.loads((folder / REPORT).read_bytes())
+    except FileNotFoundError:
+        return False
+    except (OSError, ValueError) as error:
+        raise SceneError(f"{folder / REPORT} cannot be read: {error}") from error
+    run = Interrupted.read(folder / CHECKPOINT).parameters.get(RUN)
+    return isinstance(document, dict) and document.get(RUN) == run
 
 
 @contextmanager

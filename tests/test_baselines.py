@@ -104,6 +104,18 @@ def test_colmap_finds_the_path_and_the_command_writes_what_evaluate_reads(
     assert "pycolmap" not in sys.modules, "pycolmap has to stay in a process of its own"
 
 
+def test_pictures_and_map_of_an_earlier_run_are_not_taken(room: Recording, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    for name in ("colmap/images/00099.png", "scene.ply", "evaluation.json", "notes.txt"):
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_bytes(b"earlier")
+    arguments = ["--images", "charge", "--pictures", "12", "--window-frames", "32", "--map", "none"]
+    done = CliRunner().invoke(app, ["baseline", str(room.path), "-o", str(out), *arguments])
+    assert done.exit_code == 0, done.output
+    assert sorted(file.name for file in (out / "colmap" / "images").iterdir()) == [f"{n:05d}.png" for n in range(12)]
+    assert {file.name for file in out.iterdir()} == {"colmap", "trajectory.tum", "report.json", "notes.txt"}
+
+
 def test_a_map_is_fitted_to_given_poses(room: Recording, tmp_path: Path) -> None:
     out = tmp_path / "out"
     arguments = ["--poses", "given", "--images", "tfp", "--steps", "20"]

@@ -1,6 +1,7 @@
 """Trajectory and scene files: what is written is read back, and what is no such file is refused."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -127,6 +128,9 @@ def test_bad_scenes_are_refused(scene: Scene, tmp_path: Path) -> None:
         "only binary_little_endian": good.replace(b"binary_little_endian", b"ascii"),
         "must be a positive number": scene.ply(0.3).replace(b"radiance 0.3", b"radiance nan"),
         "no property 'opacity'": good.replace(b"opacity", b"opasity"),
+        "'-1' of vertex, which is no number": re.sub(rb"element vertex \d+", b"element vertex -1", good),
+        "'x' of vertex, which is no number": re.sub(rb"element vertex \d+", b"element vertex x", good),
+        "the property x twice": good.replace(b"property float y\n", b"property float x\n"),
     }
     for message, raw in broken.items():
         file.write_bytes(raw)

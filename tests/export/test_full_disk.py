@@ -120,6 +120,18 @@ def test_a_folder_keeps_its_other_files(tmp_path: Path) -> None:
     assert found == {"database.db": "earlier", "images/1.png": "earlier", "images/2.png": "new", "sparse/points": "new"}
 
 
+def test_files_that_do_not_belong_to_a_new_folder_are_removed(tmp_path: Path) -> None:
+    place = tmp_path / "project"
+    (place / "images").mkdir(parents=True)
+    for name in ("database.db", "images/1.png", "images/2.png"):
+        (place / name).write_text("earlier")
+    with whole_folder(place, stale=("images/*",)) as folder:
+        (folder / "images").mkdir()
+        (folder / "images" / "2.png").write_text("new")
+    found = {str(path.relative_to(place)): path.read_text() for path in place.rglob("*") if path.is_file()}
+    assert found == {"database.db": "earlier", "images/2.png": "new"}
+
+
 def test_a_folder_and_those_above_it_are_gone_after_an_error(tmp_path: Path) -> None:
     with pytest.raises(SceneError), whole_folder(tmp_path / "a" / "b" / "c") as folder:
         (folder / "file").write_text("new")

@@ -11,7 +11,7 @@ import pytest
 from spiked_service.cli.main import app
 from typer.testing import CliRunner
 
-from spiked.errors import RecordingError
+from spiked.errors import RecordingError, SpikedError
 from spiked.recording import Durability, RecordingWriter, Verdict, index_path, open_recording, read_index, verify
 from spiked.recording.cut import cut_recording
 from spiked.sensor import BitOrder, Layout, Sensor
@@ -103,6 +103,22 @@ def test_what_is_no_range_is_said(tmp_path: Path, text: str) -> None:
     for option in (f"--frames={text}", f"--seconds={text}"):
         done = CliRunner().invoke(app, ["cut", str(file), "-o", str(tmp_path / "part.dat"), option])
         assert done.exit_code == 2 and "range" in done.output
+
+
+def test_a_cut_whose_truth_cannot_be_written_can_be_repeated(tmp_path: Path) -> None:
+    file = written(tmp_path / "rec.dat", Sensor(32, 16, RATE))
+    view = {"file": "views/0.png", "timestamp": 0.001}
+    (tmp_path / "part").mkdir()
+    arguments = ["cut", str(file), "-o", str(tmp_path / "part" / "rec.dat"), "--frames", ":100"]
+    for name, said in (("views/0.png", "No such file"), ("../elsewhere.png", "outside of its folder")):
+        (tmp_path / "views.json").write_text(json.dumps({"views": [{**view, "file": name}]}))
+        done = CliRunner().invoke(app, arguments)
+        assert isinstance(done.exception, SpikedError) and said in str(done.exception)
+        assert list((tmp_path / "part").iterdir()) == []
+    (tmp_path / "views").mkdir()
+    (tmp_path / "views" / "0.png").write_bytes(b"picture")
+    (tmp_path / "views.json").write_text(json.dumps({"views": [view]}))
+    assert CliRunner().invoke(app, arguments).exit_code == 0
 
 
 def test_nothing_is_left_of_a_cut_without_room(tmp_path: Path) -> None:

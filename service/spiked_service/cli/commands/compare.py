@@ -127,14 +127,18 @@ def _write_page(cells: list[Cell], outcomes: dict[Cell, Outcome], out: Path) -> 
             found[of_it[0].name] = strips(open_recording(recording), folders)
         except SpikedError as error:
             report_warning(f"no pictures of {recording.name}: {error}")
-    write_atomically(out / PAGE, page(_in_order(cells, outcomes), found, _summary()).encode())
+    shown = _in_order(cells, outcomes)
+    write_atomically(out / PAGE, page(shown, found, _summary(shown)).encode())
 
 
-def _summary() -> list[str]:
+def _summary(outcomes: list[Outcome]) -> list[str]:
+    """Which versions made the cells, and where the page was written: kept cells may be of another machine."""
+    versions = dict.fromkeys(outcome.version or "unknown" for outcome in outcomes)
     cpuinfo = Path("/proc/cpuinfo")
     models = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
     model = models[0] if models else platform.machine()
-    return [f"spiked {installed_version()}", f"{model}, {len(os.sched_getaffinity(0))} cores, {platform.system()}"]
+    made = f"cells by spiked {', '.join(versions) or installed_version()}"
+    return [made, f"page written on {model}, {len(os.sched_getaffinity(0))} cores, {platform.system()}"]
 
 
 def _shown(outcome: Outcome) -> str:

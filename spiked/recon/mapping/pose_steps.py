@@ -131,7 +131,7 @@ class PoseGradient:
 def _shortened(step: Array) -> Array:
     """Factors [n, 1] by which steps [n, 3] are no longer than `LONGEST_STEP`."""
     length = np.linalg.norm(step, axis=1, keepdims=True)
-    return LONGEST_STEP / np.maximum(length, LONGEST_STEP)
+    return np.asarray(LONGEST_STEP / np.maximum(length, LONGEST_STEP))
 
 
 def first_view_knot(trainer: MapTrainer, path: Spline) -> int:

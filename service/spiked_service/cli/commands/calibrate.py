@@ -111,9 +111,6 @@ def calibrate(
     if board is not None:
         if flat is None:
             raise ConfigurationError("--board needs a recording of the board")
-        if out.suffix != ".json":
-            raise ConfigurationError(f"--out {out}: a lens is written as a .json file, with a picture beside it")
-        outputs.try_file("--out", out.with_suffix(".png"))
         shown = g.open_described(flat, geometry, profile).recording
         _calibrate_lens(shown, Board.parse(board, markers), model, out, write_profile)
         return
@@ -161,6 +158,9 @@ def _calibrate_lens(
     recording: Recording, board: Board, model: LensModel | None, out: Path, profile: Path | None
 ) -> None:
     """Write the lens of a recording of a board, and the picture of its errors."""
+    if out.suffix != ".json":
+        raise ConfigurationError(f"--out {out}: a lens is written as a .json file, with a picture beside it")
+    outputs.try_file("--out", out.with_suffix(".png"))
     for warning in recording.warnings:
         report_warning(warning)
     sensor = recording.sensor

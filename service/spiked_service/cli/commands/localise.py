@@ -57,11 +57,7 @@ def localise(
     - `spiked localise out again.dat -o where --start 20000 --frames 1000`
     """
     if out is not None:
-        if any((out / name).exists() for name in MAP_FILES if name != "trajectory.tum"):
-            raise ConfigurationError(
-                f"--out {out} holds a reconstruction, whose path would be lost; name another folder"
-            )
-        outputs.try_folder("--out", out, ("trajectory.tum", LOCALISATION))
+        _check_folder(out)
     if json_out is not None:
         outputs.try_file("--json", json_out)
     known = read_map(map_folder)
@@ -91,6 +87,13 @@ def localise(
             (making / LOCALISATION).write_text(json.dumps(report, indent=1), encoding="utf-8")
             found.trajectory(sensor.frame_rate_hz).write_tum(making / "trajectory.tum")
         output.print(f"{out / 'trajectory.tum'}: {len(found.views)} poses", markup=False)
+
+
+def _check_folder(out: Path) -> None:
+    """Raises ConfigurationError for a folder that cannot be written, or that holds a map."""
+    if any((out / name).exists() for name in MAP_FILES if name != "trajectory.tum"):
+        raise ConfigurationError(f"--out {out} holds a reconstruction, whose path would be lost; name another folder")
+    outputs.try_folder("--out", out, ("trajectory.tum", LOCALISATION))
 
 
 def _report(found: Localisation, index: MapIndex, recording: Recording, sensor: Sensor) -> dict[str, object]:

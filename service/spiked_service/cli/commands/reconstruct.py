@@ -108,6 +108,7 @@ class ReconstructionFlags:
         return ReconstructionOptions(**vars(self)).options()
 
 
+_SECONDS = typer.Option(help="Time budget: reduces the steps, and at last the frames that are read.", min=0.0)
 _FIRST_DEPTH = typer.Option(
     help="With --method nope-sgs: depth of the first view as NumPy's .npy [H, W], in any unit, by any estimator; "
     "from a flat view that method does not find its path."
@@ -128,12 +129,7 @@ def reconstruct(
     ] = None,
     poses: Annotated[Path | None, typer.Option(help="TUM file of known camera-to-world poses.")] = None,
     first_depth: Annotated[Path | None, _FIRST_DEPTH] = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option(
-            help="Time budget: reduces the number of steps; frames that are not read by then are left out.", min=0.0
-        ),
-    ] = None,
+    seconds: Annotated[float | None, _SECONDS] = None,
     *,
     chosen: ReconstructionFlags,
     map_option: MapOptionTexts = None,

@@ -50,10 +50,8 @@ def record(
 
     Several devices are started together or not at all: if one cannot start, the error names it. Ctrl-C or SIGTERM
     stops all of them. At the end each recording is printed with its frames and losses, and, of all but the first, the
-    time from the first frame of the first recording to its own, with its standard deviation. A device that is absent
-    is waited for.
-
-    The exit code is 1 if a capture failed or its recording is bad, for instance without a frame.
+    time from the first frame of the first recording to its own, with its standard deviation. Absent devices are waited
+    for. The exit code is 1 if a capture failed or its recording is bad, for instance without a frame.
 
     Examples:
 

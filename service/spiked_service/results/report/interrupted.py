@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 
 from pydantic import TypeAdapter
 
-from spiked.errors import SceneError
+from spiked.errors import CheckpointError, SceneError
 from spiked.recon.checkpoint import Interrupted
 from spiked.recon.checkpoint_file import CHECKPOINT
 from spiked.recording import RecordingGeometry, open_recording
@@ -20,7 +20,7 @@ _GEOMETRY = TypeAdapter(RecordingGeometry)
 def is_of_interrupted_run(folder: Path) -> bool:
     """Whether the results in a folder with a checkpoint are of the run that it is of, and not of one before.
 
-    Raises CheckpointError and SceneError.
+    They count as such beside a checkpoint that cannot be read. Raises SceneError.
     """
     try:
         document = json.loads((folder / REPORT).read_bytes())
@@ -28,7 +28,10 @@ def is_of_interrupted_run(folder: Path) -> bool:
         return False
     except (OSError, ValueError) as error:
         raise SceneError(f"{folder / REPORT} cannot be read: {error}") from error
-    run = Interrupted.read(folder / CHECKPOINT).parameters.get(RUN)
+    try:
+        run = Interrupted.read(folder / CHECKPOINT).parameters.get(RUN)
+    except CheckpointError:
+        return True
     return isinstance(document, dict) and document.get(RUN) == run
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import spiked.native._spikes as _spikes
+from spiked.errors import ConfigurationError
 from spiked.sensor import BitOrder, Sensor
 
 __all__ = ["Window", "aligned_window", "instruction_sets", "unpack"]
@@ -105,10 +106,15 @@ _last_layout: tuple[Sensor | None, _spikes.Layout] = (None, None)
 def unpack(frames: NDArray[np.uint8], sensor: Sensor, *, out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
     """Stored frames, uint8 [n, frame_bytes], to upright images, uint8 [n, height, width] of 0 and 1.
 
-    With `out` its first n images are written and returned.
+    With `out` its first n images are written and returned. Raises ConfigurationError for arrays of another type.
     """
     if out is None:
         out = np.empty((len(frames), sensor.height, sensor.width), np.uint8)
+    if frames.dtype != np.uint8 or out.dtype != np.uint8 or not out.flags.c_contiguous:
+        raise ConfigurationError(
+            f"frames and images are arrays of uint8, images one after the other; got {frames.dtype} and {out.dtype}"
+            f"{'' if out.flags.c_contiguous else ' that is not contiguous'}"
+        )
     _spikes.unpack_frames(frames, _layout(sensor), out)
     return out[: len(frames)]
 

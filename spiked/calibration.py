@@ -115,6 +115,8 @@ class Calibration:
         """Raises CalibrationError if the file is missing or not a calibration."""
         try:
             gain, dark, dead = read_npz(path, ("gain", "dark", "dead"), _MOST_BYTES)
+            if any(part.dtype.kind not in "bfiu" for part in (gain, dark, dead)):
+                raise ValueError("arrays of no real numbers")
             return cls(gain.astype(np.float32), dark.astype(np.float32), dead.astype(bool))
         except OSError as error:
             raise CalibrationError(f"cannot read the calibration {path}: {error.strerror or error}") from error

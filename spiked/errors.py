@@ -21,6 +21,10 @@ class RecordingError(SpikedError):
     """A recording, its sidecar or its index cannot be used as asked."""
 
 
+class IndexFileError(RecordingError):
+    """The index of a recording cannot be used; the recording can be read without it."""
+
+
 class SceneError(SpikedError):
     """A scene or trajectory file cannot be read or written."""
 

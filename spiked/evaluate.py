@@ -49,6 +49,8 @@ _UNIT_POSES = 24
 MIN_SCORED_FRAMES = 48
 """Least number of frames with a pose: 1.5 times `RPE_FRAMES`, so that relative errors have at least 16 pairs."""
 
+Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
+"""Rows of the first and the second poses."""
 Poses = tuple[Array, Array]
 """Camera-to-world rotations [n, 3, 3] and centres [n, 3]."""
 
@@ -160,8 +162,11 @@ def similarity_of_poses(*, truth: Poses, estimate: Poses) -> Similarity:
     return Similarity(scale, rotation, centres.mean(0) - scale * turned.mean(0))
 
 
-def pose_errors(*, truth: Poses, estimate: Poses) -> PoseErrors:
-    """Errors of an estimate [n] against the truth [n], n >= 2. Raises ConfigurationError for shapes that do not fit."""
+def pose_errors(*, truth: Poses, estimate: Poses, frames: NDArray[np.integer] | None = None) -> PoseErrors:
+    """Errors of an estimate [n] against the truth [n], n >= 2, of increasing `frames` [n], by default without holes.
+
+    Raises ConfigurationError for shapes that do not fit.
+    """
     (truth_rotations, truth_centres), (rotations, centres) = truth, estimate
     n = len(truth_centres)
     if n < 2 or any(len(array) != n for array in (truth_rotations, rotations, centres)):
@@ -173,9 +178,9 @@ def pose_errors(*, truth: Poses, estimate: Poses) -> PoseErrors:
         raise ConfigurationError("the true camera never moves, so errors relative to the size of its path mean nothing")
     fit = umeyama(source=centres, target=truth_centres)
     ate = _rms(fit.points(centres) - truth_centres)
-    apart = min(RPE_FRAMES, n - 1)
-    turn, way = _relative(truth_rotations, truth_centres, apart)
-    turn_est, way_est = _relative(rotations, fit.scale * centres, apart)
+    pairs = _pairs(np.arange(n) if frames is None else np.asarray(frames))
+    turn, way = _relative(truth_rotations, truth_centres, pairs)
+    turn_est, way_est = _relative(rotations, fit.scale * centres, pairs)
     unit = _unit_errors(truth, estimate)
     return PoseErrors(
         ate_percent=100 * ate / radius,
@@ -198,6 +203,7 @@ def score_trajectory(*, truth: Trajectory, estimate: Trajectory, frame_rate_hz: 
     errors = pose_errors(
         truth=(truth.rotations[found], truth.centres[found]),
         estimate=(estimate.rotations[rows], estimate.centres[rows]),
+        frames=np.flatnonzero(found),
     )
     return TrajectoryScore(coverage, errors)
 
@@ -314,10 +320,28 @@ def _rms(differences: Array) -> float:
     return float(np.sqrt((differences**2).sum(1).mean()))
 
 
-def _relative(rotations: Array, centres: Array, apart: int) -> tuple[Array, Array]:
-    """Rotation [m, 3, 3] and translation [m, 3] from each pose to the one `apart` later, in the earlier camera."""
-    back = rotations[:-apart].swapaxes(-1, -2)
-    return back @ rotations[apart:], np.einsum("nij,nj->ni", back, centres[apart:] - centres[:-apart])
+def _pairs(frames: NDArray[np.integer]) -> Pairs:
+    """Rows of poses and of the first ones that are `RPE_FRAMES` later or more; pairs across a hole are left out.
+
+    Poses that are all further apart, or fewer, are paired with their neighbours.
+    """
+    apart = min(RPE_FRAMES, int(frames[-1] - frames[0]))
+    later = np.searchsorted(frames, frames + apart)
+    first = np.flatnonzero(later < len(frames))
+    second = later[first]
+    near = frames[second] - frames[first] <= 1.5 * apart
+    return (first[near], second[near]) if near.any() else _neighbours(len(frames))
+
+
+def _neighbours(count: int) -> Pairs:
+    return np.arange(count - 1), np.arange(1, count)
+
+
+def _relative(rotations: Array, centres: Array, pairs: Pairs) -> tuple[Array, Array]:
+    """Rotation [m, 3, 3] and translation [m, 3] from the first pose of each pair to the second, in the first camera."""
+    first, second = pairs
+    back = rotations[first].swapaxes(-1, -2)
+    return back @ rotations[second], np.einsum("nij,nj->ni", back, centres[second] - centres[first])
 
 
 def _mean_angle_deg(turns: Array, others: Array) -> float:
@@ -336,8 +360,8 @@ def _unit_errors(truth: Poses, estimate: Poses) -> tuple[float, float, float]:
 
     a, b = unit(centres), unit(truth_centres)
     fit = umeyama(source=a, target=b)
-    turn, way = _relative(truth_rotations, b, 1)
-    turn_est, way_est = _relative(rotations, fit.scale * a, 1)
+    turn, way = _relative(truth_rotations, b, _neighbours(len(rows)))
+    turn_est, way_est = _relative(rotations, fit.scale * a, _neighbours(len(rows)))
     way_error = float(100 * np.linalg.norm(way_est - way, axis=1).mean())
     return _rms(fit.points(a) - b), _mean_angle_deg(turn, turn_est), way_error
 

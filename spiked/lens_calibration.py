@@ -125,8 +125,10 @@ def board_views(
     if recording.frames < window_frames:
         raise CalibrationError(f"{recording.path} has {recording.frames} frames: an image needs {window_frames}")
     for done, begin in enumerate(evenly(recording.frames - window_frames + 1, views)):
-        low = max(begin - EDGE_FRAMES, 0)
-        high = min(begin + window_frames + EDGE_FRAMES, recording.frames)
+        first, stop = recording.unbroken(begin)
+        if begin + window_frames > stop:
+            continue  # frames were lost within: the board has moved meanwhile
+        low, high = max(begin - EDGE_FRAMES, first), min(begin + window_frames + EDGE_FRAMES, stop)
         window = aligned_window(recording.read(low, high - low), sensor, low, begin, begin + window_frames)
         numbers, pixels = board.find(_picture(window.rate(fill=True), sensor))
         if len(numbers) >= LEAST_CORNERS:

@@ -238,19 +238,24 @@ def _parse_header(raw: bytes, path: Path | str) -> tuple[list[tuple[str, str]], 
     if not raw.startswith(b"ply") or end < 0:
         raise SceneError(f"{path} is not a PLY file")
     names: list[tuple[str, str]] = []
-    count, element = 0, ""
+    count, element, form = 0, "", ""
     white: float | None = None
     for line in raw[:end].decode("latin-1").splitlines():
         words = line.split()
         match words:
-            case ["format", kind, *_] if kind != "binary_little_endian":
-                raise SceneError(f"{path} is a PLY of format {kind}; only binary_little_endian is read")
+            case ["format", form, *_]:
+                pass
             case ["comment", "radiance", value, *_]:
                 white = _radiance(value, path)
             case ["element", element, number]:
-                if not number.isdecimal():
+                if not number.isdecimal() or len(number) > 18:
                     raise SceneError(f"{path}: its header has {number!r} of {element}, which is no number")
-                count = int(number) if element == "vertex" else count
+                if element == "vertex":
+                    count = int(number)
+                elif int(number) and not names:
+                    raise SceneError(f"{path}: its first element is {element}, and that of splats is vertex")
+            case ["property", "list", *_] if element == "vertex":
+                raise SceneError(f"{path}: its vertices have a list, which splats have not")
             case ["property", kind, name] if element == "vertex":
                 if kind not in _KINDS:
                     raise SceneError(f"{path}: property {name} has unknown type {kind}")
@@ -259,6 +264,8 @@ def _parse_header(raw: bytes, path: Path | str) -> tuple[list[tuple[str, str]], 
                 names.append((name, _KINDS[kind]))
             case _:
                 pass
+    if form != "binary_little_endian":
+        raise SceneError(f"{path} is a PLY of format {form or 'unknown'}; only binary_little_endian is read")
     start = end + len(mark)
     need = count * np.dtype(names).itemsize if names else 0
     if len(raw) - start < need:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from spiked.blocks import Window, aligned_window, benchmark, instruction_sets, unpack
+from spiked.errors import ConfigurationError
 from spiked.sensor import BitOrder, Layout, Sensor
 
 REAL = Path(__file__).parents[2] / "shared" / "real"
@@ -221,6 +222,20 @@ def test_an_unknown_instruction_set_is_refused() -> None:
     environment = {**os.environ, "SPIKED_SIMD": "mmx"}
     run = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False)
     assert "SPIKED_SIMD=mmx" in run.stderr
+
+
+def test_arrays_of_other_types_are_refused() -> None:
+    """They would be converted, and the images be written into a copy."""
+    sensor = Sensor(16, 8, 1000.0)
+    frames = np.zeros((3, sensor.frame_bytes), np.uint8)
+    wrong = (np.empty((3, 8, 16), np.float32), np.empty((3, 8, 16), bool), np.empty((3, 8, 32), np.uint8)[:, :, ::2])
+    for out in wrong:
+        with pytest.raises(ConfigurationError, match="arrays of uint8"):
+            unpack(frames, sensor, out=out)  # type: ignore[arg-type]
+    with pytest.raises(ConfigurationError, match="got float32"):
+        unpack(frames.astype(np.float32), sensor)  # type: ignore[arg-type]
+    with pytest.raises(TypeError):
+        aligned_window(frames.astype(np.float32), sensor, 0, 0, 3)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("sensor", [Sensor(400, 250, 1.0), Sensor(48, 5, 1.0, flipped=False)], ids=str)

@@ -94,6 +94,13 @@ def test_a_bright_dark_recording_is_refused(tmp_path: Path) -> None:
         Calibration.measure(flat, record(tmp_path / "dark.dat", pixels, 0.15))
 
 
+@pytest.mark.parametrize("kind", [complex, [("a", "f4")], "S4"], ids=str)
+def test_arrays_of_no_real_numbers_are_no_calibration(tmp_path: Path, kind: object) -> None:
+    np.savez(tmp_path / "c.npz", gain=np.zeros((2, 8), kind), dark=np.zeros((2, 8)), dead=np.zeros((2, 8), bool))
+    with pytest.raises(CalibrationError, match="not a calibration"):
+        Calibration.read(tmp_path / "c.npz")
+
+
 @pytest.mark.parametrize("content", [b"", b"not an archive", b"PK\x03\x04garbage"])
 def test_other_files_are_no_calibrations(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "camera.npz"

@@ -117,6 +117,22 @@ def test_a_mirrored_cloud_is_never_matched_by_a_mirror() -> None:
     assert np.linalg.det(umeyama(source=points, target=points * [1, 1, -1]).rotation) == pytest.approx(1)
 
 
+def test_relative_errors_are_over_the_same_frames_with_a_hole() -> None:
+    """The same turn too much in each frame: pairs across the hole would show the turn of all that is missing."""
+    n, rate = 400, 0.01
+    t = np.arange(n) / 1000
+    truth = Trajectory(t, exp_so3(np.outer(t, [0.0, 9.0, 0.0])), np.stack([np.sin(9 * t), t, t**2], 1))
+    off = Trajectory(t, exp_so3(np.outer(t, [0.0, 9.0 * (1 + rate), 0.0])), truth.centres)
+    holed = np.r_[0:40, 360:n]
+    whole = score_trajectory(truth=truth, estimate=off, frame_rate_hz=1000)
+    part = score_trajectory(
+        truth=truth, estimate=Trajectory(t[holed], off.rotations[holed], off.centres[holed]), frame_rate_hz=1000
+    )
+    assert whole.errors is not None and part.errors is not None and part.coverage == pytest.approx(0.2)
+    assert whole.errors.rpe_r_deg == pytest.approx(np.degrees(9 * rate * RPE_FRAMES / 1000), rel=1e-6)
+    assert part.errors.rpe_r_deg == pytest.approx(whole.errors.rpe_r_deg, rel=1e-6)
+
+
 def test_coverage_counts_frames_by_time() -> None:
     rotations, centres = path()
     times = (np.arange(200) + 0.5) / 20000

@@ -130,6 +130,12 @@ def test_bad_scenes_are_refused(scene: Scene, tmp_path: Path) -> None:
         "no property 'opacity'": good.replace(b"opacity", b"opasity"),
         "'-1' of vertex, which is no number": re.sub(rb"element vertex \d+", b"element vertex -1", good),
         "'x' of vertex, which is no number": re.sub(rb"element vertex \d+", b"element vertex x", good),
+        "its first element is camera": good.replace(
+            b"element vertex", b"element camera 1\nproperty float f\nelement vertex"
+        ),
+        "its vertices have a list": good.replace(b"property float x", b"property list uchar int n\nproperty float x"),
+        "a PLY of format unknown": good.replace(b"format binary_little_endian 1.0\n", b""),
+        "which is no number": re.sub(rb"element vertex \d+", b"element vertex " + b"9" * 5000, good),
         "the property x twice": good.replace(b"property float y\n", b"property float x\n"),
     }
     for message, raw in broken.items():

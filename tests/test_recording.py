@@ -11,7 +11,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from spiked.errors import RecordingError
-from spiked.recording import Gap, OriginKind, Recording, RecordingWriter, open_recording, sidecar_path, verify
+from spiked.recording import (
+    Durability,
+    Gap,
+    OriginKind,
+    Recording,
+    RecordingWriter,
+    open_recording,
+    sidecar_path,
+    verify,
+)
+from spiked.recording.time_base import measured_rate
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
 
 SHARED = Path(__file__).parents[2] / "shared"
@@ -55,6 +65,46 @@ def test_the_first_stored_bit_is_the_left_pixel_of_the_bottom_row(tmp_path: Path
     (tmp_path / "a.dat").write_bytes(bytes([1, 0]) + bytes(2))
     upright = open_recording(tmp_path / "a.dat", width=16, height=2).frame(0)
     assert np.argwhere(upright).tolist() == [[1, 0]]
+
+
+def edited(path: Path, **fields: object) -> Path:
+    """Change fields of a sidecar."""
+    beside = sidecar_path(path)
+    beside.write_text(json.dumps({**json.loads(beside.read_text()), **fields}))
+    return path
+
+
+def test_gaps_that_overlap_are_a_contradiction(tmp_path: Path) -> None:
+    """Frames after them would have two numbers."""
+    written(tmp_path / "a.dat", SENSORS["A"])
+    gaps = [{"first": 4, "count": 10, "cause": "usb"}, {"first": 6, "count": 10, "cause": "usb"}]
+    with pytest.raises(RecordingError, match="10 frames from 4 on and of 10 from 6 on overlap"):
+        open_recording(edited(tmp_path / "a.dat", gaps=gaps))
+
+
+def test_clock_pairs_out_of_order_are_left_out(tmp_path: Path) -> None:
+    written(tmp_path / "a.dat", SENSORS["A"])
+    pairs = [{"frame": 0, "unix_ns": 0}, *({"frame": 3, "unix_ns": at} for at in (10**9, 2 * 10**9, 3 * 10**9))]
+    recording = open_recording(edited(tmp_path / "a.dat", clock=pairs))
+    assert [pair.frame for pair in recording.clock] == [0, 3] and "2 of its 4 clock pairs" in recording.warnings[0]
+    assert measured_rate(recording.clock) is None and recording.unix_ns([3]).tolist() == [10**9]
+
+
+def test_what_lies_between_two_losses_is_known(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.dat", SENSORS["odd"]) as writer:
+        for count, lost in ((5, 3), (4, 0), (6, 2), (1, 0)):
+            writer.append(random_frames(SENSORS["odd"], count))
+            if lost:
+                writer.gap(writer.next_frame, lost, "usb")
+    recording = open_recording(tmp_path / "a.dat")
+    assert [recording.unbroken(k) for k in (0, 4, 5, 14, 15)] == [(0, 5), (0, 5), (5, 15), (5, 15), (15, 16)]
+
+
+def test_a_recording_can_be_begun_again_beside_a_strange_index(tmp_path: Path) -> None:
+    (tmp_path / "a.index").write_bytes(b"old")
+    with pytest.raises(RecordingError, match=r"a\.index"):
+        RecordingWriter(tmp_path / "a.dat", SENSORS["A"], durability=Durability(index=True))
+    assert [file.name for file in tmp_path.iterdir()] == ["a.index"]
 
 
 def test_reading_is_a_view_of_a_memory_map(tmp_path: Path) -> None:

@@ -8,6 +8,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from spiked.export.kind import ExportKind, optional
 from spiked.export.ros_messages import RosMessages
 from spiked.export.source import ExportOptions, ExportSource
@@ -48,7 +50,8 @@ def _messages(make: RosMessages, timeline: Timeline) -> Iterator[tuple[str, int,
         at = key.stamp_ns
         yield "/camera/camera_info", at, make.camera_info(at, CAMERA, key.view.camera)
         yield "/camera/image_raw", at, make.image(at, CAMERA, key.pixels)
-        yield "/camera/depth", at, make.image(at, CAMERA, key.view.depth)
+        depth = np.where(key.view.depth > 0, key.view.depth, np.float32(np.nan))  # REP 118: no surface is NaN
+        yield "/camera/depth", at, make.image(at, CAMERA, depth)
 
 
 class RosBag:

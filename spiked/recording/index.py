@@ -18,7 +18,7 @@ import numpy as np
 from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
-from spiked.errors import RecordingError
+from spiked.errors import IndexFileError, RecordingError
 from spiked.recording.sidecar import ClockPair, Gap
 
 _HEADER = struct.Struct("<8sHHI12xI")
@@ -171,16 +171,19 @@ class Index:
 
 
 def read_index(path: Path) -> Index:
-    """Read an index up to the first entry that is damaged or out of order. Raises RecordingError."""
+    """Read an index up to the first entry that is damaged or out of order.
+
+    Raises RecordingError, and IndexFileError for a file that is no index.
+    """
     try:
         content = path.read_bytes()
     except OSError as error:
         raise RecordingError(f"{path}: the index cannot be read: {error.strerror}") from error
     if len(content) < HEADER_BYTES:
-        raise RecordingError(f"{path}: the index has no header; remove the file to read the recording without it")
+        raise IndexFileError(f"{path}: the index has no header; remove the file to read the recording without it")
     magic, version, entry_bytes, frame_bytes, check = _HEADER.unpack_from(content)
     if magic != _MAGIC or check != crc32(content[: HEADER_BYTES - 4]) or entry_bytes != ENTRY_BYTES:
-        raise RecordingError(f"{path}: this is not an index of a recording, or its header is damaged")
+        raise IndexFileError(f"{path}: this is not an index of a recording, or its header is damaged")
     if version != _VERSION:
         raise RecordingError(
             f"{path}: an index of version {version}; this spiked reads version {_VERSION}: use a newer spiked"

@@ -2,8 +2,9 @@
 
 import mmap
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from spiked.recording.geometry import (
     tags_agree,
 )
 from spiked.recording.host_time import host_times_ns
+from spiked.recording.index import Index, index_path, read_index
 from spiked.recording.sidecar import (
     ClockPair,
     Gap,
@@ -153,6 +155,16 @@ class Recording:
             k += gap.count
         return k
 
+    def unbroken(self, k: int) -> tuple[int, int]:
+        """First and end of the stored frames around k between which none was lost."""
+        begin = lost = 0
+        for gap in sorted(self.gaps, key=lambda gap: gap.first):
+            row = gap.first - lost
+            if row > k:
+                return begin, min(row, self.frames)
+            begin, lost = row, lost + gap.count
+        return begin, self.frames
+
     def captured(self, first: int, count: int) -> NDArray[np.uint8] | None:
         """Stored frames `first` to `first + count - 1` of the capture, uint8 [count, frame_bytes], a view of the memory
         map; None if one of them was lost or is not in the file."""
@@ -205,14 +217,24 @@ def open_unchecked(path: Path, given: RecordingGeometry) -> Recording:
     sidecar = described.sidecar
     if sidecar is not None and sidecar.calibration is not None and recorded_calibration(path) is None:
         warnings.append(f"its calibration {sidecar.calibration} is not there, so its rates are not corrected")
+    gaps, clock = (sidecar.gaps, sidecar.clock) if sidecar else ((), ())
     if sidecar is not None and sidecar.frames is None:
         warnings.append("the recording was not finished: its sidecar has no number of frames")
+        if (index := _index_of(path, sensor.frame_bytes, warnings)) is not None:
+            gaps, clock = index.gaps(), index.clock()
     # A file cut within its last frame is a common interruption; any other difference means another file's sidecar.
     elif sidecar is not None and not given.states_size and sidecar.frames not in (frames, frames + (trailing > 0)):
         contradictions.append(
             f"its sidecar {sidecar_path(path).name} says {sidecar.frames} frames of {sensor.width}x{sensor.height}, "
             f"but the file's {data.size} bytes hold {frames}; correct the sidecar or state the geometry"
         )
+    ordered = sorted(gaps, key=lambda gap: gap.first)
+    for one, other in pairwise(ordered):
+        if other.first < one.first + one.count:
+            contradictions.append(
+                f"its gaps of {one.count} frames from {one.first} on and of {other.count} from {other.first} on "
+                f"overlap; correct the sidecar {sidecar_path(path).name}"
+            )
     whole = data[: frames * sensor.frame_bytes].reshape(frames, sensor.frame_bytes)
     if sensor.layout is Layout.ROW_TAGGED:
         samples = np.unique(np.linspace(0, frames - 1, min(frames, TAGS_CHECKED)).astype(int))
@@ -222,6 +244,7 @@ def open_unchecked(path: Path, given: RecordingGeometry) -> Recording:
                 f"the row numbers of frame {wrong[0]} are not 0..{sensor.height - 1}: the file is not row-tagged "
                 f"{sensor.width}x{sensor.height} or is damaged; check layout and geometry"
             )
+    clock = _in_order(clock, warnings)
     return Recording(
         path,
         sensor,
@@ -231,12 +254,35 @@ def open_unchecked(path: Path, given: RecordingGeometry) -> Recording:
         tuple(contradictions),
         described.overruled,
         trailing,
-        sidecar.gaps if sidecar else (),
-        sidecar.clock if sidecar else (),
+        gaps,
+        clock,
         described.label_types,
         whole,
         described.assumed,
     )
+
+
+def _index_of(path: Path, frame_bytes: int, warnings: list[str]) -> Index | None:
+    """The index of a recording that was not finished: its gaps are in no sidecar yet."""
+    if not index_path(path).exists():
+        return None
+    try:
+        found = read_index(index_path(path))
+    except RecordingError as error:
+        warnings.append(f"{error}; its gaps are not known")
+        return None
+    return found if found.frame_bytes == frame_bytes else None
+
+
+def _in_order(clock: Sequence[ClockPair], warnings: list[str]) -> tuple[ClockPair, ...]:
+    """Clock pairs whose frames increase: others say nothing of the rate."""
+    kept: list[ClockPair] = []
+    for pair in clock:
+        if not kept or pair.frame > kept[-1].frame:
+            kept.append(pair)
+    if len(kept) < len(clock):
+        warnings.append(f"{len(clock) - len(kept)} of its {len(clock)} clock pairs are out of order and are left out")
+    return tuple(kept)
 
 
 def _map(path: Path) -> NDArray[np.uint8]:

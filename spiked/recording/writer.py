@@ -103,7 +103,13 @@ class RecordingWriter:
         index = None
         beside = index_path(self.path)
         if self._durability.index and (not resume or beside.exists()):
-            index = IndexWriter(beside, self.sensor.frame_bytes, resume=resume)
+            try:
+                index = IndexWriter(beside, self.sensor.frame_bytes, resume=resume)
+            except BaseException:
+                frames.close()
+                if not resume:
+                    self.path.unlink()  # without it the recording can be begun again
+                raise
         files = _Files(frames, index, Allocator(frames.fileno(), self._durability, self.bytes))
         if self._durability.sync is Sync.SECOND:
             files.syncer = Syncer(frames.fileno(), self.bytes, lambda: self._sync(files))

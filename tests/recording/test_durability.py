@@ -1,5 +1,6 @@
 """What a recording is worth after kills, full disks and bad bytes."""
 
+import json
 import os
 import resource
 import shutil
@@ -146,6 +147,27 @@ def test_an_unsynced_block_with_a_wrong_byte_is_cut_off_and_a_synced_one_is_told
     content[8 * SENSOR.frame_bytes] ^= 1
     path.write_bytes(content)
     assert "8 frames differ from what was written, the first at frame 8" in verify(path).reasons
+
+
+def test_recovery_invents_no_frames(tmp_path: Path) -> None:
+    """A copy whose file was taken before its index, or a disk that lost what it had."""
+    written(tmp_path).close()
+    file = tmp_path / "a.dat"
+    sidecar = json.loads(sidecar_path(file).read_text())
+    sidecar_path(file).write_text(json.dumps({**sidecar, "frames": None, "gaps": [], "clock": []}))
+    os.truncate(file, 70 * SENSOR.frame_bytes + 5)
+    found = recover(file, finish=True)
+    assert (found.frames, found.missing_frames, file.stat().st_size) == (64, 16, 64 * SENSOR.frame_bytes)
+    assert_holds(file, 64)
+    assert found.sidecar.gaps == (Gap(first=40, count=3, cause="usb"),)
+
+
+def test_the_gaps_of_an_unfinished_recording_are_those_of_its_index(tmp_path: Path) -> None:
+    writer = written(tmp_path)
+    recording = open_recording(tmp_path / "a.dat")
+    assert recording.gaps == (Gap(first=40, count=3, cause="usb"),) and recording.clock[0].unix_ns == 123
+    assert recording.capture_index(40) == 43 and "was not finished" in recording.warnings[0]
+    writer.close()
 
 
 def test_a_resumed_recording_is_as_one_that_was_never_interrupted(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from spiked.errors import RecordingError
+from spiked.errors import IndexFileError, RecordingError
 from spiked.recording import (
     LIVE,
     RecordingWriter,
@@ -61,7 +61,7 @@ def recover_and_assess(path: Path, why: str, sensor: Sensor | None = None) -> tu
     causes = lost_by_cause(found.sidecar.gaps)
     lost = sum(causes.values())
     size = found.frames * found.sidecar.sensor().frame_bytes
-    reasons = [*problems, f"{why}; the recording holds its first {found.frames} frames"]
+    reasons = [*problems, *_missing(found), f"{why}; the recording holds its first {found.frames} frames"]
     if lost:
         reasons.append(f"{lost} of {lost + found.frames} frames were lost")
     if not found.frames:
@@ -80,6 +80,7 @@ def reassess(path: Path) -> tuple[Recorded, Quality, bool]:
     frame_bytes = found.sidecar.sensor().frame_bytes
     frames = min(found.frames, path.stat().st_size // frame_bytes)
     bad = [] if frames else ["no frame was recorded"]
+    bad += _missing(found)
     if frames < found.frames:
         bad.append(f"the file ends after {frames} of the {found.frames} frames that its sidecar lists")
     if not found.was_finished:
@@ -93,13 +94,18 @@ def reassess(path: Path) -> tuple[Recorded, Quality, bool]:
     return Recorded(frames, frames * frame_bytes, lost=lost, lost_by_cause=causes), verdict, found.was_finished
 
 
+def _missing(found: Recovered) -> list[str]:
+    missing = found.missing_frames
+    return (
+        [f"{missing} frames after its first {found.frames} were on the disk and are not in the file"] if missing else []
+    )
+
+
 def recovered(path: Path) -> tuple[Recovered, tuple[str, ...]]:
-    """Recover a recording, without its index if that is unreadable; and the problems found. Raises RecordingError."""
+    """Recover a recording, without its index if that is none; and the problems found. Raises RecordingError."""
     try:
         return recover(path, finish=True), ()
-    except RecordingError as error:
-        if not index_path(path).exists():
-            raise
+    except IndexFileError as error:
         problem = error
     try:
         index_path(path).rename(index_path(path).with_suffix(".index.unreadable"))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from rich.progress import Progress
-from spiked_driver import open_source
+from spiked_driver import open_camera, open_source
 
 from spiked.calibration import LEAST_FRAMES, LONGEST_FRAMES, Calibration
 from spiked.errors import CalibrationError, ConfigurationError, SourceError
@@ -72,12 +72,15 @@ def record_still(source: str, seconds: float, path: Path) -> Recording:
 
     Raises SourceError for a source that is silent or ends early, and RecordingError for a full disk.
     """
-    camera = open_source(source, report_warning)
-    sensor = camera.sensor
+    opened = open_camera(source, report_warning)
+    camera, sensor = opened.source, opened.source.sensor
     wanted = int(np.clip(round(seconds * sensor.frame_rate_hz), LEAST_FRAMES, LONGEST_FRAMES))
     view = np.empty((min(wanted, _READ_FRAMES), sensor.compact().frame_bytes), np.uint8)
     lost, heard_s = 0, time.monotonic()
-    with RecordingWriter(path, sensor) as writer, Progress(console=messages, transient=True) as bar:
+    with (
+        RecordingWriter(path, sensor, assumed=opened.assumed) as writer,
+        Progress(console=messages, transient=True) as bar,
+    ):
         task = bar.add_task("recording", total=wanted)
         camera.open()
         try:

@@ -1,5 +1,6 @@
 """Ranges of frames or seconds in options."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -22,8 +23,10 @@ def number_range(number: Callable[[str], float]) -> Callable[[str], Range]:
             begin, end = (number(part) if part.strip() else None for part in text.split(":"))
         except ValueError as error:
             raise typer.BadParameter(f"{text!r} is no range: write A:B, A: or :B") from error
-        if any(one is not None and not one >= 0 for one in (begin, end)):
-            raise typer.BadParameter(f"{text!r}: a range counts from the begin of the recording, so it has no minus")
+        if any(one is not None and not 0 <= one < math.inf for one in (begin, end)):
+            raise typer.BadParameter(
+                f"{text!r}: a range counts from the begin of the recording, in finite numbers >= 0"
+            )
         return Range(begin, end)
 
     return parse

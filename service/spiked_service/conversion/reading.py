@@ -205,7 +205,9 @@ def _sidecar_fields(recording: Recording) -> dict[str, Any]:
     if not beside.exists():
         return {}
     sidecar = read_sidecar(beside)
-    fields: dict[str, Any] = {**(sidecar.model_extra or {}), "note": sidecar.note}
+    fields: dict[str, Any] = {**(sidecar.model_extra or {}), "note": sidecar.note, "first_frame": sidecar.first_frame}
+    if sidecar.profile is not None:
+        fields["profile"] = sidecar.profile
     if sidecar.device is not None:
         fields["device"] = sidecar.device
     if sidecar.calibration is not None:

@@ -65,11 +65,11 @@ class FrameWindow:
         return self.first_frame + self.recording.capture_index(self.row)
 
     def aligned(self, length: int) -> Window:
-        """Spike-aligned window of `length` frames around it, or of all if the recording has fewer."""
-        frames = self.recording.frames
-        length = min(length, frames)
-        begin = min(max(0, self.row - length // 2), frames - length)
-        first, last = max(0, begin - _EDGE_FRAMES), min(frames, begin + length + _EDGE_FRAMES)
+        """Spike-aligned window of `length` frames around it, or of all between the losses around it if fewer."""
+        low, high = self.recording.unbroken(self.row)
+        length = min(length, high - low)
+        begin = min(max(low, self.row - length // 2), high - length)
+        first, last = max(low, begin - _EDGE_FRAMES), min(high, begin + length + _EDGE_FRAMES)
         stored = np.ascontiguousarray(self.recording.read(first, last - first))
         return aligned_window(stored, self.sensor, first, begin, begin + length)
 

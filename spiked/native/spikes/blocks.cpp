@@ -156,9 +156,11 @@ void bind_blocks(nb::module_& m) {
         .def(nb::init<size_t, size_t, size_t, bool, bool>(), nb::arg("width"), nb::arg("height"), nb::arg("row_stride"),
              nb::arg("flipped"), nb::arg("msb"));
     m.def("instruction_sets", &instruction_sets, "Instruction sets this machine can run, best first.");
-    m.def("unpack_frames", &unpack_frames, nb::arg("frames"), nb::arg("layout"), nb::arg("images"));
-    m.def("aligned_window", &aligned_window, nb::arg("frames"), nb::arg("layout"), nb::arg("begin"), nb::arg("end"),
-          nb::arg("spikes"), nb::arg("start"), nb::arg("stop"), nb::arg("count"), nb::arg("instruction_set") = "");
+    m.def("unpack_frames", &unpack_frames, nb::arg("frames").noconvert(), nb::arg("layout"),
+          nb::arg("images").noconvert());
+    m.def("aligned_window", &aligned_window, nb::arg("frames").noconvert(), nb::arg("layout"), nb::arg("begin"),
+          nb::arg("end"), nb::arg("spikes").noconvert(), nb::arg("start").noconvert(), nb::arg("stop").noconvert(),
+          nb::arg("count").noconvert(), nb::arg("instruction_set") = "");
 }
 
 }  // namespace spiked

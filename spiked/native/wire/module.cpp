@@ -44,7 +44,7 @@ nb::class_<Holder<Parser>> bind(nb::module_& m, const char* name) {
         .def("keep", &Held::keep)
         .def("finish", [](Held& held) { held.parser.finish(); })
         .def("mark_loss", [](Held& held) { held.parser.mark_loss(); })
-        .def("next", &Held::next, "out"_a)
+        .def("next", &Held::next, "out"_a.noconvert())
         .def_prop_ro("next_index", [](const Held& held) { return held.parser.next_index(); })
         .def_prop_ro("counters", [](const Held& held) { return held.parser.counters(); });
 }

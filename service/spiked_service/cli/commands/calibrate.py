@@ -19,6 +19,7 @@ from spiked.errors import ConfigurationError
 from spiked.lens_calibration import board_views, calibrate_lens
 from spiked.profile import CameraProfile
 from spiked.recording import Recording, RecordingGeometry
+from spiked.recording.geometry import Assumable
 from spiked.sensor import Sensor
 from spiked_service.cli import outputs
 from spiked_service.cli import recording_flags as g
@@ -133,19 +134,22 @@ def _calibrate_pixels(flat: Recording | None, dark: Recording | None, out: Path,
     calibration = Calibration.measure(flat, dark, before)
     calibration.write(out)
     if profile is not None:
-        _write_profile(profile, out, known.sensor)
+        _write_profile(profile, out, known.sensor, known.assumed)
     output.print(f"{out}: {calibration.summary()}", markup=False)
 
 
-def _write_profile(path: Path, calibration: Path | None, sensor: Sensor) -> None:
-    """What the recording says of its camera, and the calibration if there is one, over the profile that is there."""
+def _write_profile(path: Path, calibration: Path | None, sensor: Sensor, assumed: tuple[Assumable, ...]) -> None:
+    """What the recording says of its camera, and the calibration if there is one, over the profile that is there.
+
+    What was `assumed` of the camera is not said: a profile makes it a fact, about which nobody is asked again.
+    """
     before = CameraProfile.read(path) if path.exists() and path.stat().st_size else CameraProfile()
     stated = {
         "width": sensor.width,
         "height": sensor.height,
-        "rate": sensor.frame_rate_hz,
+        "rate": None if "frame_rate" in assumed else sensor.frame_rate_hz,
         "mosaic": sensor.mosaic,
-        "flipped": sensor.flipped,
+        "flipped": None if "flipped" in assumed else sensor.flipped,
         "intrinsics": None if before.fov is not None else Pinhole.of(sensor.intrinsics),
         "calibration": None if calibration is None else Path(os.path.relpath(calibration, path.parent)),
     }
@@ -179,7 +183,7 @@ def _calibrate_lens(
     if profile is not None:
         before = CameraProfile.read(profile) if profile.exists() and profile.stat().st_size else CameraProfile()
         before.model_copy(update={"fov": None}).write(profile)
-        _write_profile(profile, None, replace(sensor, intrinsics=found.intrinsics))
+        _write_profile(profile, None, replace(sensor, intrinsics=found.intrinsics), recording.assumed)
     k, sigma = found.intrinsics, found.sigmas
     values = {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy, **(k.distortion.named() if k.distortion else {})}
     lens = ", ".join(f"{name} {value:.5g} (+- {sigma[name]:.2g})" for name, value in values.items() if name in sigma)

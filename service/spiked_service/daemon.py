@@ -148,7 +148,7 @@ def open_data_store(data: Path | None, notifier: Notifier) -> DataStore:
     rows = ReconstructionRepository(folder, catalogue, notifier, policy)
     reconstructions = Reconstructions(folder, catalogue, notifier, policy, rows)
     captures = Captures(folder, catalogue, disk_space, reconstructions, notifier)
-    retention = Retention(folder, catalogue, captures, lambda text: notifier.log("info", text))
+    retention = Retention(folder, catalogue, captures.removal, lambda text: notifier.log("info", text))
     recovery = Recovery(folder, catalogue, rows, notifier, orphans)
     return DataStore(folder, catalogue, disk_space, reconstructions, captures, retention, recovery, notifier)
 

@@ -384,15 +384,15 @@ def test_names_and_notes_change_while_it_runs_and_after(data_store: DataStore, t
     capture_id = data_store.captures.start(recorded_only(f"replay:{tmp_path / 'noise.dat'}?repeat=1000")).id
     data_store.captures.update(capture_id, name="while it runs")
     with pytest.raises(BusyError, match="stop it first"):
-        data_store.captures.remove(capture_id)
+        data_store.captures.removal.remove(capture_id)
     data_store.captures.stop(capture_id)
     assert over(data_store, capture_id).row.name == "while it runs"
     data_store.captures.update(capture_id, notes="after", keep=True)
     row = data_store.catalogue.captures.get(capture_id)
     assert (row.name, row.notes, row.keep) == ("while it runs", "after", True)
-    data_store.captures.remove(capture_id)
+    data_store.captures.removal.remove(capture_id)
     assert data_store.captures.list().items == []
-    assert data_store.captures.restore(capture_id).row.deleted_at is None
+    assert data_store.captures.removal.restore(capture_id).row.deleted_at is None
     assert data_store.captures.list().items[0].id == capture_id
 
 
@@ -488,7 +488,7 @@ def test_a_disk_that_is_filled_during_a_capture_accounts_for_every_frame(
         assert len(data_store.captures.list().items) == 1
         filler.unlink()
         assert data_store.check_disk()[0] is not CheckStatus.FAILED
-        data_store.captures.purge(row.id)
+        data_store.captures.removal.purge(row.id)
         again = over(data_store, data_store.captures.start(recorded_only(source, frames=100)).id).row
         assert again.verdict is not None and again.state is CaptureState.COMPLETE
 

@@ -301,7 +301,7 @@ def test_what_cannot_be_done_is_refused_at_once(place: Place, tmp_path: Path) ->
     dark = data_store.reconstructions.submit(wide, lens, task=Task.LOCALISE, map_ids=(room,))
     assert "too little texture or light" in ended(data_store, dark).reason
     data_store.reconstructions.remove(dark.id)
-    data_store.captures.remove(wide)
+    data_store.captures.removal.remove(wide)
     with pytest.raises(ConfigurationError, match="is deleted"):
         place.submit(wide, Task.LOCALISE, room)
     assert set(data_store.folder.contents()[1]) == before, "nothing is left of what was refused"

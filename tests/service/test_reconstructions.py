@@ -182,7 +182,7 @@ def test_what_cannot_be_reconstructed_is_refused_at_once(house: tuple[DataStore,
     seeing = ReconstructionOptions(steps=0, intrinsics=IntrinsicsOption(fx=80, fy=80, cx=48, cy=32))
     noise = ended(data_store, data_store.reconstructions.submit(blind.id, seeing))
     assert noise.state is JobState.FAILED and "too short" in noise.reason
-    data_store.captures.remove(blind.id)
+    data_store.captures.removal.remove(blind.id)
     with pytest.raises(ConfigurationError, match="is deleted"):
         data_store.reconstructions.submit(blind.id, seeing)
 

@@ -67,7 +67,7 @@ def test_an_end_is_told_once_and_again_after_an_error() -> None:
 def test_an_address_that_is_not_there_delays_nothing_else() -> None:
     bus = Bus()
     with listening([]) as (address, sent):
-        hooks = Webhooks(bus, lambda: ["http://127.0.0.1:9/", address], delays_s=(0.01,))
+        hooks = Webhooks(bus, lambda: ["http://host:abc/x", "http://127.0.0.1:9/", address], delays_s=(0.01,))
         bus.publish(Topic.JOB, Job(state="cancelled", ended_at="t"), "c1", "j1")
         assert sent.get(timeout=10)["data"]["state"] == "cancelled"
         hooks.close()
@@ -75,5 +75,6 @@ def test_an_address_that_is_not_there_delays_nothing_else() -> None:
 
 def test_only_addresses_of_web_servers_are_taken() -> None:
     assert load_settings({"webhooks": "https://example.org/x"}).settings.webhooks == ["https://example.org/x"]
-    with pytest.raises(ConfigurationError, match=r"ftp://example\.org"):
-        load_settings({"webhooks": "ftp://example.org"})
+    for wrong in ("ftp://example.org", "http://example.org:abc/x", "http://example.org:70000"):
+        with pytest.raises(ConfigurationError, match="is no address"):
+            load_settings({"webhooks": wrong})

@@ -8,6 +8,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Coroutine
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from http import HTTPStatus
@@ -20,11 +21,13 @@ from fastapi.routing import APIRoute
 from spiked_service.api.auth.scopes import authorise
 from spiked_service.api.problems import ConflictError, KeyReusedError
 from spiked_service.api.schemas.base import not_null
-from spiked_service.store.catalogue import Catalogue
+from spiked_service.store.catalogue import Catalogue, StoreError
 
 KEPT = timedelta(days=1)
 """Time for which the first answer to a key is stored."""
 _KEY = re.compile("[!-~]{1,255}")
+_UNKNOWN = 0
+"""Status of a request that may have been carried out."""
 _HEADERS = ("location", "content-type", "etag")
 
 IdempotencyKey = Annotated[
@@ -60,8 +63,8 @@ class IdempotencyKeys:
                 "CREATE TABLE IF NOT EXISTS idempotency (key TEXT PRIMARY KEY, fingerprint TEXT NOT NULL, "
                 "at TEXT NOT NULL, status INTEGER, headers TEXT, body BLOB) WITHOUT ROWID"
             )
-            # Requests that an earlier service did not finish.
-            connection.execute("DELETE FROM idempotency WHERE status IS NULL")
+            # Requests of an earlier service: nobody knows how far they went.
+            connection.execute("UPDATE idempotency SET status = ? WHERE status IS NULL", (_UNKNOWN,))
 
     def begin(self, key: str, fingerprint: str) -> Answer | None:
         """The stored response, or None: then carry the request out and call `finish` or `abandon`.
@@ -82,6 +85,11 @@ class IdempotencyKeys:
                 return None
         if known[0] != fingerprint:
             raise KeyReusedError(f"the idempotency key {key} was used for another request")
+        if known[1] == _UNKNOWN:
+            raise ConflictError(
+                f"the service ended during the request with the idempotency key {key}: look with GET whether it was "
+                "carried out, and use a new key to repeat it"
+            )
         if known[1] is None:
             raise ConflictError(f"the request with the idempotency key {key} is being carried out; send it again later")
         return Answer(known[1], json.loads(known[2]), known[3])
@@ -115,14 +123,18 @@ def idempotent(keys: IdempotencyKeys) -> type[APIRoute]:
                 known = await run_in_threadpool(keys.begin, key, await _fingerprint(request))
                 if known is not None:
                     return Response(known.body, known.status, {**known.headers, "Idempotency-Replayed": "true"})
+                carried_out = False
                 try:
                     response = await carry_out(request)
-                    if response.status_code < HTTPStatus.BAD_REQUEST:
+                    carried_out = response.status_code < HTTPStatus.BAD_REQUEST
+                    if carried_out:
                         headers = {name: response.headers[name] for name in _HEADERS if name in response.headers}
                         answer = Answer(response.status_code, headers, bytes(response.body))
-                        await run_in_threadpool(keys.finish, key, answer)
+                        with suppress(StoreError):  # a full disk: the key stays taken, and its answer is not repeated
+                            await run_in_threadpool(keys.finish, key, answer)
                 finally:
-                    await run_in_threadpool(keys.abandon, key)
+                    if not carried_out:
+                        await run_in_threadpool(keys.abandon, key)
                 return response
 
             return handle

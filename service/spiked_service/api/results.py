@@ -121,7 +121,7 @@ class SceneFiles:
         Raises NotReadyError, SceneError.
         """
         version = result.published.version
-        tag = files.etag("changes", version, level, since or "")
+        tag = files.etag("changes", result.folder.name, version, level, since or "")
         if files.unchanged(request, tag):
             return files.not_modified(tag)
         key = (result.scene, "changes", since, level)

@@ -2,7 +2,6 @@
 
 import threading
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Unpack
 
@@ -15,6 +14,7 @@ from spiked_service.captures.armed_device import ArmedDevice
 from spiked_service.captures.live_capture import LiveCapture
 from spiked_service.captures.new_captures import NewCaptures, check_free, group_devices
 from spiked_service.captures.recent import RecentCaptures
+from spiked_service.captures.removal import Removal
 from spiked_service.captures.sources import device_of, realtime
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue import Reconstructions
@@ -56,6 +56,7 @@ class Captures:
         self._live: dict[str, LiveCapture] = {}
         self._armed: dict[str, ArmedDevice] = {}
         self._recent = RecentCaptures()
+        self.removal = Removal(folder, catalogue, reconstructions, self)
         self._closing = threading.Event()
         self._ticker = threading.Thread(target=self._tick, name="counters", daemon=True)
         self._ticker.start()
@@ -81,8 +82,10 @@ class Captures:
             size = self._new.size_of(plan)
         with self._lock:
             self._refuse_if_busy(device)
+            if self._armed.get(device) is not armed_device:
+                raise BusyError(f"{device} has been armed or disarmed meanwhile: try again")
             capture = self._begin(plan, size)
-            armed_device = self._armed.pop(device, None)
+            self._armed.pop(device, None)
             if armed_device is None:
                 try:
                     capture.acquire()
@@ -112,15 +115,19 @@ class Captures:
                     created.append(self._begin(plan, size, group))
                 for capture in created:
                     capture.acquire()
+                failed = None
             except (OSError, StoreError) as error:
+                failed = error
+                running = [capture for capture in created if capture.holds_device]
                 for capture in created:
-                    if capture.holds_device:  # its worker runs; its row says why it is short
-                        capture.stop()
-                    else:
+                    if capture not in running:
                         self._undo(capture)
-                if isinstance(error, StoreError):
-                    raise
-                raise BusyError(f"no worker can be started: {error.strerror}; end other programs") from error
+        if failed is not None:
+            for capture in running:  # without the lock, as in `change`; their rows say why they are short
+                capture.stop()
+            if isinstance(failed, StoreError):
+                raise failed
+            raise BusyError(f"no worker can be started: {failed.strerror}; end other programs") from failed
         for capture in created:
             self.publish(capture.id)
         return group
@@ -229,33 +236,22 @@ class Captures:
 
     def update(self, capture_id: str, **edit: Unpack[CaptureEdit]) -> Snapshot:
         """Change what a user may change; None leaves it. Raises UnknownIdError."""
-        return self._change(capture_id, **{key: value for key, value in edit.items() if value is not None})
+        return self.change(capture_id, **{key: value for key, value in edit.items() if value is not None})
 
-    def remove(self, capture_id: str) -> Snapshot:
-        """Mark a capture as deleted, until `restore` or `purge`. Raises UnknownIdError, BusyError."""
-        snapshot = self._ended(capture_id)
-        for row in snapshot.reconstructions:
-            self._catalogue.freeing(self._reconstructions.cancel, row.id)
-        at = snapshot.row.deleted_at or datetime.now(UTC)
-        return self._catalogue.freeing(self._change, capture_id, deleted_at=at)
+    def change(self, capture_id: str, **fields: object) -> Snapshot:
+        """Change fields of the row, and publish it. Raises UnknownIdError, StoreError, and BusyError during a purge."""
+        with self._lock:
+            live = self._live.get(capture_id)
+        if live is not None:  # without the lock, because the capture calls back and takes it
+            live.edit(**fields)
+        else:
+            with self.removal.no_purge(capture_id):
+                self._catalogue.captures.set(capture_id, **fields)
+        return self.publish(capture_id)
 
-    def restore(self, capture_id: str) -> Snapshot:
-        """Undo `remove`. Raises UnknownIdError."""
-        return self._change(capture_id, deleted_at=None)
-
-    def purge(self, capture_id: str) -> None:
-        """Delete a capture with its files and reconstructions, for good. Raises UnknownIdError, BusyError."""
-        for row in self._ended(capture_id).reconstructions:
-            self._catalogue.freeing(self._reconstructions.remove, row.id)
-        self._folder.remove(self._folder.capture(capture_id))
-        self._catalogue.freeing(self._catalogue.captures.remove, capture_id)
+    def forget(self, capture_id: str) -> None:
+        """It is deleted for good: its picture, too."""
         self._recent.drop_picture(capture_id)
-
-    def _ended(self, capture_id: str) -> Snapshot:
-        snapshot = self.get(capture_id)
-        if not snapshot.row.state.over:
-            raise BusyError(f"capture {capture_id} is still {snapshot.row.state}: stop it first")
-        return snapshot
 
     def processes(self) -> dict[str, dict[str, int]]:
         """Process ids of the running workers by capture and role, without reconstructions."""
@@ -303,15 +299,6 @@ class Captures:
             for device, one in list(self._armed.items()):
                 if one is armed_device:
                     del self._armed[device]
-
-    def _change(self, capture_id: str, **fields: object) -> Snapshot:
-        with self._lock:
-            live = self._live.get(capture_id)
-        if live is not None:  # without the lock, because the capture calls back and takes it
-            live.edit(**fields)
-        else:
-            self._catalogue.captures.set(capture_id, **fields)
-        return self.publish(capture_id)
 
     def _changed(self, capture: LiveCapture) -> None:
         self._notifier.capture(self.snapshot(capture.row))

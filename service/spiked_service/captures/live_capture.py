@@ -234,8 +234,9 @@ class LiveCapture:
             self._readers.discard(Role.RECONSTRUCTION)
             if self._acquisition is not None:
                 self._acquisition.drop_readers(Role.RECONSTRUCTION)
-            if row.state is JobState.FAILED and not self.row.plan.record:
-                self._row.fail(row.reason)
+            if not self.row.plan.record:  # nobody reads the ring any more
+                if row.state is JobState.FAILED:
+                    self._row.fail(row.reason)
                 self._stop_source()
             elif row.state is JobState.FAILED or (row.state is JobState.QUEUED and row.reason):
                 self.warned(row.reason)  # queued without a reason: it waits for a free worker

@@ -55,8 +55,9 @@ class LiveRow:
     def edit(self, **fields: object) -> None:
         """Change what a user may change. Raises StoreError if it cannot be saved."""
         with self._lock:
-            self._row = replace(self._row, **fields)  # type: ignore[arg-type]
-            self._catalogue.captures.put(self._row)
+            edited = replace(self._row, **fields)  # type: ignore[arg-type]
+            self._catalogue.captures.put(edited)
+            self._row = edited
         self._on_change()
 
     def warn(self, *texts: str) -> None:

@@ -63,14 +63,21 @@ def reconcile(folder: DataFolder, catalogue: Catalogue, log: Log) -> Orphans:
     )
 
 
-def note_versions(folder: DataFolder, catalogue: Catalogue, reconstruction_id: str) -> None:
-    """Set the versions of a reconstruction in the catalogue to those in its folder. Raises StoreError, OSError."""
+def note_versions(folder: DataFolder, catalogue: Catalogue, reconstruction_id: str) -> bool:
+    """Set the versions of a reconstruction in the catalogue to those in its folder; whether there are any.
+
+    Raises StoreError, OSError.
+    """
     published = versions(folder.reconstruction(reconstruction_id))
     kept = {one.version for one in published}
     if kept == {one.version for one in catalogue.versions(reconstruction_id)}:
-        return
+        return bool(kept)
+    if not kept:
+        with catalogue.transaction():
+            catalogue.forget_versions(reconstruction_id)
     for one in published:
         catalogue.put_version(version_row(reconstruction_id, one), kept)
+    return bool(kept)
 
 
 def _reconcile(

@@ -17,7 +17,16 @@ from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.store.catalogue import Catalogue
 from spiked_service.store.folder import DataFolder
-from spiked_service.store.rows import CaptureRow, CaptureState, Grade, Origin, Plan, Quality
+from spiked_service.store.rows import (
+    CaptureRow,
+    CaptureState,
+    Grade,
+    JobState,
+    Origin,
+    Plan,
+    Quality,
+    ReconstructionRow,
+)
 from spiked_service.store.snapshot import Snapshot
 
 _Check = tuple[Callable[[str], None], str]
@@ -73,8 +82,8 @@ class Recovery:
         """End a capture that ran when an earlier service ended, and recover its recording."""
         row = self._interrupted[capture_id]
         self._notifier.log("warning", "the service ended during this capture", capture_id)
-        recording, verdict = None, None
-        if row.plan.record:
+        recording, verdict = row.recording, row.verdict
+        if row.plan.record and (recording is None or verdict is None):  # its recorder had not ended
             recording, verdict = recover_and_assess(self._folder.recording(capture_id), _SERVICE_ENDED, row.sensor)
         row = self._catalogue.captures.set(
             capture_id,
@@ -89,6 +98,9 @@ class Recovery:
     def _recover_capture(self, capture_id: str) -> None:
         path = self._folder.recording(capture_id)
         folder = self._folder.capture(capture_id)
+        if path.exists() and path.stat().st_nlink > 1:
+            self._folder.remove(folder)  # of an upload, whose own names its files still have
+            return
         try:
             sidecar = read_sidecar(sidecar_path(path))
             recording, verdict, finished = reassess(path)
@@ -154,14 +166,20 @@ class Recovery:
         if row is None:
             return
         if self._catalogue.captures.find(row.capture_id) is not None:
-            if row.state.over:
-                note_versions(self._folder, self._catalogue, reconstruction_id)
+            if row.state.over and not note_versions(self._folder, self._catalogue, reconstruction_id) and row.version:
+                self._lose_result(row)
             return
         folder = self._folder.reconstruction(reconstruction_id)
         where = self._folder.set_aside(*(one for one in (folder,) if one.exists()))
         self._catalogue.reconstructions.remove(reconstruction_id)
         message = f"reconstruction {reconstruction_id} of missing capture {row.capture_id} was moved to {where}"
         self._notifier.log("error", message, None, reconstruction_id)
+
+    def _lose_result(self, row: ReconstructionRow) -> None:
+        """End a reconstruction as failed whose files are gone: it was deleted after the backup that was restored."""
+        reason = "its files are gone: they were deleted after the catalogue that was restored"
+        self._catalogue.reconstructions.set(row.id, state=JobState.FAILED, reason=reason, version=0)
+        self._notifier.log("error", reason, row.capture_id, row.id)
 
     def _set_upload_aside(self, upload_id: str) -> None:
         part = self._folder.upload(upload_id)

@@ -218,20 +218,27 @@ class Uploads:
             ended_at=now,
             **more,
         )
+        data = self._folder.recording(row.id)
+        files = {part.with_suffix(".dat") if converted else part: data, part.with_suffix(".json"): sidecar_path(data)}
+        if self._calibration(upload.id).exists():
+            files[self._calibration(upload.id)] = data.with_name(CALIBRATION)
         try:
-            self._folder.capture(row.id).mkdir()
-            data = self._folder.recording(row.id)
-            part.with_suffix(".json").replace(sidecar_path(data))
-            if self._calibration(upload.id).exists():
-                self._calibration(upload.id).replace(data.with_name(CALIBRATION))
-            (part.with_suffix(".dat") if converted else part).replace(data)
-        except OSError as error:
-            self._folder.remove(self._folder.capture(row.id))
+            data.parent.mkdir()
+            for own, there in files.items():
+                _link(own, there)
+            with self._catalogue.transaction():
+                self._catalogue.captures.put(row)
+                self._catalogue.uploads.set(upload.id, capture_id=row.id)
+        except (OSError, StoreError) as error:
+            for own, there in files.items():
+                if there.exists() and not own.exists():
+                    there.replace(own)
+            self._folder.remove(data.parent)
+            if isinstance(error, StoreError):
+                raise
             raise StoreError(f"upload {upload.id} cannot be moved to its capture: {error.strerror}") from error
-        with self._catalogue.transaction():
-            self._catalogue.captures.put(row)
-            self._catalogue.uploads.set(upload.id, capture_id=row.id)
-        part.unlink(missing_ok=True)  # there is one, if it was converted
+        for own in (*files, part):
+            own.unlink(missing_ok=True)
         return row.id
 
     def _calibration(self, upload_id: str) -> Path:
@@ -251,6 +258,14 @@ class Uploads:
         finally:
             with self._lock:
                 self._busy.discard(upload_id)
+
+
+def _link(own: Path, there: Path) -> None:
+    """Give a file a second name, so that a kill loses none; move it where there are no links. Raises OSError."""
+    try:
+        there.hardlink_to(own)
+    except OSError:
+        own.replace(there)
 
 
 class _Tail:

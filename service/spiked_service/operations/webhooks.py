@@ -1,8 +1,10 @@
 """Tells other programs by HTTP when jobs have ended."""
 
+import queue
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import httpx
 
@@ -22,7 +24,11 @@ _log = logger("spiked.webhooks")
 
 
 class Webhooks:
-    """Sends the message of a job that has ended to addresses, on a thread. Nothing waits for it."""
+    """Sends the message of a job that has ended to addresses. Nothing waits for it.
+
+    One thread picks such messages from all of the bus, and another sends them: an address that does not answer takes
+    longer than the bus keeps messages.
+    """
 
     def __init__(self, bus: Bus, addresses: Callable[[], Sequence[str]], delays_s: Sequence[float] = DELAYS_S) -> None:
         """`addresses` are those of now."""
@@ -31,19 +37,36 @@ class Webhooks:
         self._subscription = bus.subscribe([Topic.JOB])
         self._told: OrderedDict[tuple[str | None, object], None] = OrderedDict()
         self._leave = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="webhooks", daemon=True)
-        self._thread.start()
+        self._ended: queue.Queue[Message | None] = queue.Queue(REMEMBERED)
+        self._threads = [
+            threading.Thread(target=work, name=f"webhooks {name}", daemon=True)
+            for name, work in (("picking", self._pick), ("sending", self._send_all))
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def close(self) -> None:
-        """End the thread; what is being sent is given up."""
+        """End the threads; what is being sent is given up."""
         self._leave.set()
         self._subscription.close()
-        self._thread.join(TIMEOUT_S)
+        with suppress(queue.Full):
+            self._ended.put_nowait(None)
+        for thread in self._threads:
+            thread.join(TIMEOUT_S)
 
-    def _run(self) -> None:
+    def _pick(self) -> None:
         while not self._leave.is_set():
             message = self._subscription.take(1.0)
-            if message is not None and message.topic is Topic.JOB and self._ends(message):
+            if message is None or message.topic is not Topic.JOB or not self._ends(message):
+                continue
+            try:
+                self._ended.put_nowait(message)
+            except queue.Full:
+                _log.error("webhook dropped: too many wait to be sent", job=message.reconstruction_id)
+
+    def _send_all(self) -> None:
+        while not self._leave.is_set():
+            if (message := self._ended.get()) is not None:
                 for address in self._addresses():
                     self._send(address, message)
 
@@ -75,6 +98,6 @@ class Webhooks:
                 if answer.is_success:
                     return
                 trouble = f"it answered {answer.status_code}"
-            except httpx.HTTPError as error:
+            except (httpx.HTTPError, httpx.InvalidURL, OSError, ValueError) as error:
                 trouble = str(error) or type(error).__name__
         _log.warning("webhook not delivered", address=address, job=message.reconstruction_id, reason=trouble)

@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, get_args
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 from pydantic import AfterValidator, BeforeValidator, Field, SecretStr, ValidationError
 from pydantic.config import JsonDict
@@ -90,11 +90,19 @@ Words = Annotated[list[str], NoDecode, BeforeValidator(_parts)]
 """In the environment and after --set: separated by commas, or a JSON list."""
 
 
+def _has_port(parts: SplitResult) -> bool:
+    """Whether its port is left out or a number of one."""
+    try:
+        return parts.port != 0
+    except ValueError:
+        return False
+
+
 def _addresses(values: list[str]) -> list[str]:
     """Addresses of web servers. Raises ValueError for anything else."""
     for value in values:
         parts = urlsplit(value)
-        if parts.scheme not in ("http", "https") or not parts.hostname:
+        if parts.scheme not in ("http", "https") or not parts.hostname or not _has_port(parts):
             raise ValueError(f"{value!r} is no address: write http://HOST/PATH or https://HOST/PATH")
     return values
 

@@ -6,6 +6,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Protocol
 
+from spiked_service.base.errors import BusyError
 from spiked_service.store.catalogue import Catalogue
 from spiked_service.store.folder import UPLOAD_SUFFIXES, DataFolder
 from spiked_service.store.rows import CaptureRow
@@ -33,8 +34,8 @@ class Removing(Protocol):
         """Mark it as deleted."""
         ...
 
-    def purge(self, capture_id: str) -> None:
-        """Purge it."""
+    def purge(self, capture_id: str, still: Callable[[CaptureRow], bool]) -> None:
+        """Purge it, if its row is `still` one to purge. Raises BusyError."""
         ...
 
 
@@ -52,7 +53,7 @@ class Retention:
         """May be changed at any time."""
 
     def apply(self, now: datetime | None = None) -> None:
-        """Remove what exceeds the policy. Raises StoreError, and BusyError while a job runs."""
+        """Remove what exceeds the policy, but for captures with a running job. Raises StoreError."""
         now = now or datetime.now(UTC)
         policy = self.policy
         rows = [row for row in self._catalogue.captures.where("1 ORDER BY id") if row.state.over]
@@ -82,12 +83,18 @@ class Retention:
         for row in candidates:
             if total <= limit:
                 return
-            self._purge(row, f"all captures together are larger than {limit} bytes")
-            total -= used.get(row.id, 0)
+            if self._purge(row, f"all captures together are larger than {limit} bytes"):
+                total -= used.get(row.id, 0)
 
-    def _purge(self, row: CaptureRow, why: str) -> None:
-        self._captures.purge(row.id)
+    def _purge(self, row: CaptureRow, why: str) -> bool:
+        """Purge a capture, unless it was restored or kept meanwhile, or one of its jobs runs; whether it was."""
+        removed = row.deleted_at is not None
+        try:
+            self._captures.purge(row.id, lambda now: now.deleted_at is not None if removed else _disposable(now))
+        except BusyError:
+            return False  # the next time
         self._log(f"capture {row.id} is gone: {why}")
+        return True
 
     def _drop_uploads(self, now: datetime) -> None:
         for row in self._catalogue.uploads.where():

@@ -62,7 +62,7 @@ def test_old_ones_are_removed_then_gone_unless_kept_or_running(data_store: DataS
     assert data_store.catalogue.captures.get(old).deleted_at is not None
     assert there(data_store, old, young, kept, running) == [True] * 4
     assert [row.id for row in data_store.captures.list(deleted=True).items] == [old]
-    assert data_store.captures.restore(old).row.deleted_at is None
+    assert data_store.captures.removal.restore(old).row.deleted_at is None
     data_store.captures.update(old, keep=True)
     data_store.retention.apply(NOW)
     assert data_store.catalogue.captures.get(old).deleted_at is None
@@ -115,7 +115,7 @@ def test_on_a_full_disk_captures_are_removed_and_purged(tmp_path: Path) -> None:
         with pytest.raises(StoreError, match="full"):
             data_store.catalogue.captures.set(young, notes="x" * 10_000)
         assert reserve.exists()
-        assert data_store.captures.remove(unwanted).row.deleted_at is not None
+        assert data_store.captures.removal.remove(unwanted).row.deleted_at is not None
         assert not reserve.exists()
         data_store.catalogue.keep_reserve()
         assert not reserve.exists(), "there is no room for it yet"

@@ -71,19 +71,19 @@ def _add_end_routes(router: APIRouter, captures: Captures) -> None:
     @router.delete("/{capture_id:id}", status_code=HTTPStatus.NO_CONTENT, responses=problems(404, 409))
     def remove_capture(capture_id: str) -> None:
         """Remove it with its files and reconstructions; `:restore` undoes it for some days, `:purge` frees the disk."""
-        captures.remove(capture_id)
+        captures.removal.remove(capture_id)
 
     @router.post("/{capture_id:id}:purge", status_code=HTTPStatus.NO_CONTENT, responses=problems(404, 409))
     def purge_capture(capture_id: str, idempotency_key: IdempotencyKey = None) -> None:
         """Delete a removed capture with its files for good, before retention does."""
         if captures.get(capture_id).row.deleted_at is None:
             raise BusyError(f"capture {capture_id} has not been removed: remove it first, then it can be purged")
-        captures.purge(capture_id)
+        captures.removal.purge(capture_id)
 
     @router.post("/{capture_id:id}:restore", responses=problems(404, 409))
     def restore_capture(capture_id: str, idempotency_key: IdempotencyKey = None) -> CaptureOut:
         """Undo its removal."""
-        captures.restore(capture_id)
+        captures.removal.restore(capture_id)
         return CaptureOut.of(captures.get(capture_id))
 
     @router.post("/{capture_id:id}:stop", status_code=HTTPStatus.ACCEPTED, responses=problems(404, 409))

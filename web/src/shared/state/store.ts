@@ -55,7 +55,7 @@ const { setState: set, getState: get } = useService;
 
 export const isFinished = (capture: Capture): boolean => capture.state === "complete" || capture.state === "failed";
 /** Whether the capture still takes frames; while it only refines, its device is free. */
-export const isAcquiring = (capture: Capture): boolean => capture.state === "starting" || capture.state === "streaming";
+export const isAcquiring = (capture: Capture): boolean => ["starting", "waiting", "streaming"].includes(capture.state);
 export const isEnded = (job: Reconstruction): boolean => !["queued", "running"].includes(job.state);
 
 /** Ids are UUIDs of version 7: the largest is the newest. */

@@ -39,7 +39,8 @@ IdempotencyKey = Annotated[
         json_schema_extra=not_null,
         description="Any text, new for each new request. A request that is sent again with its key is not carried out "
         "again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request "
-        "has used is refused with 422, and one whose request is still carried out with 409.",
+        "has used is refused with 422; one whose request is still carried out, or during which the service ended, with "
+        "409.",
     ),
 ]
 

@@ -4734,7 +4734,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path: {
@@ -4845,7 +4845,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path: {
@@ -5257,7 +5257,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path: {
@@ -5673,7 +5673,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path?: never;
@@ -6092,7 +6092,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path: {
@@ -6196,7 +6196,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path: {
@@ -6302,7 +6302,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path: {
@@ -6408,7 +6408,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path?: never;
@@ -6619,7 +6619,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path: {
@@ -8173,7 +8173,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path?: never;
@@ -8601,7 +8601,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path: {
@@ -8707,7 +8707,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path: {
@@ -8826,7 +8826,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path: {
@@ -8945,7 +8945,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path: {
@@ -10610,7 +10610,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path: {
@@ -10729,7 +10729,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path: {
@@ -11161,7 +11161,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path: {
@@ -12073,7 +12073,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path?: never;
@@ -12642,7 +12642,7 @@ export interface operations {
         parameters: {
             query?: never;
             header?: {
-                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422, and one whose request is still carried out with 409. */
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
                 "idempotency-key"?: string;
             };
             path: {

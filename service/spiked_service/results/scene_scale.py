@@ -106,6 +106,13 @@ def forget_scale(folder: Path, since: int) -> bool:
     return known
 
 
+def put_scale_back(folder: Path, before: SceneScale) -> None:
+    """Undo `forget_scale`, since no version of another unit came. Raises SceneError, OSError."""
+    with _WRITING:
+        stored = before.model_copy(update={"revision": read_scale(folder).revision + 1})
+        write_atomically(folder / SCALE, stored.model_dump_json(indent=1).encode())
+
+
 def remove_scale(folder: Path) -> None:
     """Remove the scale of what is replaced in a folder of `spiked reconstruct`. Raises OSError."""
     (folder / SCALE).unlink(missing_ok=True)

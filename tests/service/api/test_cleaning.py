@@ -1,5 +1,6 @@
 """A scene cleaned over HTTP, and brought back."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -54,3 +55,20 @@ def test_what_is_outlined_in_a_view_is_removed(service: Any, done: CaptureOut, j
         refused = http.post(f"{url}:clean", json={**body, "version": edited["version"], "outline": outline})
         assert refused.status_code == 422, refused.text
     assert http.post(f"{url}:revert", json={"version": edited["version"], "to": before["version"]}).status_code == 200
+
+
+def test_a_version_of_another_unit_takes_no_metres_along(service: Any, done: CaptureOut, job: str) -> None:
+    """Earlier versions are of another run: the scale that was measured since is not theirs."""
+    http, url = service.http, f"reconstructions/{job}"
+    before = http.get(url).json()["version"]
+    body = {"version": before, "floaters": False, "box": {"low": [-1e6] * 3, "high": [1e6] * 3}}
+    cleaned = http.post(f"{url}:clean", json=body).json()["version"]
+    (folder,) = Path(http.get("system").json()["data_folder"]).glob(f"reconstructions/{job}")
+    scale = {"revision": 3, "metres_per_unit": 2.0, "version": cleaned, "since": before}
+    (folder / "scale.json").write_text(json.dumps(scale))
+    assert http.get(f"{url}/scale").json()["metres_per_unit"] == 2.0
+    same = http.post(f"{url}:revert", json={"version": cleaned, "to": cleaned}).json()["version"]
+    assert http.get(f"{url}/scale").json()["metres_per_unit"] == 2.0
+    assert http.post(f"{url}:revert", json={"version": same, "to": before}).status_code == 200
+    assert http.get(f"{url}/scale").json()["metres_per_unit"] is None
+    (folder / "scale.json").unlink()

@@ -11,7 +11,9 @@ from spiked_service.api.problems import problems
 from spiked_service.api.results import Results
 from spiked_service.api.schemas.cleaning import CleanRequest, EditedOut, RevertRequest
 from spiked_service.reconstructions.repository import ReconstructionRepository
-from spiked_service.results.scene_scale import forget_scale, read_scale
+from spiked_service.results.published import Published
+from spiked_service.results.scene_scale import forget_scale, put_scale_back, read_scale
+from spiked_service.results.versions import Publisher
 
 _POSES = 256
 """Poses of the path that views are chosen from."""
@@ -59,10 +61,20 @@ def cleaning_routes(rows: ReconstructionRepository, results: Results, route_clas
         """Publish an earlier version again, as the newest."""
         earlier = results.of(rows.get(reconstruction_id), body.to).published
         folder = rows.folder(reconstruction_id)
-        other_unit = earlier.version <= read_scale(folder).since
-        published = rows.publish_edit(reconstruction_id, body.version, lambda publisher: publisher.again(earlier))
-        if other_unit:
-            forget_scale(folder, published.version - 1)
+        scale = read_scale(folder)
+        other_unit = earlier.version <= scale.since
+
+        def again(publisher: Publisher) -> Published:
+            if not other_unit:
+                return publisher.again(earlier)
+            forget_scale(folder, body.version)  # first: after a kill there is no scale rather than a wrong one
+            try:
+                return publisher.again(earlier)
+            except BaseException:
+                put_scale_back(folder, scale)
+                raise
+
+        published = rows.publish_edit(reconstruction_id, body.version, again)
         return EditedOut(
             version=published.version, splats=published.splats, outside=0, outlined=0, floaters=0, shrunk=0
         )

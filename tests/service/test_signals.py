@@ -18,7 +18,11 @@ WIZARD = (sys.executable, "-m", "spiked_service", "calibrate", "--device", "sim:
 
 @contextmanager
 def waiting_wizard(folder: Path, *before: str) -> Iterator[subprocess.Popen[bytes]]:
-    with subprocess.Popen([*before, *WIZARD, folder / "camera.npz"], stdin=subprocess.PIPE, cwd=folder) as wizard:
+    def as_in_a_terminal() -> None:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run with nohup themselves
+
+    command = [*before, *WIZARD, folder / "camera.npz"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, cwd=folder, preexec_fn=as_in_a_terminal) as wizard:
         until(lambda: bool(list(folder.glob(".spiked-*"))), "its folder")
         yield wizard
         wizard.kill()

@@ -8,7 +8,11 @@ from types import FrameType
 
 Handler = Callable[[int, FrameType | None], object]
 
-_ENDING = (signal.SIGTERM, signal.SIGHUP)
+
+def ending_signals() -> tuple[signal.Signals, ...]:
+    """SIGTERM, and SIGHUP unless it is ignored: `nohup` lets a program outlive its terminal."""
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return (signal.SIGTERM,) if ignored else (signal.SIGTERM, signal.SIGHUP)
 
 
 class _Ended(BaseException):
@@ -21,12 +25,8 @@ class _Ended(BaseException):
 
 @contextmanager
 def handling(handlers: Mapping[signal.Signals, Handler]) -> Iterator[None]:
-    """These handle their signals; afterwards those before do again.
-
-    SIGHUP stays ignored if it was: `nohup` lets a program outlive its terminal.
-    """
-    taken = {number: handler for number, handler in handlers.items() if not _ignored(number)}
-    before = {number: signal.signal(number, handler) for number, handler in taken.items()}
+    """These handle their signals; afterwards those before do again."""
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield
     finally:
@@ -45,7 +45,7 @@ def cleaning_up() -> Iterator[None]:
         raise _Ended(number)
 
     try:
-        with handling(dict.fromkeys(_ENDING, end)):
+        with handling(dict.fromkeys(ending_signals(), end)):
             yield
     except _Ended as ended:
         signal.signal(ended.number, signal.SIG_DFL)
@@ -59,11 +59,7 @@ def holding() -> Iterator[None]:
     For imports: packages that catch BaseException around theirs (trimesh does) would swallow Ctrl-C.
     """
     came: list[int] = []
-    with handling(dict.fromkeys((signal.SIGINT, *_ENDING), lambda number, frame: came.append(number))):
+    with handling(dict.fromkeys((signal.SIGINT, *ending_signals()), lambda number, frame: came.append(number))):
         yield
     if came:
         signal.raise_signal(came[0])
-
-
-def _ignored(number: signal.Signals) -> bool:
-    return number is signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from spiked.client import CaptureOut, CaptureRequest, CaptureState, Grade, GroupOut, Spiked
 from spiked.errors import ConfigurationError
-from spiked_service.base.signals import handling
+from spiked_service.base.signals import ending_signals, handling
 from spiked_service.cli import outputs
 from spiked_service.cli.console import messages, output, report_warning
 from spiked_service.results.map_folder import file_name
@@ -75,7 +75,7 @@ def record(
     ]
     with Spiked(address, token=chosen_token(token, token_file)) as client:
         # The end of the terminal and SIGTERM stop the captures, as Ctrl-C does: nobody else would.
-        with handling(dict.fromkeys((signal.SIGTERM, signal.SIGHUP), signal.default_int_handler)):
+        with handling(dict.fromkeys(ending_signals(), signal.default_int_handler)):
             run = _Run(client, plans)
             stopped = run.wait()
         _show(run)

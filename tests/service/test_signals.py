@@ -18,11 +18,13 @@ WIZARD = (sys.executable, "-m", "spiked_service", "calibrate", "--device", "sim:
 
 @contextmanager
 def waiting_wizard(folder: Path, *before: str) -> Iterator[subprocess.Popen[bytes]]:
-    def as_in_a_terminal() -> None:
-        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run with nohup themselves
-
     command = [*before, *WIZARD, folder / "camera.npz"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, cwd=folder, preexec_fn=as_in_a_terminal) as wizard:
+    earlier = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run with nohup themselves
+    try:
+        started = subprocess.Popen(command, stdin=subprocess.PIPE, cwd=folder)
+    finally:
+        signal.signal(signal.SIGHUP, earlier)
+    with started as wizard:
         until(lambda: bool(list(folder.glob(".spiked-*"))), "its folder")
         yield wizard
         wizard.kill()

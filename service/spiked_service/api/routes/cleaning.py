@@ -1,5 +1,7 @@
 """`reconstructions/ID:clean` and `:revert`: edited scenes are versions like any."""
 
+from pathlib import Path
+
 from fastapi import APIRouter
 from fastapi.routing import APIRoute
 
@@ -61,22 +63,26 @@ def cleaning_routes(rows: ReconstructionRepository, results: Results, route_clas
         """Publish an earlier version again, as the newest."""
         earlier = results.of(rows.get(reconstruction_id), body.to).published
         folder = rows.folder(reconstruction_id)
-        scale = read_scale(folder)
-        other_unit = earlier.version <= scale.since
-
-        def again(publisher: Publisher) -> Published:
-            if not other_unit:
-                return publisher.again(earlier)
-            forget_scale(folder, body.version)  # first: after a kill there is no scale rather than a wrong one
-            try:
-                return publisher.again(earlier)
-            except BaseException:
-                put_scale_back(folder, scale)
-                raise
-
-        published = rows.publish_edit(reconstruction_id, body.version, again)
+        published = rows.publish_edit(
+            reconstruction_id,
+            body.version,
+            lambda publisher: _published_again(publisher, earlier, folder, body.version),
+        )
         return EditedOut(
             version=published.version, splats=published.splats, outside=0, outlined=0, floaters=0, shrunk=0
         )
 
     return router
+
+
+def _published_again(publisher: Publisher, earlier: Published, folder: Path, newest: int) -> Published:
+    """An earlier version as the newest. One of another unit of length has no scale."""
+    scale = read_scale(folder)
+    if earlier.version > scale.since:
+        return publisher.again(earlier)
+    forget_scale(folder, newest)  # first: after a kill there is no scale rather than a wrong one
+    try:
+        return publisher.again(earlier)
+    except BaseException:
+        put_scale_back(folder, scale)
+        raise

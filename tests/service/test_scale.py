@@ -25,7 +25,7 @@ def run(*arguments: str | Path) -> Result:
 
 def test_a_known_length_makes_metres(tmp_path: Path) -> None:
     out = room_map(2, (0.0, 0.5)).write(tmp_path / "out")
-    done = run(out, "--length", "3.0", "1.5", "--up", "0", "0", "1")
+    done = run(out, "--length", "3.0", "1.5", "--up", "0", "0", "4")
     assert done.exit_code == 0, done.output
     assert "a unit is 2 m" in done.output
     own, path = Scene.read_ply(out / "scene.ply"), Trajectory.read_tum(out / "trajectory.tum")
@@ -43,6 +43,7 @@ def test_a_known_length_makes_metres(tmp_path: Path) -> None:
     )
     stored = read_scale(out)
     assert (stored.revision, stored.metres_per_unit, stored.source) == (1, 2.0, ScaleSource.LENGTH)
+    assert stored.up == (0, 0, 1)
 
 
 def test_what_is_missing_is_said(tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ def scale(
     if length is not None:
         metres, units = length
         frame = FrameOfReference(metres / units if units > 0 else -1.0, kept)
-        made = SceneScale(metres_per_unit=frame.metres_per_unit, source=ScaleSource.LENGTH, up=kept)
+        sigma, source = None, ScaleSource.LENGTH
     else:
         by_tags = scale_by_tags(found.scene, found.trajectory, found.camera, tag or 0.0, family)
         for one in by_tags.tags:
@@ -63,9 +63,10 @@ def scale(
                 markup=False,
             )
         frame = FrameOfReference(by_tags.metres_per_unit, kept)
-        made = SceneScale(metres_per_unit=frame.metres_per_unit, sigma=by_tags.sigma, source=ScaleSource.TAG, up=kept)
+        sigma, source = by_tags.sigma, ScaleSource.TAG
+    made = SceneScale(metres_per_unit=frame.metres_per_unit, sigma=sigma, source=source, up=frame.direction)
     with outputs.writing("OUT", map_folder):
-        with whole_folder(map_folder / METRIC, ("scene.ply", "trajectory.tum")) as metric:
+        with whole_folder(map_folder / METRIC) as metric:
             frame.scene(found.scene).write_ply(metric / "scene.ply")
             frame.trajectory(found.trajectory).write_tum(metric / "trajectory.tum")
             (map_folder / SCALE).unlink(missing_ok=True)  # a kill between the two leaves no scale, not another one

@@ -1,5 +1,8 @@
 """Conversion keeps every frame's bits, and every gap that a form can tell of."""
 
+import resource
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -91,3 +94,18 @@ def test_the_command_finds_out_what_real_bytes_are(tmp_path: Path) -> None:
     recording = open_recording(out)
     assert int(np.bitwise_count(recording.compact(0, 1)).sum()) == 311
     assert [gap.count for gap in recording.gaps] == [241_231, 1]
+
+
+def test_a_conversion_without_room_leaves_the_source_whole(tmp_path: Path) -> None:
+    """Raw bytes beside the recording, of the same name: its sidecar is that of the source."""
+    with RecordingWriter(tmp_path / "rec.dat", Sensor(400, 250, 20_000.0)) as writer:
+        writer.append(np.zeros((300, 12_500), np.uint8))
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
+
+    command = [sys.executable, "-m", "spiked_service", "convert", "rec.dat", "rec.bin", "--to", "usb"]
+    done = subprocess.run(command, check=False, cwd=tmp_path, preexec_fn=limit, capture_output=True, text=True)
+    assert done.returncode == 2 and "rec.bin: cannot be written" in done.stderr
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before

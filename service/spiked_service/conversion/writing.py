@@ -1,12 +1,12 @@
 """Writes frames and gaps in any form that is written."""
 
 import os
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +39,7 @@ def write_content(content: Content, out: Path, to: Form, warn: Warn) -> tuple[in
     count = lost = 0
     with ExitStack() as stack:
         writer = _writer(content, out, to, warn)
-        stack.push(_remover(out))
+        stack.enter_context(_removed_after_an_error(out, to))
         stack.callback(writer.close)
         for item in chain([first], content.items):
             if isinstance(item, Gap):
@@ -51,15 +51,16 @@ def write_content(content: Content, out: Path, to: Form, warn: Warn) -> tuple[in
     return count, lost
 
 
-def _remover(out: Path) -> Callable[[type[BaseException] | None, BaseException | None, Any], None]:
-    """The end of a context that removes `out` and its sidecar after an error."""
-
-    def remove(kind: type[BaseException] | None, error: BaseException | None, traceback: Any) -> None:
-        if kind is not None:
-            out.unlink(missing_ok=True)
+@contextmanager
+def _removed_after_an_error(out: Path, to: Form) -> Iterator[None]:
+    """Raw bytes have no sidecar: one of that name is the source's, in the same folder."""
+    try:
+        yield
+    except BaseException:
+        out.unlink(missing_ok=True)
+        if to in (Form.COMPACT, Form.ROW_TAGGED):
             sidecar_path(out).unlink(missing_ok=True)
-
-    return remove
+        raise
 
 
 class _RecordingFile:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from spiked.errors import ConfigurationError, RecordingError
 from spiked.pose import exp_so3
-from spiked.recording import whole_recording
+from spiked.recording import RecordingWriter
 from spiked.scene import Scene
 from spiked.sensor import BitOrder, Layout, Sensor
 from spiked.simulate.camera import DEFAULT_GAIN, SimulatedCamera
@@ -150,9 +150,12 @@ def write_frames(
     simulation: dict[str, Any],
     progress: Callable[[int], None] | None,
 ) -> None:
-    """Write a recording with its sidecar; `next_frames` gives as many frames as it is asked for [n, frame_bytes]."""
+    """Write a recording with its sidecar, within `writing_into`.
+
+    `next_frames` gives as many frames as it is asked for [n, frame_bytes].
+    """
     note = "simulated; cfa is of the upright image"
-    with whole_recording(data, sensor, note=note, simulation=simulation) as out:
+    with RecordingWriter(data, sensor, note=note, simulation=simulation) as out:
         for begin in range(0, frames, _CHUNK):
             count = min(_CHUNK, frames - begin)
             out.append(next_frames(count))

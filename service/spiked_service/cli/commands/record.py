@@ -183,8 +183,8 @@ def _show(run: _Run) -> None:
         if recording is not None:
             planned = f" of {one.frames_planned:,}" if one.frames_planned else ""
             line += f", {recording.frames:,}{planned} frames, {recording.lost:,} lost"
-        if reasons := [one.reason or "", *([] if one.verdict is None else one.verdict.reasons)]:
-            line += "".join(f"; {reason}" for reason in reasons if reason)
+        reasons = one.reason, *(() if one.verdict is None else one.verdict.reasons)
+        line += "".join(f"; {reason}" for reason in reasons if reason)
         output.print(line, markup=False)
         for warning in one.warnings:
             report_warning(f"{one.source}: {warning}")

@@ -100,7 +100,7 @@ def _true_strips(held_out: Path, cells: dict[str, Path]) -> list[Strip]:
         raise SceneError(f"cannot read the held-out views {held_out}: {error!r}") from error
     found = []
     for on_path, where in ((True, "on the path"), (False, "beside the path")):
-        names = [name for name, beside in named if beside is on_path]
+        names = [name for name, lies_on_path in named if lies_on_path is on_path]
         if names:
             strip = _true_strip(names[len(names) // 2], where, cells)
             found += [] if strip is None else [strip]

@@ -11,7 +11,7 @@ from spiked.blocks import aligned_window
 from spiked.errors import CalibrationError
 from spiked.numpy_files import UNREADABLE, read_npz
 from spiked.recording import Recording
-from spiked.sensor import Image, Response, Sensor
+from spiked.sensor import Image, Mosaic, Response, Sensor
 
 __all__ = ["Calibration", "CalibrationSummary", "mean_rate"]
 
@@ -83,12 +83,15 @@ class Calibration:
                 "calibrate with the same camera and geometry"
             )
 
-    def apply(self, rate: Image, deviation: Image) -> tuple[Image, Image]:
-        """Light and its deviation from a measured rate [H, W]; dead pixels take their neighbours', uncertain."""
+    def apply(self, rate: Image, deviation: Image, mosaic: Mosaic | None = None) -> tuple[Image, Image]:
+        """Light and its deviation from a measured rate [H, W].
+
+        Dead pixels take the light of their neighbours, of a mosaic those of their colour, and are uncertain.
+        """
         light = np.maximum(rate - self.dark, 0) / self.gain
         spread = deviation / self.gain
         if self.dead.any():
-            light = np.where(self.dead, around(light, ~self.dead), light)
+            light = around(light, ~self.dead, mosaic)
             spread = np.where(self.dead, np.float32(1e3), spread)
         return light.astype(np.float32), spread.astype(np.float32)
 
@@ -167,6 +170,11 @@ class Calibration:
         net = light - offset
         gain = net / _typical(net, flat.sensor)
         dead = (gain < GAIN_LIMITS[0]) | (gain > GAIN_LIMITS[1]) | (offset > HOT_SHARE * float(np.median(light)))
+        if 2 * int(dead.sum()) > dead.size:
+            raise CalibrationError(
+                f"more than half of the pixels would be dead or hot by {flat.path}: use light that is even and several "
+                "times as bright as the dark current, and recordings of one camera"
+            )
         gain = np.where(dead, 1, gain)
         gain[~dead] /= np.exp(np.log(gain[~dead]).mean())
         return cls(gain.astype(np.float32), offset.astype(np.float32), dead)
@@ -232,8 +240,21 @@ def _likeness(rate: Image) -> float:
     return float(np.mean([np.corrcoef(a.ravel(), b.ravel())[0, 1] for a, b in pairs]))
 
 
-def around(image: Image, good: NDArray[np.bool_]) -> Image:
-    """For each pixel the mean of the good ones in the smallest square about it that has one."""
+def around(image: Image, good: NDArray[np.bool_], mosaic: Mosaic | None = None) -> Image:
+    """The image, and at pixels that are not good the mean of the good ones in the smallest square that has one.
+
+    Of a mosaic they are those of the same colour.
+    """
+    if mosaic is None:
+        return _around(image, good)
+    out, channels = image.astype(np.float32), mosaic.channels(*image.shape)
+    for channel in range(3):
+        missing = (channels == channel) & ~good
+        out[missing] = _around(image, good & (channels == channel))[missing]
+    return out
+
+
+def _around(image: Image, good: NDArray[np.bool_]) -> Image:
     out = np.where(good, image, 0).astype(np.float32)
     missing = ~good
     weight = good.astype(np.float32)

@@ -12,7 +12,7 @@ import pytest
 from spiked.calibration import Calibration, around, mean_rate
 from spiked.errors import CalibrationError
 from spiked.recording import Recording, RecordingWriter, open_recording
-from spiked.sensor import Response, Sensor
+from spiked.sensor import Mosaic, Response, Sensor
 from spiked.simulate import PixelMaps, SensorNoise
 from spiked.simulate.sensor import SpikeSensor
 
@@ -158,6 +158,26 @@ def test_a_missing_pixel_takes_the_mean_of_the_nearest_good_ones() -> None:
     good[2, 2] = False
     image[2, 2] = 1e6
     np.testing.assert_allclose(around(image, good)[2, 2], 12.0)
+
+
+def test_a_dead_pixel_of_a_mosaic_takes_the_light_of_its_colour() -> None:
+    mosaic = Mosaic.GBRG
+    colours = np.array([0.1, 0.3, 0.05], np.float32)[mosaic.channels(8, 9)]
+    dead = np.zeros((8, 9), bool)
+    dead[3, 3], dead[3, 4], dead[4, 4], dead[0, 0] = True, True, True, True
+    measured = np.where(dead, np.float32(0.9), colours)
+    calibration = Calibration(np.ones_like(colours), np.zeros_like(colours), dead)
+    light, deviation = calibration.apply(measured, np.full_like(measured, 0.01), mosaic)
+    np.testing.assert_allclose(light, colours, rtol=1e-6)
+    np.testing.assert_array_equal(deviation > 1, dead)
+
+
+def test_a_light_that_hardly_exceeds_the_dark_current_is_refused(tmp_path: Path) -> None:
+    maps = PixelMaps(np.ones((48, 64), np.float32), np.full((48, 64), 0.1, np.float32))
+    pixels = SpikeSensor(SENSOR, 3, SensorNoise(), maps=maps)
+    dark, flat = record(tmp_path / "dark.dat", pixels, 0.0), record(tmp_path / "flat.dat", pixels, 0.15)
+    with pytest.raises(CalibrationError, match="more than half of the pixels"):
+        Calibration.measure(flat, dark)
 
 
 def test_a_dark_recording_alone_gives_dark_rates_and_hot_pixels(tmp_path: Path) -> None:

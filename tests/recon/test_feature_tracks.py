@@ -12,6 +12,7 @@ from spiked.recon.frontend.feature_tracks import Tracks, flow, picture, pyramid,
 from spiked.recon.frontend.spike_intervals import JITTER, SpikeIntervals
 from spiked.recon.frontend.windowing import make_view
 from spiked.recon.statistics import median
+from spiked.sensor import Sensor
 
 H, W = 96, 128
 
@@ -124,7 +125,7 @@ def test_a_view_is_measured_as_its_window_says(far: int) -> None:
     start[:10], stop[:10] = 0xFFFF, 0xFFFF
     stop[10:20] = start[10:20]
     window = Window(100, 64 + far, 124, 140 + far, spikes, start, stop, spikes)
-    view = make_view(window, after_gap=False)
+    view = make_view(window, Sensor(W, H, 20000.0), after_gap=False)
     valid = window.valid
     assert view.intervals.start.dtype == (np.uint16 if far else np.uint8)
     np.testing.assert_allclose(view.rate, window.rate(fill=True), rtol=1e-6)

@@ -58,8 +58,8 @@ def test_a_view_shows_its_target_only_to_the_map() -> None:
     images[30] = 1  # one spike too many in each pixel: the count has it
     frames = packed(images)
     window = aligned_window(frames, SENSOR, 0, 24, 40)
-    view = make_view(window, after_gap=False, targets=record_targets((*TargetKind,), frames, SENSOR, 0, 24, 40))
-    assert view.nbytes > make_view(window, after_gap=False).nbytes
+    view = make_view(window, SENSOR, after_gap=False, targets=record_targets((*TargetKind,), frames, SENSOR, 0, 24, 40))
+    assert view.nbytes > make_view(window, SENSOR, after_gap=False).nbytes
     np.testing.assert_array_equal(view.showing(TargetKind.COUNTS).rate, images[16:48].sum(0) / np.float32(32))
     assert view.showing(TargetKind.ADJACENT).rate[0, 0] == pytest.approx(1 / 5)
     times, windows, seen = view.showing(TargetKind.COUNTS).exposure(4)

@@ -84,7 +84,7 @@ def build_view(
     image = _sharp(of, frames, sensor) if sharp and warped is not None else None
     first = 0 if of.warped is None else of.warped[0]
     recorded = record_targets(targets, frames, sensor, of.first, of.begin, of.end)
-    return make_view(window, of.after_gap, calibration, image, first, warped, sensor.response, recorded)
+    return make_view(window, sensor, of.after_gap, calibration, image, first, warped, recorded)
 
 
 def _sharp(of: ViewFrames, frames: NDArray[np.uint8], sensor: Sensor) -> Image | None:

@@ -81,6 +81,8 @@ class View:
     """Stored frames [n, frame_bytes] around the middle, if `sharp` is set; the map is fitted to all of them."""
     targets: tuple[SpikeTarget, ...] = ()
     """What else the map may be fitted to, one of a kind."""
+    mosaic: Mosaic | None = None
+    """Of the sensor."""
     shown: SpikeTarget | None = None
     """Rates, deviations and exposures are those of this target; None: of the charge between `intervals`."""
 
@@ -101,7 +103,7 @@ class View:
     def light(self) -> tuple[Image, Image]:
         """Rate and deviation, computed at the first access and cached."""
         measured = self._measured.rate(), self._measured.deviation()
-        return measured if self.calibration is None else self.calibration.apply(*measured)
+        return measured if self.calibration is None else self.calibration.apply(*measured, self.mosaic)
 
     @property
     def rate(self) -> Image:
@@ -144,19 +146,21 @@ class View:
 
 def make_view(
     window: Window,
+    sensor: Sensor,
     after_gap: bool,
     calibration: Calibration | None = None,
     sharp: Image | None = None,
     first: int = 0,
     frames: NDArray[np.uint8] | None = None,
-    response: Response = Response.INTEGRATE_AND_FIRE,
     targets: tuple[SpikeTarget, ...] = (),
 ) -> View:
     """The view of a window, in light instead of spikes where the camera is calibrated."""
-    counted = response is Response.BERNOULLI
+    counted = sensor.response is Response.BERNOULLI
     intervals = PhotonCounts.of(window) if counted else SpikeIntervals.of(window)
     count = float(cv2.mean(window.count)[0])
-    return View(window.begin, window.end, intervals, count, calibration, after_gap, sharp, first, frames, targets)
+    return View(
+        window.begin, window.end, intervals, count, calibration, after_gap, sharp, first, frames, targets, sensor.mosaic
+    )
 
 
 class Windows:
@@ -245,7 +249,7 @@ class Windows:
         begin = first_frame + (len(frames) - length) // 2
         window = aligned_window(frames, self.sensor, first_frame, begin, begin + length)
         targets = self._record(frames, first_frame, window)
-        view = make_view(window, self._gap, self._calibration, response=self.sensor.response, targets=targets)
+        view = make_view(window, self.sensor, self._gap, self._calibration, targets=targets)
         self._frames, self._first, self._next, self._gap = self._store[:0], stop, stop, False
         self._probed, self._compensator = True, None
         return view
@@ -325,7 +329,7 @@ class Windows:
                 continue  # the motion after the last frame is unknown, and a blurred view is worse than none
             first, frames = self._around((begin + end) // 2, stop) if sharp is not None else (0, None)
             targets = self._record(part, low, window)
-            view = make_view(window, self._gap, self._calibration, sharp, first, frames, self.sensor.response, targets)
+            view = make_view(window, self.sensor, self._gap, self._calibration, sharp, first, frames, targets)
             if not self._sees_motion:
                 self._wanted = _frames_wanted(view.spikes_a_pixel / (end - begin))
             yield view

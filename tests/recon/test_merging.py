@@ -11,7 +11,7 @@ from spiked.pose import exp_so3, log_so3, rotation_of
 from spiked.recon import KnownMap, NotOnePlaceError, merge
 from spiked.recon.mapping.replay import Replay
 from spiked.recon.merging.joining import Joint, join
-from spiked.recon.merging.known_map import inverse
+from spiked.recon.merging.known_map import inverse, moved_scene
 from spiked.recon.merging.path_warp import PathWarp
 from spiked.render import Camera, rasteriser_for
 from spiked.scene import Scene
@@ -112,6 +112,23 @@ def test_a_grey_map_can_be_joined_with_a_coloured_one(left: KnownMap) -> None:
     coloured = left.coloured().scene
     assert coloured.colours.shape == (len(left.scene), 3)
     assert (coloured.colours == left.scene.colours).all() and coloured.white == left.scene.white
+
+
+def test_colours_by_direction_stay_with_a_map_that_is_joined(left: KnownMap) -> None:
+    harmonics = np.zeros((len(left.scene), 3, 1), np.float32)
+    harmonics[:, 2] = 0.1
+    seen = replace(left, scene=replace(left.scene, harmonics=harmonics))
+    assert (seen.coloured().scene.seen_from(np.zeros(3)).colours == seen.scene.seen_from(np.zeros(3)).colours).all()
+
+    turn = Similarity(1.0, exp_so3(np.array([0.3, 0.2, 0.1])), np.zeros(3))
+    warp = PathWarp(np.array([1.0, 3.0]), [Similarity(1.0, np.eye(3), np.zeros(3)), turn])
+    weights = np.zeros((len(left.scene), 2), np.float32)
+    weights[::2, 0], weights[1::2, 1] = 1, 1
+    moved = warp.scene(seen.scene, weights, np.array([1.0, 3.0]), 2.0)
+    for rows, similarity in ((slice(0, None, 2), warp.similarities[0]), (slice(1, None, 2), turn)):
+        alone = moved_scene(seen.scene, similarity, 2.0)
+        centre = np.array([0.1, 0.2, -0.3])
+        np.testing.assert_allclose(moved.seen_from(centre).colours[rows], alone.seen_from(centre).colours[rows], 1e-5)
 
 
 def test_an_empty_map_is_refused(left: KnownMap) -> None:

@@ -46,7 +46,10 @@ class KnownMap:
         """The map with three colours: grey surfaces have them alike."""
         scene = self.scene
         colours = np.ascontiguousarray(np.broadcast_to(scene.colours, (len(scene), 3)))
-        return replace(self, scene=replace(scene, colours=colours))
+        harmonics = scene.harmonics
+        if harmonics is not None:
+            harmonics = np.ascontiguousarray(np.broadcast_to(harmonics, (*harmonics.shape[:2], 3)))
+        return replace(self, scene=replace(scene, colours=colours, harmonics=harmonics))
 
 
 def brightened(scene: Scene, brightness: float) -> Scene:

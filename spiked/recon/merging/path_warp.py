@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.evaluate import Similarity
+from spiked.harmonics import rotated_harmonics
 from spiked.pose import Array, exp_so3, log_so3, quaternion
 from spiked.recon.merging.known_map import brightened, turned_quaternions
 from spiked.scene import Scene
@@ -60,13 +61,18 @@ class PathWarp:
         for part, share in zip(parts, shares.T, strict=True):
             means += share[:, None] * part.points(points)
             log_scale += share * np.log(part.scale)
-        best = quaternion(np.stack([part.rotation for part in parts]))[shares.argmax(1)]
+        nearest = shares.argmax(1)
+        turns = np.stack([part.rotation for part in parts])
+        harmonics = None if scene.harmonics is None else scene.harmonics.copy()
+        for number, turn in enumerate(turns if harmonics is not None else ()):
+            harmonics[nearest == number] = rotated_harmonics(harmonics[nearest == number], turn)
         moved = Scene(
             np.ascontiguousarray(means, np.float32),
-            np.ascontiguousarray(turned_quaternions(best, scene.quats), np.float32),
+            np.ascontiguousarray(turned_quaternions(quaternion(turns)[nearest], scene.quats), np.float32),
             np.ascontiguousarray(scene.log_scales + log_scale[:, None], np.float32),
             scene.opacity_logits.copy(),
             scene.colours,
             scene.white,
+            harmonics,
         )
         return brightened(moved, brightness)

@@ -4,6 +4,8 @@ import resource
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from spiked_service.cli.main import app
 from spiked_service.conversion.form import Form
-from spiked_service.conversion.reading import read_content
+from spiked_service.conversion.reading import Item, read_content
 from spiked_service.conversion.writing import write_content
 from typer.testing import CliRunner
 
@@ -96,6 +98,22 @@ def test_the_command_finds_out_what_real_bytes_are(tmp_path: Path) -> None:
     assert [gap.count for gap in recording.gaps] == [241_231, 1]
 
 
+def test_raw_bytes_appear_when_they_are_whole(tmp_path: Path) -> None:
+    """A kill leaves no shorter file: raw bytes do not say how many there should be."""
+    with RecordingWriter(tmp_path / "rec.dat", Sensor(400, 250, 20_000.0)) as writer:
+        writer.append(np.zeros((3, 12_500), np.uint8))
+    out, content = tmp_path / "rec.usb", read_content(tmp_path / "rec.dat", None, RecordingGeometry(), print)
+    seen = []
+
+    def watched(items: Iterator[Item]) -> Iterator[Item]:
+        for item in items:
+            yield item
+            seen.append(out.exists())
+
+    write_content(replace(content, items=watched(content.items)), out, Form.USB, print)
+    assert seen and not any(seen) and out.stat().st_size > 3 * 12_500
+
+
 def test_a_conversion_without_room_leaves_the_source_whole(tmp_path: Path) -> None:
     """Raw bytes beside the recording, of the same name: its sidecar is that of the source."""
     with RecordingWriter(tmp_path / "rec.dat", Sensor(400, 250, 20_000.0)) as writer:
@@ -107,5 +125,5 @@ def test_a_conversion_without_room_leaves_the_source_whole(tmp_path: Path) -> No
 
     command = [sys.executable, "-m", "spiked_service", "convert", "rec.dat", "rec.bin", "--to", "usb"]
     done = subprocess.run(command, check=False, cwd=tmp_path, preexec_fn=limit, capture_output=True, text=True)
-    assert done.returncode == 2 and "rec.bin: cannot be written" in done.stderr
+    assert done.returncode == 2 and "rec.bin cannot be written" in done.stderr
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before

@@ -40,6 +40,8 @@ from spiked.client.models import (
 )
 from spiked.client.results import ResultMethods
 from spiked.errors import SpikedError
+from spiked.recording import remove_recording, sidecar_path
+from spiked.whole_files import write_atomically
 
 _CHUNK_BYTES = 8 << 20
 """Bytes of an upload in one request."""
@@ -201,18 +203,25 @@ class Spiked(MapMethods, ResultMethods):
         return _wait(lambda: self.capture(capture_id), lambda one: one.state in over, timeout_s)
 
     def save_recording(self, capture_id: str, path: Path | str) -> Path:
-        """Write the `.dat` and its sidecar; a download that broke off goes on where it ended."""
+        """Write the `.dat` and its sidecar; a download that broke off goes on where it ended.
+
+        An earlier recording of that name is replaced with its sidecar and index when the new one is here.
+        """
         path = Path(path)
         part = path.with_name(f"{path.name}.{capture_id}.part")
         done = part.stat().st_size if part.exists() else 0
         recording = self.capture(capture_id).recording
+        if recording is not None and done > recording.bytes:
+            done = 0
         if recording is None or done < recording.bytes:
             headers = {"Range": f"bytes={done}-"} if done else {}
             with self._connection.stream(f"captures/{capture_id}/recording", headers) as answer:
                 _append(part, answer)
         sidecar = self._connection.request("GET", f"captures/{capture_id}/recording/sidecar")
-        path.with_suffix(".json").write_bytes(sidecar.content)
-        return part.replace(path)
+        remove_recording(path)  # frames beside the sidecar or the index of others would be read by these
+        part.replace(path)
+        write_atomically(sidecar_path(path), sidecar.content)
+        return path
 
     def start_reconstruction(
         self,

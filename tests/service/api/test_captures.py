@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from spiked.client import ApiError, CaptureOut, NoiseModel
-from spiked.recording import open_recording
+from spiked.recording import Durability, RecordingWriter, open_recording
+from spiked.sensor import Sensor
 
 FRAMES = 512
 
@@ -79,9 +80,22 @@ def test_the_recording_opens_with_its_sidecar(service: Any, done: CaptureOut, tm
 def test_a_download_that_broke_off_goes_on(service: Any, done: CaptureOut, tmp_path: Path) -> None:
     whole = service.http.get(f"captures/{done.id}/recording").content
     part = tmp_path / f"rec.dat.{done.id}.part"
-    for length in (100, len(whole)):
-        part.write_bytes(whole[:length])
+    for length in (100, len(whole), len(whole) + 1):
+        part.write_bytes((whole + b"?")[:length])
         assert service.client.save_recording(done.id, tmp_path / "rec.dat").read_bytes() == whole
+
+
+def test_a_download_replaces_an_earlier_recording_with_its_index(
+    service: Any, done: CaptureOut, tmp_path: Path
+) -> None:
+    with RecordingWriter(tmp_path / "rec.dat", Sensor(64, 48, 1000.0), durability=Durability(index=True)) as writer:
+        writer.append(np.zeros((5, 384), np.uint8))
+        writer.gap(5, 7, "device")
+    assert (tmp_path / "rec.index").exists()
+    service.client.save_recording(done.id, tmp_path / "rec.dat")
+    recording = open_recording(tmp_path / "rec.dat")
+    assert (recording.frames, recording.gaps) == (FRAMES, ())
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["rec.dat", "rec.json"]
 
 
 @pytest.mark.parametrize("kind", ["interval", "rate", "accumulation", "render"])

@@ -85,6 +85,10 @@ class Allocator:
                 self._allocated += size
         self._allocated = max(self._allocated, end)
 
+    def cut(self, end: int) -> None:
+        """Call after the file was cut to `end` bytes: what was allocated behind them is free again."""
+        self._checked, self._allocated = min(self._checked, end), min(self._allocated, end)
+
 
 def _fitting(file: int, durability: Durability) -> tuple[int, int]:
     """Step and reserve in bytes, reduced on a small disk."""

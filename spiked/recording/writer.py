@@ -164,6 +164,7 @@ class RecordingWriter:
         except OSError as error:
             with suppress(OSError):  # on a read-only disk the unfinished block stays and is not counted
                 files.frames.cut(offset)
+                files.allocator.cut(offset)
                 if files.index is not None:
                     files.index.retract(entries)
             raise RecordingError(

@@ -31,6 +31,7 @@ from spiked.recording import (
     sidecar_path,
     verify,
 )
+from spiked.recording.durability import Allocator
 from spiked.recording.index import ENTRY_BYTES
 from spiked.sensor import Layout, Sensor
 
@@ -268,6 +269,19 @@ def test_space_taken_in_advance_is_given_back(tmp_path: Path) -> None:
     assert ahead.st_size == after.st_size == 80 * SENSOR.frame_bytes
     assert ahead.st_blocks * 512 > 32 << 20
     assert after.st_blocks * 512 <= 80 * SENSOR.frame_bytes + 4096
+
+
+def test_space_is_taken_again_after_a_file_was_cut(tmp_path: Path) -> None:
+    with (tmp_path / "rec.dat").open("wb") as file:
+        allocator = Allocator(file.fileno(), Durability(preallocate_bytes=1 << 20), 0)
+        allocator.before(4096)
+        if os.fstat(file.fileno()).st_blocks * 512 < 1 << 20:
+            pytest.skip("this file system does not allocate ahead")
+        file.truncate(1)  # frees what is allocated behind it
+        file.truncate(0)
+        allocator.cut(0)
+        allocator.before(4096)
+        assert os.fstat(file.fileno()).st_blocks * 512 >= 1 << 20
 
 
 def test_a_read_only_file_system_is_told(small_disk: Path) -> None:

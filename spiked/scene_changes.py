@@ -43,7 +43,8 @@ class SceneChanges:
     whole: bool
     """The slots are all empty before."""
     began: int
-    """First version of these slots; 0: nothing follows from them, and what comes next is whole."""
+    """A random number of these slots, by which they are known; 0: nothing follows from them, and what comes next is
+    whole."""
     version: int
     """Version of the scene that the slots show afterwards."""
     level: int

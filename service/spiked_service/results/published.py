@@ -42,7 +42,7 @@ class Published(BaseModel):
     slots: str | None = None
     """Name of the file of `ShownScene`, which only the newest versions have."""
     slots_began: int = 0
-    """First version of these slots."""
+    """The number of these slots: `ShownScene.began`."""
     paths: list[OtherPath] = []
     """Of a map of several recordings: the paths of the others."""
 

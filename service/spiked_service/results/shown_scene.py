@@ -5,6 +5,7 @@ that between two versions only what has visibly changed travels; see docs/decisi
 """
 
 import io
+import secrets
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,8 @@ class ShownScene:
 
     def __init__(self) -> None:
         self.began = 0
-        """First version of these slots; 0: they are of one version only."""
+        """A random number drawn when these slots began: other slots, of another reconstruction or of a backup that was
+        restored, have another one. 0: they are of one version only."""
         self.version = 0
         """Version of the scene that they show."""
         self._slots = np.zeros(0, _row_type(1))
@@ -75,7 +77,7 @@ class ShownScene:
         """Make the slots show a version of the scene, within `tolerance`."""
         rows = _rows(scene, white, version)
         if self.began == 0 or self._slots.dtype != rows.dtype:
-            self.began, self._slots, self._slot_of_row = version, np.zeros(0, rows.dtype), np.zeros(0, np.int64)
+            self.began, self._slots, self._slot_of_row = _number(), np.zeros(0, rows.dtype), np.zeros(0, np.int64)
         slot_of_row = self._matches(rows, tolerance)
         empty = np.ones(len(self._slots), bool)
         empty[slot_of_row[slot_of_row >= 0]] = False
@@ -122,6 +124,11 @@ class ShownScene:
         columns = (np.ascontiguousarray(slots[name][filled]) for name in _COLUMNS)
         numbers = gone.astype(np.uint32), filled.astype(np.uint32)
         return SceneChanges(version is None, self.began, self.version, level, len(slots), *numbers, *columns)
+
+
+def _number() -> int:
+    """A 32-bit number other than 0."""
+    return 1 + secrets.randbelow(0xFFFF_FFFF)
 
 
 def _row_type(channels: int) -> np.dtype[Any]:

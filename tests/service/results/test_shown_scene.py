@@ -107,6 +107,17 @@ def test_slots_are_found_again_whatever_the_order_and_used_again() -> None:
     assert len(mirrored(shown)) == COUNT
 
 
+def test_a_state_of_other_slots_is_never_continued() -> None:
+    """Of a second reconstruction of the capture, or of a backup that was restored: both count versions from 1."""
+    one, other = ShownScene(), ShownScene()
+    for shown in (one, other):
+        shown.update(room(), WHITE, 1)
+    assert one.since(None).state != other.since(None).state
+    began = one.began
+    one.update(moved(room(), 0.002, 1), WHITE, 2)
+    assert one.began == began
+
+
 def test_levels_of_detail_are_parts_of_each_other() -> None:
     shown = ShownScene()
     shown.update(room(), WHITE, 1)
@@ -126,7 +137,7 @@ def test_slots_are_read_back_and_a_damaged_file_is_refused(tmp_path: Path) -> No
     shown.update(room(), WHITE, 4)
     shown.update(moved(room(), 0.01, 1), WHITE, 5)
     shown.write(path)
-    again = ShownScene.read(path, 4, 5)
+    again = ShownScene.read(path, shown.began, 5)
     assert again.since(4).write() == shown.since(4).write()
     raw = path.read_bytes()
     for damaged in (b"", raw[:-1], raw[:40], b"\x93NUMPY" + bytes(200)):

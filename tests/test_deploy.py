@@ -15,7 +15,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from spiked_service.base.health import CheckStatus, Health
 from spiked_service.base.limits import ConcurrencyLimit
 from spiked_service.events.bus import Bus
-from spiked_service.operations.metrics import CaptureSample, Metrics, MetricsSource
+from spiked_service.operations.metrics import Metrics, MetricsSource, RingSample
 from spiked_service.settings.settings import Settings, load_settings
 from spiked_service.store.rows import ConsumerCounters, Counters
 
@@ -32,7 +32,7 @@ def exposed() -> set[str]:
     health = Health()
     health.add("disk", lambda: (CheckStatus.OK, ""))
     source = MetricsSource(
-        lambda: [CaptureSample("a", "usb0", counters, over=False)],
+        lambda: [RingSample("a", "usb0", counters, over=False)],
         lambda: {"streaming": 1},
         lambda: {"queued": 1},
         lambda: {"recorder": 1},

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spiked.ring import (
+    ClockPair,
     DeviceState,
     DeviceStatus,
     End,
@@ -360,6 +361,37 @@ def test_status_is_visible_from_outside_and_outlives_the_name() -> None:
     (row,) = before.readers
     assert (row.consumer, row.frames_read, row.lost, row.lag_frames, row.alive) == ("test", 16, 4, 0, True)
     assert after.writer.end is EndReason.STOPPED
+
+
+def test_what_a_ring_had_counted_before_a_frame(writer: RingWriter) -> None:
+    ring = Ring.attach(writer.name)
+    assert (ring.counted_before(0).block, ring.counted_before(5).block) == (0, 0)
+    put(writer, 8)
+    writer.gap(4, LossCause.USB)
+    put(writer, 6)
+    writer.clock_pair(ClockPair(17, 1))
+    writer.gap(5, LossCause.DEVICE)
+    put(writer, 5)
+    expected = {
+        0: (0, 0, 0),
+        7: (0, 0, 0),
+        10: (8, 2, 0),
+        12: (12, 4, 0),
+        17: (12, 4, 0),
+        20: (18, 4, 2),
+        28: (23, 4, 5),
+    }
+    for frame, (block, usb, device) in expected.items():
+        found = ring.counted_before(frame)
+        assert (found.frame, found.block) == (frame, block)
+        assert (found.lost[LossCause.USB], found.lost[LossCause.DEVICE], found.lost[LossCause.RING]) == (usb, device, 0)
+    for _ in range(200):  # the log forgets
+        put(writer, 8)
+        writer.gap(1, LossCause.USB)
+    whole = ring.status().writer
+    assert ring.counted_before(whole.next_frame).lost == whole.lost
+    assert ring.counted_before(whole.next_frame - 9).lost[LossCause.USB] == 204 - 1
+    assert 4 < ring.counted_before(20).lost[LossCause.USB] < 204
 
 
 def test_texts_too_long_for_shared_memory_are_cut_between_characters(writer: RingWriter) -> None:

@@ -207,21 +207,7 @@ class Spiked(MapMethods, ResultMethods):
 
         An earlier recording of that name is replaced with its sidecar and index when the new one is here.
         """
-        path = Path(path)
-        part = path.with_name(f"{path.name}.{capture_id}.part")
-        done = part.stat().st_size if part.exists() else 0
-        recording = self.capture(capture_id).recording
-        if recording is not None and done > recording.bytes:
-            done = 0
-        if recording is None or done < recording.bytes:
-            headers = {"Range": f"bytes={done}-"} if done else {}
-            with self._connection.stream(f"captures/{capture_id}/recording", headers) as answer:
-                _append(part, answer)
-        sidecar = self._connection.request("GET", f"captures/{capture_id}/recording/sidecar")
-        remove_recording(path)  # frames beside the sidecar or the index of others would be read by these
-        part.replace(path)
-        write_atomically(sidecar_path(path), sidecar.content)
-        return path
+        return _download(self._connection, self.capture(capture_id), Path(path))
 
     def start_reconstruction(
         self,
@@ -360,6 +346,22 @@ class Spiked(MapMethods, ResultMethods):
                 raise
             return now
         return UploadOut.model_validate_json(answer.content)
+
+
+def _download(connection: Connection, capture: CaptureOut, path: Path) -> Path:
+    part = path.with_name(f"{path.name}.{capture.id}.part")
+    done, recording = part.stat().st_size if part.exists() else 0, capture.recording
+    if recording is not None and done > recording.bytes:
+        done = 0
+    if recording is None or done < recording.bytes:
+        headers = {"Range": f"bytes={done}-"} if done else {}
+        with connection.stream(f"captures/{capture.id}/recording", headers) as answer:
+            _append(part, answer)
+    sidecar = connection.request("GET", f"captures/{capture.id}/recording/sidecar")
+    remove_recording(path)  # frames beside the sidecar or the index of others would be read by these
+    part.replace(path)
+    write_atomically(sidecar_path(path), sidecar.content)
+    return path
 
 
 def _append(part: Path, answer: httpx.Response) -> None:

@@ -1326,7 +1326,7 @@ class ConsumerOut(BaseModel):
 
 class CountersOut(BaseModel):
     """
-    Frames of a capture; received + lost is the index of the next frame.
+    Frames of a capture, without those that an armed device had before it.
     """
 
     model_config = ConfigDict(
@@ -1336,7 +1336,12 @@ class CountersOut(BaseModel):
     device_reason: str
     received: Annotated[int, Field(description="Frames written into the ring.")]
     lost: Annotated[dict[str, int], Field(description="By cause: device, usb, ring, disk.")]
-    next_frame: int
+    next_frame: Annotated[
+        int,
+        Field(
+            description="Index of the next frame, as previews and poses count: that of the first frame, + received + lost. The first is 0 unless the device was armed."
+        ),
+    ]
     consumers: list[ConsumerOut]
 
 

@@ -11,11 +11,12 @@ from spiked.ring.items import ClockPair, DeviceState, DeviceStatus, End, EndReas
 from spiked.ring.process import own_identity
 from spiked.ring.reader import Frames, Item, RingReader
 from spiked.ring.segment import RingLayout, clean_stale, remove_ring
-from spiked.ring.status import ReaderStatus, Ring, RingStatus, WriterStatus
+from spiked.ring.status import CountedBefore, ReaderStatus, Ring, RingStatus, WriterStatus
 from spiked.ring.writer import RingWriter
 
 __all__ = [
     "ClockPair",
+    "CountedBefore",
     "DeviceState",
     "DeviceStatus",
     "End",

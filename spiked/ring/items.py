@@ -5,6 +5,7 @@ from enum import StrEnum
 from typing import TypeVar
 
 from spiked.errors import SpikedError
+from spiked.native._ring import Entry
 
 
 class RingError(SpikedError):
@@ -106,3 +107,9 @@ def encode(value: StrEnum) -> int:
 def decode(kind: type[_Code], code: int) -> _Code:
     """The member with this code; the inverse of `encode`."""
     return list(kind)[code - 1]
+
+
+def is_clock_pair(entry: Entry) -> bool:
+    """Whether an entry of the log is a clock pair: `count` is a Unix time in ns, `cause` the frame minus `first`, below
+    0."""
+    return bool(entry.cause < 0)

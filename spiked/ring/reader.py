@@ -10,7 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.native._ring import READER_PLACES, Control, Entry, ReaderCounters, ReaderPlace, WriterCounters
-from spiked.ring.items import ClockPair, End, EndReason, Gap, LossCause, Policy, RingError, decode, encode
+from spiked.ring.items import (
+    ClockPair,
+    End,
+    EndReason,
+    Gap,
+    LossCause,
+    Policy,
+    RingError,
+    decode,
+    encode,
+    is_clock_pair,
+)
 from spiked.ring.process import is_alive, own_identity
 from spiked.ring.segment import RingLayout, Segment, attach_segment
 from spiked.ring.status import RingStatus, read_status
@@ -192,7 +203,7 @@ class RingReader:
             if entry is None or (entry.cause == 0 and not self._holds(entry.slot)):
                 self._jumped = False
                 continue  # overwritten meanwhile: choose a newer one
-            if _is_clock_pair(entry):
+            if is_clock_pair(entry):
                 self._counters.next_entry = position + 1
                 self._start += position == self._start
                 self._clock_pairs.append(ClockPair(entry.first + entry.cause, entry.count))
@@ -271,7 +282,7 @@ class RingReader:
         """The last entry from a position on that is no clock pair; if all are, the position."""
         for newest in range(writer.entries - 1, position, -1):
             entry = self._control.read_entry(newest)
-            if entry is None or not _is_clock_pair(entry):
+            if entry is None or not is_clock_pair(entry):
                 return newest
         return position
 
@@ -314,11 +325,6 @@ class RingReader:
     def _publish(self) -> None:
         self._place.publish(self._counters)
         self._control.progress.ring()
-
-
-def _is_clock_pair(entry: Entry) -> bool:
-    """Whether an entry is a clock pair: `count` is a Unix time in ns, `cause` the frame minus `first`, below 0."""
-    return bool(entry.cause < 0)
 
 
 def _lease(policy: Policy, slots: int) -> int:

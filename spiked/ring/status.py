@@ -6,7 +6,7 @@ from typing import Self
 
 from spiked.deprecation import renamed_attributes
 from spiked.native._ring import READER_PLACES, ReaderCounters
-from spiked.ring.items import DeviceState, DeviceStatus, EndReason, LossCause, Policy, decode, encode
+from spiked.ring.items import DeviceState, DeviceStatus, EndReason, LossCause, Policy, decode, encode, is_clock_pair
 from spiked.ring.process import is_alive, own_identity, pid_of
 from spiked.ring.segment import RingLayout, Segment, attach_segment
 
@@ -62,6 +62,17 @@ class RingStatus:
 
 
 @dataclass(frozen=True)
+class CountedBefore:
+    """What a ring had counted when it came to a frame."""
+
+    frame: int
+    block: int
+    """First frame of the block, or of the gap, that holds the frame: a reader that starts at the frame starts here."""
+    lost: Mapping[LossCause, int]
+    """Frames lost before the frame, by cause."""
+
+
+@dataclass(frozen=True)
 class ReaderPlace:
     """A reader's record in shared memory."""
 
@@ -97,6 +108,25 @@ class Ring:
     def status(self) -> RingStatus:
         """Counters of the writer and of every reader."""
         return read_status(self._segment)
+
+    def counted_before(self, frame: int) -> CountedBefore:
+        """The counters as they were at a frame; losses that the log no longer holds count as before it."""
+        control = self._segment.control
+        writer = control.writer()
+        lost, block = {cause: writer.lost[encode(cause) - 1] for cause in LossCause}, int(writer.next_frame)
+        for position in range(writer.entries - 1, -1, -1):
+            entry = control.read_entry(position)
+            if entry is None:
+                break  # overwritten
+            if is_clock_pair(entry):
+                continue
+            block = int(entry.first)
+            if entry.cause:
+                behind = block + entry.count - max(block, frame)
+                lost[decode(LossCause, entry.cause)] -= max(0, behind)
+            if block <= frame:
+                break
+        return CountedBefore(frame, block, lost)
 
     def claim_for_successor(self, reason: str) -> bool:
         """Take ownership of a dead writer's ring until a successor starts: readers wait, the ring is not removed.

@@ -24,7 +24,7 @@ from spiked_service.results.versions import pose_file, versions
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.catalogue import StoreError, UnknownIdError
 from spiked_service.store.disk_space import DiskFullError
-from spiked_service.store.rows import CaptureState, Grade, JobState, Plan, ReconstructionRow, Stage
+from spiked_service.store.rows import CaptureState, ConsumerCounters, Grade, JobState, Plan, ReconstructionRow, Stage
 from spiked_service.workers.backoff import Backoff
 from spiked_service.workers.messages import Role
 from spiked_service.workers.process import StandbyWorker
@@ -398,7 +398,7 @@ def test_names_and_notes_change_while_it_runs_and_after(data_store: DataStore, t
 
 def test_an_armed_device_begins_in_the_past(data_store: DataStore, tmp_path: Path) -> None:
     frames = random_recording(tmp_path / "noise.dat", 997)
-    source = f"replay:{tmp_path / 'noise.dat'}?repeat=100000"
+    source = f"replay:{tmp_path / 'noise.dat'}?repeat=100000&gap=20:9"
     data_store.captures.arm(source, 0.2)
     with pytest.raises(BusyError, match="armed already"):
         data_store.captures.arm(source, 0.2)
@@ -409,17 +409,34 @@ def test_an_armed_device_begins_in_the_past(data_store: DataStore, tmp_path: Pat
     counters = armed_device.counters()
     assert counters is not None
     before = counters.next_frame
-    capture_id = data_store.captures.start(recorded_only(source, pretrigger_s=0.2, frames=2000)).id
+    capture_id = data_store.captures.start(recorded_only(source, pretrigger_s=0.2, frames=12_000)).id
     assert data_store.captures.armed() == {}
+
+    def recorder() -> ConsumerCounters | None:
+        counters = data_store.captures.get(capture_id).counters
+        consumers = {} if counters is None else {one.name: one for one in counters.consumers}
+        return consumers.get("recorder")
+
+    until(lambda: (one := recorder()) and one.frames_read > 0, "it is recorded")
+    assert (one := recorder()) is not None and one.lost == 0
     row = over(data_store, capture_id).row
     assert row.state is CaptureState.COMPLETE, row.reason
-    assert row.recording is not None and row.recording.frames == 6000, row.verdict
+    assert row.recording is not None and row.recording.frames == 16_000, row.verdict
     assert row.verdict is not None and row.verdict.grade is Grade.GOOD
     recording = open_recording(data_store.captures.recording(capture_id))
     shifts = [shift for shift in range(997) if (recording.data[:1] == frames[shift]).all()]
     assert len(shifts) == 1
-    assert ((recording.data == frames[(shifts[0] + np.arange(6000)) % 997]).all(axis=1)).all()
-    assert row.counters is not None and row.counters.next_frame >= before + 2000
+    assert ((recording.data == frames[(shifts[0] + np.arange(16_000)) % 997]).all(axis=1)).all()
+    assert row.counters is not None and row.counters.next_frame >= before + 12_000
+    # The capture has its own frames alone, and the metrics all that the ring had since it was armed.
+    assert (row.counters.received, row.counters.lost["usb"]) == (16_000, 0)
+    (ring,) = data_store.captures.rings()
+    assert ring.over and ring.counters.lost["usb"] == 9
+    assert ring.counters.received + 9 == ring.counters.next_frame >= row.counters.next_frame
+    page = metrics_of(data_store)
+    assert (
+        f'spiked_frames_received_total{{device="replay:{tmp_path}/noise.dat"}} {float(ring.counters.received)}' in page
+    )
 
 
 def test_a_device_is_disarmed(data_store: DataStore) -> None:
@@ -437,10 +454,15 @@ def make_small_disk(tmp_path: Path) -> Iterator[Path]:
         yield place
 
 
-def lost_on_disk(data_store: DataStore) -> float:
-    """`spiked_frames_lost_total{cause="disk"}` as Prometheus reads it."""
+def metrics_of(data_store: DataStore) -> str:
+    """As Prometheus reads them."""
     source = metrics_source_of(data_store.captures, data_store.reconstructions, data_store.folder.path)
-    text = Metrics(source, Bus(), Health(), {}).exposition().decode()
+    return Metrics(source, Bus(), Health(), {}).exposition().decode()
+
+
+def lost_on_disk(data_store: DataStore) -> float:
+    """`spiked_frames_lost_total{cause="disk"}`."""
+    text = metrics_of(data_store)
     return sum(
         float(line.rpartition(" ")[2])
         for line in text.splitlines()

@@ -1,6 +1,7 @@
 """Metrics: totals over captures, and what a running daemon exposes."""
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from spiked_service.base.health import CheckStatus, Health
 from spiked_service.base.limits import ConcurrencyLimit
 from spiked_service.events.bus import Bus, Topic
 from spiked_service.events.payloads import PosePayload
-from spiked_service.operations.metrics import CaptureSample, Metrics, MetricsSource
+from spiked_service.operations.metrics import Metrics, MetricsSource, RingSample
 from spiked_service.store.rows import ConsumerCounters, Counters
 
 from spiked.ring import DeviceState, Policy
@@ -40,7 +41,7 @@ def scraped(metrics: Metrics) -> Scraped:
     return Scraped(metrics.exposition().decode())
 
 
-def made(samples: list[CaptureSample], bus: Bus | None = None, health: Health | None = None) -> Metrics:
+def made(samples: list[RingSample], bus: Bus | None = None, health: Health | None = None) -> Metrics:
     return Metrics(
         MetricsSource(lambda: list(samples), lambda: {"streaming": 1}, lambda: {"queued": 2}, dict, lambda: Path("/")),
         bus or Bus(),
@@ -50,12 +51,12 @@ def made(samples: list[CaptureSample], bus: Bus | None = None, health: Health | 
 
 
 def test_frames_add_up_over_captures_of_a_device() -> None:
-    samples = [CaptureSample("a", "usb0", counters(100, 5), over=False)]
+    samples = [RingSample("a", "usb0", counters(100, 5), over=False)]
     metrics = made(samples)
     assert scraped(metrics)("spiked_frames_received_total", device="usb0") == 100
-    samples[:] = [CaptureSample("a", "usb0", counters(150, 5), over=True)]
+    samples[:] = [RingSample("a", "usb0", counters(150, 5), over=True)]
     assert scraped(metrics)("spiked_frames_received_total", device="usb0") == 150
-    samples[:] = [CaptureSample("b", "usb0", counters(10), over=False)]
+    samples[:] = [RingSample("b", "usb0", counters(10), over=False)]
     now = scraped(metrics)
     assert now("spiked_frames_received_total", device="usb0") == 160
     assert now("spiked_frames_lost_total", device="usb0", cause="usb") == 5
@@ -64,6 +65,30 @@ def test_frames_add_up_over_captures_of_a_device() -> None:
     assert now("spiked_ring_fill_ratio", device="usb0", consumer="recorder") == 0.25
     assert now("spiked_device_state", device="usb0", state="streaming") == 1
     assert now("spiked_device_state", device="usb0", state="lost") == 0
+
+
+def test_scrapes_at_the_same_time_count_frames_once() -> None:
+    """The last counters of a ring come once; a scrape that read older ones must not bring them afterwards."""
+    ended = [RingSample("a", "usb0", counters(100, 5), over=True)]
+    asked, go_on = threading.Event(), threading.Event()
+
+    def rings() -> Iterator[RingSample]:
+        samples, ended[:] = list(ended), []
+        asked.set()
+        go_on.wait(10)
+        yield from samples
+
+    source = MetricsSource(rings, dict, dict, dict, lambda: Path("/"))
+    metrics = Metrics(source, Bus(), Health(), {})
+    first = threading.Thread(target=metrics.exposition)
+    first.start()
+    assert asked.wait(10)
+    second = threading.Thread(target=metrics.exposition)
+    second.start()
+    go_on.set()
+    first.join()
+    second.join()
+    assert scraped(metrics)("spiked_frames_received_total", device="usb0") == 100
 
 
 def test_latency_of_poses_and_what_listeners_lost() -> None:

@@ -7,8 +7,9 @@ from typing import Protocol
 
 from spiked_driver.source_kinds import is_camera
 
-from spiked.ring import Ring, own_identity, remove_ring
-from spiked_service.store.rows import Counters
+from spiked.ring import CountedBefore, Ring, own_identity, remove_ring
+from spiked_service.captures.ring_counts import RingCount, RingSection
+from spiked_service.store.rows import Counters, Recorded
 from spiked_service.workers.messages import (
     AcquisitionCommand,
     PreviewCommand,
@@ -63,7 +64,10 @@ class AcquisitionSupervisor:
         self._closing = False
         self._stopping = False
         self._ended = False
-        self._final: Counters | None = None
+        self._totals: Counters | None = None
+        self._section: RingSection | None = None
+        self._behind: CountedBefore | None = None
+        """At the stop frame of the section, once the ring has come to it."""
         self._warnings: list[str] = []
         self._acquisition = WorkerSupervisor(
             Role.ACQUISITION, logs / "acquisition.log", self._handle, self._acquisition_exited
@@ -96,17 +100,41 @@ class AcquisitionSupervisor:
         """Whether the source is released and all workers have exited."""
         return self._ended and not self._acquisition.running and not self._preview.running
 
-    def set_listener(self, listener: AcquisitionListener) -> None:
-        """Replace the listener."""
+    def hand_over(self, listener: AcquisitionListener, first_frame: int, stop_frame: int | None) -> None:
+        """Report to a capture from now on, which has the frames from `first_frame` to `stop_frame` of the ring."""
         with self._lock:
             self._listener = listener
+            if self._ring is not None:
+                attached = {one.name: one for one in Counters.of(self._ring.status()).consumers}
+                self._section = RingSection(self._ring.counted_before(first_frame), stop_frame, attached)
+
+    def ring_count(self, over: bool, recording: Recorded | None = None) -> RingCount | None:
+        """What the ring has counted since it exists; None before it exists."""
+        totals = self._read()
+        return (
+            None if totals is None else RingCount(self._command.ring_id, self._command.source, totals, over, recording)
+        )
 
     def counters(self) -> Counters | None:
-        """Counters of the ring, now or at its end; None before it exists."""
+        """Counters of the ring, now or at its end; of a capture that was triggered while it ran, those of its frames.
+
+        None before it exists.
+        """
+        with self._lock:
+            totals, section = self._read(), self._section
+            if totals is None or section is None:
+                return totals
+            stop = section.stop_frame
+            if self._behind is None and stop is not None and totals.next_frame > stop and self._ring is not None:
+                self._behind = self._ring.counted_before(stop)
+            return section.of_capture(totals, self._behind)
+
+    def _read(self) -> Counters | None:
         with self._lock:
             if self._ring is not None:
-                self._final = Counters.of(self._ring.status())
-            return self._final
+                now = Counters.of(self._ring.status())
+                self._totals = now if self._section is None else self._section.of_ring(now)
+            return self._totals
 
     def drop_readers(self, role: Role) -> None:
         """Remove readers of this role from the ring, so that the source does not wait for them."""

@@ -11,6 +11,7 @@ from spiked_service.base.errors import BusyError
 from spiked_service.base.ids import new_id
 from spiked_service.captures.acquisition import AcquisitionSupervisor
 from spiked_service.captures.live_capture import LiveCapture
+from spiked_service.captures.ring_counts import RingCount
 from spiked_service.captures.sources import stated_options
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.store.folder import DataFolder
@@ -61,6 +62,10 @@ class ArmedDevice:
     def counters(self) -> Counters | None:
         """Counters of the ring."""
         return self._acquisition.counters()
+
+    def ring_count(self, *, over: bool = False) -> RingCount | None:
+        """What the ring has counted; None before it exists."""
+        return self._acquisition.ring_count(over)
 
     @property
     def sensor(self) -> Sensor:

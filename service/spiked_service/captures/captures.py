@@ -13,8 +13,9 @@ from spiked_service.base.ids import new_id
 from spiked_service.captures.armed_device import ArmedDevice
 from spiked_service.captures.live_capture import LiveCapture
 from spiked_service.captures.new_captures import NewCaptures, check_free, group_devices
-from spiked_service.captures.recent import RecentCaptures
+from spiked_service.captures.recent import Recent
 from spiked_service.captures.removal import Removal
+from spiked_service.captures.ring_counts import RingCount
 from spiked_service.captures.sources import device_of, realtime
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue import Reconstructions
@@ -55,7 +56,7 @@ class Captures:
         self._lock = threading.RLock()
         self._live: dict[str, LiveCapture] = {}
         self._armed: dict[str, ArmedDevice] = {}
-        self._recent = RecentCaptures()
+        self._recent = Recent()
         self.removal = Removal(folder, catalogue, reconstructions, self)
         self._closing = threading.Event()
         self._ticker = threading.Thread(target=self._tick, name="counters", daemon=True)
@@ -172,6 +173,7 @@ class Captures:
         if armed_device is not None:
             armed_device.dismiss()
             armed_device.join(_CLOSE_S)
+            self._recent.add_ring(armed_device.ring_count(over=True))
 
     def armed(self) -> dict[str, ArmedDevice]:
         """The armed devices."""
@@ -206,11 +208,12 @@ class Captures:
         """Captures that have not ended, oldest first."""
         return [self.snapshot(capture.row) for capture in self._kept() if not capture.row.state.over]
 
-    def recent(self) -> Sequence[Snapshot]:
-        """Captures that have not ended, and the last ones that ended since the service started."""
+    def rings(self) -> Sequence[RingCount]:
+        """What the rings of armed devices and captures have counted, and the last ones that are over."""
         with self._lock:
-            rows = [*self._recent.rows(), *(capture.row for capture in self._live.values())]
-        return [self.snapshot(row) for row in {row.id: row for row in rows}.values()]
+            running = [one.ring_count() for one in self._all()]
+            counts = [*(count for count in running if count is not None), *self._recent.rings()]
+        return list({count.ring_id: count for count in counts}.values())
 
     def counts(self) -> dict[str, int]:
         """Number of captures by state, without removed ones."""
@@ -299,6 +302,7 @@ class Captures:
             for device, one in list(self._armed.items()):
                 if one is armed_device:
                     del self._armed[device]
+                    self._recent.add_ring(armed_device.ring_count(over=True))
 
     def _changed(self, capture: LiveCapture) -> None:
         self._notifier.capture(self.snapshot(capture.row))
@@ -306,7 +310,8 @@ class Captures:
             return
         self._disk_space.release(self._folder.recording(capture.id))
         with self._lock:
-            self._recent.add(capture.row, capture.picture)
+            self._recent.add(capture.id, capture.picture)
+            self._recent.add_ring(capture.ring_count())
             saved = self._catalogue.captures.find(capture.id)
             if saved is not None and saved.state.over:
                 self._live.pop(capture.id, None)

@@ -12,6 +12,7 @@ from spiked_service.captures.acquisition import AcquisitionSupervisor
 from spiked_service.captures.live_row import LiveRow
 from spiked_service.captures.recorder import RecorderSupervisor, RecordingResult
 from spiked_service.captures.recording_quality import completed
+from spiked_service.captures.ring_counts import RingCount
 from spiked_service.captures.states import CaptureEvent, device_event
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue import Reconstructions
@@ -86,8 +87,13 @@ class LiveCapture:
         return None if self._acquisition is None else self._acquisition.picture
 
     def counters(self) -> Counters | None:
-        """Counters of the ring, now or at its end."""
+        """Counters of its frames, now or at the end."""
         return None if self._acquisition is None else self._acquisition.counters()
+
+    def ring_count(self) -> RingCount | None:
+        """What its ring has counted; None before it exists."""
+        row, acquisition = self.row, self._acquisition
+        return None if acquisition is None else acquisition.ring_count(row.state.over, row.recording)
 
     def acquire(self) -> None:
         """Start an acquisition of its own. Raises OSError."""
@@ -119,12 +125,10 @@ class LiveCapture:
         """Use an acquisition that runs already; start at a frame that its ring still holds."""
         assert acquisition.opened is not None, "a running acquisition has opened its ring"
         with self._lock:
-            self._acquisition = acquisition
-            self._first_frame, self._stop_frame = first_frame, stop_frame
-            acquisition.set_listener(self)
+            self._acquisition, self._first_frame, self._stop_frame = acquisition, first_frame, stop_frame
+            acquisition.hand_over(self, first_frame, stop_frame)
             self._source_ended = acquisition.ended
-            if acquisition.warnings:
-                self._row.warn(*acquisition.warnings)
+            self._row.warn(*acquisition.warnings)
             self._begin(acquisition.opened, recorder, reconstructor)
 
     def update_state(self) -> None:
@@ -152,8 +156,8 @@ class LiveCapture:
             self._stopping = True
             if self.row.state is CaptureState.FINISHING and self._reconstruction_id is not None:
                 self._reconstructions.finish_early(self._reconstruction_id)
-            elif self._acquisition is not None:
-                self._acquisition.stop()
+            else:
+                self._stop_source()
 
     def dismiss(self) -> None:
         """Ask all workers to exit at once."""
@@ -250,8 +254,7 @@ class LiveCapture:
             sensor = replace(opened.sensor, intrinsics=self.row.plan.intrinsics or opened.sensor.intrinsics)
             frames = opened.frames if self._stop_frame is None else self._stop_frame - self._first_frame
             self._row.set(sensor=sensor, frames_planned=frames)
-            if questions := orientation_questions(opened.assumed, sensor):
-                self._row.warn(*questions)
+            self._row.warn(*orientation_questions(opened.assumed, sensor))
             try:
                 if Role.RECORDER in self._readers:
                     self._start_recorder(opened, recorder)
@@ -308,7 +311,7 @@ class LiveCapture:
             return
         if self._acquisition is None or not self._acquisition.finished:
             return
-        counters = self._acquisition.counters()
+        counters = self.counters()
         self._acquisition.release()
         if counters is not None:
             self._complete_recording(counters)

@@ -61,10 +61,11 @@ class LiveRow:
         self._on_change()
 
     def warn(self, *texts: str) -> None:
-        """Append warnings."""
-        with self._lock:
-            self._store({"warnings": (*self._row.warnings, *texts)})
-        self._on_change()
+        """Append warnings, if there are any."""
+        if texts:
+            with self._lock:
+                self._store({"warnings": (*self._row.warnings, *texts)})
+            self._on_change()
 
     def fail(self, reason: str) -> None:
         """Mark the capture as failed. The first error becomes its reason."""

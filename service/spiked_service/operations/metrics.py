@@ -28,10 +28,10 @@ _REQUEST_S = (0.002, 0.005, 0.01, 0.015, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 
 
 
 @dataclass(frozen=True)
-class CaptureSample:
-    """A capture at the moment of a scrape."""
+class RingSample:
+    """A ring, of a capture or an armed device, at the moment of a scrape."""
 
-    capture_id: str
+    ring_id: str
     device: str
     """Source without its options, so that the label values stay few."""
     counters: Counters
@@ -45,8 +45,8 @@ class CaptureSample:
 class MetricsSource:
     """Callables that the metrics are read from at each scrape."""
 
-    captures: Callable[[], Iterable[CaptureSample]]
-    """Running captures, and once those that ended since the last call."""
+    rings: Callable[[], Iterable[RingSample]]
+    """Running ones, and once those that ended since the last call."""
     captures_by_state: Callable[[], dict[str, int]]
     reconstructions_by_state: Callable[[], dict[str, int]]
     workers_by_role: Callable[[], dict[str, int]]
@@ -86,15 +86,14 @@ class Metrics:
 
 
 class _Totals:
-    """Frame counters by device, summed over captures."""
+    """Frame counters by device, summed over rings."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
         self._seen: dict[str, Counter[tuple[str, ...]]] = {}
         self.totals: Counter[tuple[str, ...]] = Counter()
 
-    def add(self, sample: CaptureSample) -> None:
-        """Add the difference since the last sample of this capture."""
+    def add(self, sample: RingSample) -> None:
+        """Add the difference since the last sample of this ring."""
         device, counters = sample.device, sample.counters
         now: Counter[tuple[str, ...]] = Counter({("received", device): counters.received})
         now.update({("lost", device, cause): count for cause, count in counters.lost.items()})
@@ -102,13 +101,11 @@ class _Totals:
         for consumer in counters.consumers:
             now["read", device, consumer.name] += consumer.frames_read
             now["missed", device, consumer.name] += consumer.lost
-        with self._lock:
-            before = self._seen.get(sample.capture_id, Counter())
-            for key, count in now.items():
-                self.totals[key] += max(0, count - before[key])
-            self._seen[sample.capture_id] = now
-            if sample.over:
-                del self._seen[sample.capture_id]
+        before = self._seen.pop(sample.ring_id, Counter())
+        for key, count in now.items():
+            self.totals[key] += max(0, count - before[key])
+        if not sample.over:
+            self._seen[sample.ring_id] = now
 
 
 class _Collector(Collector):
@@ -120,6 +117,7 @@ class _Collector(Collector):
         self._health = health
         self._concurrency = limits
         self._totals = _Totals()
+        self._lock = threading.Lock()
 
     def describe(self) -> Iterable[Metric]:
         """Return nothing, because registering must not read values."""
@@ -128,7 +126,7 @@ class _Collector(Collector):
     def collect(self) -> Iterator[Metric]:
         """All metric families."""
         yield InfoMetricFamily("spiked_build", "Version and platform.", value=_build())
-        yield from self._frames(list(self._source.captures()))
+        yield from self._frames()
         yield _states("spiked_captures", "Captures by state.", self._source.captures_by_state())
         yield _states("spiked_reconstructions", "Jobs by state.", self._source.reconstructions_by_state())
         yield _states("spiked_workers", "Worker processes.", self._source.workers_by_role(), "role")
@@ -140,9 +138,12 @@ class _Collector(Collector):
             health.add_metric([finding.name], float(finding.verdict is CheckStatus.FAILED))
         yield health
 
-    def _frames(self, samples: list[CaptureSample]) -> Iterator[Metric]:
-        for sample in samples:
-            self._totals.add(sample)
+    def _frames(self) -> Iterator[Metric]:
+        with self._lock:  # of two scrapes at a time the second must not bring older counters
+            samples = list(self._source.rings())
+            for sample in samples:
+                self._totals.add(sample)
+            totals = Counter(self._totals.totals)
         live = [sample for sample in samples if not sample.over]
         device, consumer = ["device"], ["device", "consumer"]
         families = {
@@ -157,7 +158,6 @@ class _Collector(Collector):
                 "spiked_consumer_frames_lost", "Frames that a consumer did not read.", labels=consumer
             ),
         }
-        totals = Counter(self._totals.totals)
         for sample in live:
             totals.update({("lost", sample.device, str(cause)): 0 for cause in LossCause})
         for (kind, *labels), count in sorted(totals.items()):

@@ -1,4 +1,4 @@
-"""Reads the values of the metrics from captures, jobs and workers."""
+"""Reads the values of the metrics from rings, captures, jobs and workers."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from spiked.ring import LossCause
 from spiked_service.captures.captures import Captures
-from spiked_service.operations.metrics import CaptureSample, MetricsSource
+from spiked_service.operations.metrics import MetricsSource, RingSample
 from spiked_service.reconstructions.queue import Reconstructions
 from spiked_service.store.rows import Counters, Recorded
 from spiked_service.workers.messages import Role
@@ -16,15 +16,16 @@ def metrics_source_of(captures: Captures, reconstructions: Reconstructions, data
     """The source for `Metrics`."""
     counted: set[str] = set()
 
-    def running() -> Iterator[CaptureSample]:
-        for snapshot in captures.recent():
-            over = snapshot.row.state.over
-            if snapshot.counters is None or snapshot.id in counted:
+    def rings() -> Iterator[RingSample]:
+        now = captures.rings()
+        counted.intersection_update(one.ring_id for one in now)
+        for one in now:
+            if one.ring_id in counted:
                 continue
-            if over:
-                counted.add(snapshot.id)
-            on_disk = lost_behind_ring(snapshot.row.recording, snapshot.counters)
-            yield CaptureSample(snapshot.id, device_name(snapshot.row.source), snapshot.counters, over, on_disk)
+            if one.over:
+                counted.add(one.ring_id)
+            on_disk = lost_behind_ring(one.recording, one.counters)
+            yield RingSample(one.ring_id, device_name(one.source), one.counters, one.over, on_disk)
 
     def workers() -> dict[str, int]:
         found = Counter(role for roles in captures.processes().values() for role in roles)
@@ -32,7 +33,7 @@ def metrics_source_of(captures: Captures, reconstructions: Reconstructions, data
         return found
 
     return MetricsSource(
-        captures=running,
+        rings=rings,
         captures_by_state=captures.counts,
         reconstructions_by_state=lambda: {str(state): count for state, count in reconstructions.rows.counts().items()},
         workers_by_role=workers,

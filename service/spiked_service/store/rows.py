@@ -148,7 +148,7 @@ class ConsumerCounters:
 
 @dataclass(frozen=True)
 class Counters:
-    """Frames of a capture; received and lost together are the index of the next frame."""
+    """Frames of a capture."""
 
     device: DeviceState
     device_reason: str
@@ -156,6 +156,8 @@ class Counters:
     lost: dict[str, int]
     """Lost frames by cause."""
     next_frame: int
+    """Index of the next frame: that of the capture's first frame, which is 0 unless a device was armed, and frames
+    received and lost."""
     consumers: tuple[ConsumerCounters, ...]
 
     @classmethod

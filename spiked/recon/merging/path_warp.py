@@ -64,8 +64,9 @@ class PathWarp:
         nearest = shares.argmax(1)
         turns = np.stack([part.rotation for part in parts])
         harmonics = None if scene.harmonics is None else scene.harmonics.copy()
-        for number, turn in enumerate(turns if harmonics is not None else ()):
-            harmonics[nearest == number] = rotated_harmonics(harmonics[nearest == number], turn)
+        if harmonics is not None:
+            for number, turn in enumerate(turns):
+                harmonics[nearest == number] = rotated_harmonics(harmonics[nearest == number], turn)
         moved = Scene(
             np.ascontiguousarray(means, np.float32),
             np.ascontiguousarray(turned_quaternions(quaternion(turns)[nearest], scene.quats), np.float32),

@@ -49,13 +49,16 @@ class ConsumerOut(Out):
 
 
 class CountersOut(Out):
-    """Frames of a capture; received + lost is the index of the next frame."""
+    """Frames of a capture, without those that an armed device had before it."""
 
     device: DeviceState
     device_reason: str
     received: int = Field(description="Frames written into the ring.")
     lost: dict[str, int] = Field(description="By cause: device, usb, ring, disk.")
-    next_frame: int
+    next_frame: int = Field(
+        description="Index of the next frame, as previews and poses count: that of the first frame, + received + lost. "
+        "The first is 0 unless the device was armed."
+    )
     consumers: list[ConsumerOut]
 
     @classmethod

@@ -3,6 +3,7 @@
 import type { JSX } from "react";
 
 import type { Capture, Device, System } from "../../shared/api/types";
+import { framesSoFar } from "../../shared/state/capture";
 import { bytes, count, duration, rate } from "../../shared/state/format";
 import { Badge, captureTone, deviceTone, gradeTone, Meter, Panel, Stat, Warnings } from "../../shared/ui/parts";
 
@@ -16,7 +17,8 @@ export function FrameStats({ capture, rateHz }: { capture: Capture; rateHz: numb
   const lostBy = (cause: string): number =>
     cause === "disk" ? Math.max(onDisk, counters?.lost[cause] ?? 0) : (counters?.lost[cause] ?? 0);
   const lost = CAUSES.reduce((sum, cause) => sum + lostBy(cause), 0);
-  const seconds = counters !== null && sensor !== null ? counters.next_frame / sensor.frame_rate_hz : null;
+  const frames = framesSoFar(capture);
+  const seconds = frames !== null && sensor !== null ? frames / sensor.frame_rate_hz : null;
   const waits =
     capture.state === "streaming" &&
     counters?.consumers.some((one) => one.policy === "lossless" && one.fill > 0.9) === true;

@@ -2193,7 +2193,7 @@ export interface components {
         };
         /**
          * CountersOut
-         * @description Frames of a capture; received + lost is the index of the next frame.
+         * @description Frames of a capture, without those that an armed device had before it.
          */
         CountersOut: {
             device: components["schemas"]["DeviceState"];
@@ -2211,7 +2211,10 @@ export interface components {
             lost: {
                 [key: string]: number;
             };
-            /** Next Frame */
+            /**
+             * Next Frame
+             * @description Index of the next frame, as previews and poses count: that of the first frame, + received + lost. The first is 0 unless the device was armed.
+             */
             next_frame: number;
             /** Consumers */
             consumers: components["schemas"]["ConsumerOut"][];

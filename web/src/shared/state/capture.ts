@@ -12,8 +12,12 @@ export const nameOf = (capture: Capture): string => (capture.name === "" ? sourc
 /** The name of a reconstruction, else when it was begun. */
 export const calledOf = (job: Reconstruction): string => (job.name === "" ? `of ${when(job.created_at)}` : job.name);
 
+/** Frames received and lost since the capture began; null before there are counters. */
+export const framesSoFar = ({ counters }: Capture): number | null =>
+  counters === null ? null : Object.values(counters.lost).reduce((sum, lost) => sum + lost, counters.received);
+
 export function lengthOf(capture: Capture): string {
-  const frames = capture.recording?.frames ?? capture.counters?.next_frame ?? capture.frames_planned;
+  const frames = capture.recording?.frames ?? framesSoFar(capture) ?? capture.frames_planned;
   if (frames == null) return "–";
   return capture.sensor === null ? `${count(frames)} frames` : duration(frames / capture.sensor.frame_rate_hz);
 }

@@ -53,6 +53,31 @@ def test_a_capture_is_found_and_looked_at(studied: Studied, visit: Callable[...,
     until(lambda: len(page.locator(".log pre").inner_text()) > 10, "a log")
 
 
+def test_what_another_has_written_is_kept_by_a_visit_of_the_field(studied: Studied, visit: Callable[..., Any]) -> None:
+    fields = {
+        "Notes on the capture": ("captures", studied.capture_id, "notes"),
+        "Name of the capture": ("captures", studied.capture_id, "name"),
+        "Name of the reconstruction": ("reconstructions", studied.reconstruction_id, "name"),
+        "Notes on the reconstruction": ("reconstructions", studied.reconstruction_id, "notes"),
+    }
+    page = visit(f"{studied.address}?page=captures&capture={studied.capture_id}")
+    for label, (kind, id_, key) in fields.items():
+        field = page.get_by_label(label)
+        field.wait_for()
+        before = studied.http.get(f"{kind}/{id_}").json()[key]
+        studied.http.patch(f"{kind}/{id_}", json={key: "by another"})
+        until(lambda field=field: field.input_value() == "by another", f"what another wrote in {label}", 20)
+        field.focus()
+        field.blur()
+        field.fill("a slip")
+        field.press("Escape")
+        field.blur()
+        assert field.input_value() == "by another"
+        page.wait_for_timeout(300)
+        assert studied.http.get(f"{kind}/{id_}").json()[key] == "by another"
+        studied.http.patch(f"{kind}/{id_}", json={key: before})
+
+
 def test_everything_can_be_downloaded(studied: Studied, visit: Callable[..., Any]) -> None:
     page = visit(f"{studied.address}?page=captures&capture={studied.capture_id}")
     page.get_by_role("link", name="nerfstudio").wait_for()

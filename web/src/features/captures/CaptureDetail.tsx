@@ -3,7 +3,7 @@
 import { type JSX, useState } from "react";
 
 import * as calls from "../../shared/api/calls";
-import type { Capture, Reconstruction } from "../../shared/api/types";
+import type { Capture, CaptureChange, Reconstruction } from "../../shared/api/types";
 import { useDenied } from "../../shared/state/access";
 import { attempt } from "../../shared/state/attempt";
 import { nameOf, sourceOf } from "../../shared/state/capture";
@@ -16,6 +16,7 @@ import {
   storeReconstruction,
   useService,
 } from "../../shared/state/store";
+import { useDraft } from "../../shared/state/useDraft";
 import { useFetch } from "../../shared/state/useFetch";
 import { ActionButton, ScopeNote } from "../../shared/ui/access";
 import { Icon } from "../../shared/ui/icons";
@@ -86,7 +87,7 @@ function Detail({ capture }: { capture: Capture }): JSX.Element {
   const canRun = capture.recording !== null && isFinished(capture);
   return (
     <div className="detail">
-      <Head capture={capture} />
+      <Head key={capture.id} capture={capture} />
       <ScopeNote />
       <div className="columns">
         <div>
@@ -130,14 +131,12 @@ function Detail({ capture }: { capture: Capture }): JSX.Element {
 /** Whether its tracking and its loss were noted over time. */
 const measured = (job: Reconstruction): boolean => job.task === "reconstruct" || job.task === "extend";
 
+const change = (capture: Capture, values: CaptureChange): Promise<boolean> =>
+  attempt(async () => storeCapture(await calls.changeCapture(capture.id, values)));
+
 function Head({ capture }: { capture: Capture }): JSX.Element {
-  const [name, setName] = useState(capture.name);
   const readOnly = useDenied("operate");
-  const change = async (values: { name: string } | { keep: boolean }): Promise<boolean> =>
-    attempt(async () => storeCapture(await calls.changeCapture(capture.id, values)));
-  const rename = async (): Promise<void> => {
-    if (name !== capture.name && !(await change({ name }))) setName(capture.name);
-  };
+  const name = useDraft(capture.name, (text) => change(capture, { name: text }));
   return (
     <header className="head">
       <button type="button" onClick={() => go({ page: "captures", capture: null, reconstruction: null })}>
@@ -147,16 +146,10 @@ function Head({ capture }: { capture: Capture }): JSX.Element {
       <input
         className="title"
         aria-label="Name of the capture"
-        value={name}
         placeholder={sourceOf(capture)}
         maxLength={200}
         readOnly={readOnly !== null}
-        onChange={(event) => setName(event.target.value)}
-        onBlur={() => void rename()}
-        onKeyDown={(event) => {
-          if (event.key === "Enter") event.currentTarget.blur();
-          if (event.key === "Escape") setName(capture.name);
-        }}
+        {...name}
       />
       <CaptureBadge capture={capture} />
       <label className="check" title={readOnly ?? "Exclude from automatic removal"}>
@@ -164,7 +157,7 @@ function Head({ capture }: { capture: Capture }): JSX.Element {
           type="checkbox"
           checked={capture.keep}
           disabled={readOnly !== null}
-          onChange={(event) => void change({ keep: event.target.checked })}
+          onChange={(event) => void change(capture, { keep: event.target.checked })}
         />{" "}
         Keep
       </label>
@@ -200,42 +193,27 @@ const tagsOf = (text: string): string[] => [
 ];
 
 function Notes({ capture }: { capture: Capture }): JSX.Element {
-  const [notes, setNotes] = useState(capture.notes);
-  const [tags, setTags] = useState(capture.tags.join(", "));
-  const saveTags = async (): Promise<void> => {
-    const wanted = tagsOf(tags);
-    if (wanted.join() === capture.tags.join()) return;
-    await attempt(async () => storeCapture(await calls.changeCapture(capture.id, { tags: wanted })));
-  };
+  const notes = useDraft(capture.notes, (text) => change(capture, { notes: text }));
+  const tags = useDraft(capture.tags.join(", "), async (text) => {
+    const wanted = tagsOf(text);
+    return wanted.join() === capture.tags.join() || change(capture, { tags: wanted });
+  });
   const noted = Object.entries(capture.metadata);
-  const readOnly = useDenied("operate");
-  const save = async (): Promise<void> => {
-    if (notes === capture.notes) return;
-    await attempt(async () => storeCapture(await calls.changeCapture(capture.id, { notes })));
-  };
+  const readOnly = useDenied("operate") !== null;
   return (
     <Panel title="Notes">
       <textarea
         className="notes"
         aria-label="Notes on the capture"
         placeholder="Notes; included in the search"
-        value={notes}
-        rows={Math.min(12, Math.max(2, notes.split("\n").length))}
+        rows={Math.min(12, Math.max(2, notes.value.split("\n").length))}
         maxLength={20000}
-        readOnly={readOnly !== null}
-        onChange={(event) => setNotes(event.target.value)}
-        onBlur={() => void save()}
+        readOnly={readOnly}
+        {...notes}
       />
       <label className="tags">
         Tags
-        <input
-          value={tags}
-          placeholder="desk, night"
-          maxLength={1000}
-          readOnly={readOnly !== null}
-          onChange={(event) => setTags(event.target.value)}
-          onBlur={() => void saveTags()}
-        />
+        <input placeholder="desk, night" maxLength={1000} readOnly={readOnly} {...tags} />
       </label>
       {noted.length > 0 && (
         <dl className="facts">

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browsing import AXE, DESKTOP, PHONE, keep, violations
+from browsing import AXE, DESKTOP, PHONE, address, keep, until, violations
 
 from spiked.calibration import Calibration
 
@@ -119,3 +119,26 @@ def test_what_cannot_be_used_is_told(idle: Any, visit: Callable[..., Any], files
     page.locator(".upload .error-message").wait_for()
     assert "cannot be used as a recording" in page.locator(".upload .error-message").inner_text()
     assert idle.http.get("uploads").json()["items"] == []
+
+
+def test_an_upload_goes_on_beside_other_pages(idle: Any, visit: Callable[..., Any], files: Path) -> None:
+    page = opened(visit, idle)
+    held: list[Any] = []
+
+    def hold(route: Any) -> None:
+        held.append(route)
+
+    page.route("**/api/v1/uploads/*", hold, times=1)
+    choose_files(page, files / "desk.dat", files / "desk.json")
+    page.get_by_role("textbox", name="Name", exact=True).fill("sent meanwhile")
+    page.locator(".upload form").get_by_role("button", name="Upload").click()
+    page.get_by_role("region", name="Upload of sent meanwhile").wait_for()
+    page.get_by_role("link", name="Live").click()
+    page.get_by_role("button", name="Cancel").wait_for()
+    until(lambda: page.evaluate("() => true") and bool(held), "a piece under way")
+    held[0].continue_()
+    page.get_by_text("Uploaded sent meanwhile").wait_for()
+    assert "page=captures" not in address(page)
+    page.get_by_role("button", name="Open").click()
+    page.get_by_text("Recording", exact=True).first.wait_for()
+    assert newest(idle)["id"] in address(page)

@@ -113,6 +113,8 @@ _KINDS: dict[type[SpikedError], str] = {
     FrameNotRecordedError: "not-recorded",
     NotInImageError: "not-in-image",
     BusyError: "busy",
+    UploadBusyError: "busy",
+    UploadOffsetError: "upload-offset",
     KeyReusedError: "idempotency-key-reused",
 }
 

@@ -2,6 +2,7 @@
 
 import { type JSX, lazy, Suspense, useEffect, useState } from "react";
 
+import { UploadBar } from "../features/captures/UploadBar";
 import { LivePage } from "../features/live/LivePage";
 import { go, type PageName, useRoute } from "../shared/state/route";
 import { follow, useService } from "../shared/state/store";
@@ -89,6 +90,7 @@ export function App(): JSX.Element {
         <ThemeSwitch />
       </header>
       {!signedOut && <Disconnected />}
+      <UploadBar />
       <main id="main" tabIndex={-1} className={`page-${page}`}>
         {signedOut ? (
           <SignIn />

@@ -1,28 +1,27 @@
-/** The form that uploads a recording: dropped or picked, described, sent with its progress, and opened as a capture. */
+/** The form that uploads a recording: dropped or picked, described, sent, and opened as a capture. */
 
-import { type JSX, useRef, useState } from "react";
+import { type JSX, useEffect, useRef, useState } from "react";
 
 import * as calls from "../../shared/api/calls";
 import type { OptionValues } from "../../shared/api/types";
 import { bytes } from "../../shared/state/format";
 import { go } from "../../shared/state/route";
 import { errorText, useService } from "../../shared/state/store";
+import { toast } from "../../shared/state/toasts";
 import { useFetch } from "../../shared/state/useFetch";
 import { ScopeNote } from "../../shared/ui/access";
 import { Fetched } from "../../shared/ui/Fetched";
 import { Icon } from "../../shared/ui/icons";
 import { OptionsForm } from "../../shared/ui/OptionsForm";
-import { ErrorMessage, Meter, Panel } from "../../shared/ui/parts";
-import { uploadFile } from "./uploadFile";
+import { ErrorMessage, Panel } from "../../shared/ui/parts";
 import { sizeText, statedOf, uploadFields, valuesOfSidecar } from "./uploadForm";
+import { upload } from "./uploads";
 
 interface Chosen {
   file: File;
   sidecar: Record<string, unknown> | null;
   calibration: File | null;
 }
-
-type Progress = { sent: number; checking: boolean };
 
 export function UploadPanel({ onClose }: { onClose: () => void }): JSX.Element {
   const schema = useFetch("upload options", calls.uploadSchema);
@@ -100,16 +99,19 @@ function UploadForm({ chosen, fields }: { chosen: Chosen; fields: ReturnType<typ
   const devices = useService((state) => state.devices);
   const [name, setName] = useState(chosen.file.name);
   const [device, setDevice] = useState("");
-  const [progress, setProgress] = useState<Progress | null>(null);
   const [problem, setProblem] = useState<string | null>(null);
   const [values, setValues] = useState<OptionValues>(() => valuesOfSidecar(chosen.sidecar ?? {}));
-  const abort = useRef<AbortController | null>(null);
+  const here = useRef(false);
+  useEffect(() => {
+    here.current = true;
+    return () => {
+      here.current = false;
+    };
+  }, []);
   const size = sizeText(chosen.file.name, chosen.file.size, values);
 
   const send = async (stated: OptionValues): Promise<void> => {
-    abort.current = new AbortController();
     setProblem(null);
-    setProgress({ sent: 0, checking: false });
     try {
       const request = {
         name,
@@ -119,18 +121,14 @@ function UploadForm({ chosen, fields }: { chosen: Chosen; fields: ReturnType<typ
         device: device === "" ? null : device,
         ...statedOf(stated),
       };
-      const capture = await uploadFile({
-        file: chosen.file,
-        request,
-        calibration: chosen.calibration,
-        onProgress: (sent) => setProgress({ sent, checking: false }),
-        onCheck: () => setProgress({ sent: chosen.file.size, checking: true }),
-        signal: abort.current.signal,
-      });
-      go({ page: "captures", capture: capture.id });
+      const capture = await upload(chosen.file, request, chosen.calibration);
+      if (capture === null) return;
+      const open = (): void => go({ page: "captures", capture: capture.id });
+      if (here.current) open();
+      else toast(`Uploaded ${name}`, { action: { label: "Open", run: open } });
     } catch (error) {
-      if (!(error instanceof DOMException && error.name === "AbortError")) setProblem(errorText(error));
-      setProgress(null);
+      if (here.current) setProblem(errorText(error));
+      else toast(`${name} was not uploaded. ${errorText(error)}`, { tone: "problem" });
     }
   };
 
@@ -159,21 +157,6 @@ function UploadForm({ chosen, fields }: { chosen: Chosen; fields: ReturnType<typ
           : size.text}
       </p>
       <OptionsForm schema={fields} initial={values} action="Upload" onSubmit={send} onChange={setValues} />
-      {progress !== null && (
-        <div className="progress" role="status">
-          <Meter share={progress.sent / chosen.file.size} label="Sent" />
-          <span>
-            {progress.checking
-              ? "All bytes are there; the service checks them."
-              : `${bytes(progress.sent)} of ${bytes(chosen.file.size)}`}
-          </span>
-          {!progress.checking && (
-            <button type="button" onClick={() => abort.current?.abort()}>
-              Cancel
-            </button>
-          )}
-        </div>
-      )}
       {problem !== null && <ErrorMessage text={problem} />}
     </>
   );

@@ -12,6 +12,8 @@ export class ApiError extends Error {
     readonly status: number,
     message: string,
     readonly whatToDo: string | null = null,
+    /** What kind of problem it is, as the service names it. */
+    readonly kind = "",
   ) {
     super(message);
     this.name = "ApiError";
@@ -77,7 +79,8 @@ function errorOf(response: Response, body: unknown): ApiError {
   const problem = typeof body === "object" && body !== null ? (body as Record<string, unknown>) : {};
   const text = (key: string): string | null => (typeof problem[key] === "string" ? problem[key] : null);
   const said = text("detail") ?? text("title") ?? `${response.status} ${response.statusText}`;
-  return new ApiError(response.status, said, text("what_to_do"));
+  const kind = text("type")?.split(":").at(-1);
+  return new ApiError(response.status, said, text("what_to_do"), kind);
 }
 
 export const query = (values: Record<string, string | number | boolean | null | undefined>): string => {

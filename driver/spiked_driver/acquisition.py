@@ -110,7 +110,7 @@ class SlotPacker:
 
     def add(self, chunk: Chunk) -> None:
         if self._died_s is not None:
-            self._bridge(chunk.frames)
+            self._bridge(chunk.frames + chunk.waiting)
             if self.full:
                 return
         first = self._zero + chunk.first

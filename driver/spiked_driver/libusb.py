@@ -19,6 +19,8 @@ from spiked.errors import SourceError
 from spiked_driver.usb_cameras import UsbCamera
 
 Callback = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
+_INTERRUPTED = -10
+"""LIBUSB_ERROR_INTERRUPTED."""
 _NO_MEMORY = -11
 """LIBUSB_ERROR_NO_MEM."""
 _BULK = 2
@@ -153,7 +155,9 @@ class UsbContext:
     def handle_events(self, timeout_s: float) -> None:
         """Run the callbacks of completed transfers; wait at most `timeout_s` for the first."""
         wait = _Timeval(int(timeout_s), int(1e6 * (timeout_s % 1)))
-        usb.backend.libusb1._check(self._handle_events(self._backend.ctx, ctypes.byref(wait), None))
+        code = self._handle_events(self._backend.ctx, ctypes.byref(wait), None)
+        if code != _INTERRUPTED:  # a signal came: no transfer has failed
+            usb.backend.libusb1._check(code)
 
     def close(self) -> None:
         """Close the device, then the context. pyusb's own finalisers may run in the other order."""

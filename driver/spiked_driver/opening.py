@@ -68,7 +68,7 @@ class OpeningFilter:
             self._on_discarded(self._received - self._count, self._jump)
         frames = min(len(view), self._count - self._delivered)
         view[:frames] = held[self._delivered : self._delivered + frames]
-        chunk = Chunk(self._delivered, frames)
+        chunk = Chunk(self._delivered, frames, waiting=self._count - self._delivered - frames)
         self._delivered += frames
         if self._delivered == self._count:
             self._held = None

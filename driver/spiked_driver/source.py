@@ -23,6 +23,8 @@ class Chunk:
     frames: int
     seen_ns: int | None = field(default=None, compare=False)
     """Monotonic time, ns, at which they had all arrived, if that was before the source returned; else None."""
+    waiting: int = field(default=0, compare=False)
+    """Frames behind these that have arrived, too, and come with the next reads."""
 
 
 class Source(Protocol):

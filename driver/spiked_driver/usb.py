@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,7 +108,7 @@ class UsbSource:
         if isinstance(item, Gap):
             return self._gaps.attributed(item)
         self._connection.frame_delivered()
-        return Chunk(item.first, item.frames, self._seen_ns)
+        return replace(item, seen_ns=self._seen_ns)
 
     def _receive(self, connection: UsbConnection) -> bool:
         """Feed the next bytes to the framing; false when the caller should get control back."""

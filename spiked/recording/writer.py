@@ -215,6 +215,8 @@ class RecordingWriter:
         if files.syncer is not None:
             files.syncer.close()
         try:
+            if files.syncer is not None:
+                files.syncer.check()  # the kernel tells an error of writing once: the sync below would succeed
             files.frames.cut(self.bytes)  # releases preallocated space
             self._sync(files)
         except OSError as error:

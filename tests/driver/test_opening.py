@@ -1,15 +1,18 @@
 """The first frames of a stream may be old: they are discarded, and the capture counts from behind them."""
 
+import time
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+from spiked_driver.acquisition import SlotPacker
 from spiked_driver.framing import USB_COMPACT_BYTES, USB_FRAME_BYTES, UsbFraming, encode_usb
 from spiked_driver.opening import OpeningFilter
 from spiked_driver.source import Chunk
 
-from spiked.ring import Gap, LossCause
+from spiked.ring import Gap, LossCause, RingWriter
+from spiked.sensor import Sensor
 
 REAL = Path(__file__).parents[3] / "shared" / "wire" / "sps10_002_ep82_contiguous.bin"
 RATE = 2000.0
@@ -48,6 +51,25 @@ def read(wire: bytes, *, piece: int = 40_000) -> tuple[list[int], list[Gap], lis
 
 def test_without_a_jump_every_frame_is_delivered_without_a_warning() -> None:
     assert read(numbered(5, 300)) == (list(range(5, 305)), [], [])
+
+
+def test_frames_that_wait_behind_the_opening_are_not_lost_again_when_an_acquisition_restarts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It died 130 frames ago; of these the opening held 100, which come after the gap."""
+    died_s = 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: died_s + 130 / RATE)
+    framing = UsbFraming()
+    opening = OpeningFilter(framing, RATE, lambda count, older: None)
+    framing.feed(numbered(0, OPENING + 1))
+    with RingWriter.create(Sensor(400, 250, RATE), slots=64, block_frames=8) as writer:
+        packer = SlotPacker(writer, None, died_s)
+        while isinstance(item := opening.read_into(packer.view()), Chunk):
+            packer.add(item)
+        packer.flush()
+        status = writer.status().writer
+    assert status.committed >= OPENING
+    assert abs(status.next_frame - 130) <= 16 and sum(status.lost.values()) == status.next_frame - status.committed
 
 
 @pytest.mark.parametrize("old", [1, 3, OPENING - 1])

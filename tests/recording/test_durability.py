@@ -1,5 +1,6 @@
 """What a recording is worth after kills, full disks and bad bytes."""
 
+import errno
 import json
 import os
 import resource
@@ -7,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -269,6 +271,24 @@ def test_space_taken_in_advance_is_given_back(tmp_path: Path) -> None:
     assert ahead.st_size == after.st_size == 80 * SENSOR.frame_bytes
     assert ahead.st_blocks * 512 > 32 << 20
     assert after.st_blocks * 512 <= 80 * SENSOR.frame_bytes + 4096
+
+
+def test_an_error_of_the_last_sync_in_the_background_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernel tells it once: a later sync of the same file succeeds."""
+    failed, real = threading.Event(), os.fdatasync
+
+    def sync(file: int) -> None:
+        if not failed.is_set():
+            failed.set()
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        real(file)
+
+    monkeypatch.setattr(os, "fdatasync", sync)
+    writer = RecordingWriter(tmp_path / "rec.dat", SENSOR, durability=Durability(index=True, sync=Sync.SECOND))
+    writer.append(np.zeros((8, SENSOR.frame_bytes), np.uint8))
+    assert failed.wait(10)
+    with pytest.raises(RecordingError, match="cannot be finished"):
+        writer.close()
 
 
 def test_space_is_taken_again_after_a_file_was_cut(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from fastapi import Request, Response
 from spiked.errors import ConfigurationError, SpikedError
 from spiked.export import ExportKind, ExportOptions
 from spiked_service.api import files
+from spiked_service.api.problems import NothingError
 from spiked_service.api.results import Result, Results
 from spiked_service.base.limits import OverloadedError
 from spiked_service.captures.captures import Captures
@@ -58,7 +59,12 @@ class Exports:
         number = result.published.version
         made = self._place / f"{row.id}-{number:06d}-{zlib.crc32(repr(known).encode()):08x}"
         if not made.exists():
-            self._make(self._command(row, capture, title, result, kind, options, made))
+            try:
+                self._make(self._command(row, capture, title, result, kind, options, made))
+            except ConfigurationError as error:
+                if result.published.splats:
+                    raise
+                raise NothingError(str(error)) from error  # of an early version: no other options would help
         name = f"{row.id}-{number:06d}-{kind.name}{kind.suffix or '.zip'}"
         return files.ranged(request, made, name, kind.sent_as, **{"X-Scene-Version": str(number)})
 

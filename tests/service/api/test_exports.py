@@ -55,3 +55,6 @@ def test_what_cannot_be_made_is_said(service: Any, done: CaptureOut, job: str) -
     assert service.http.get(f"reconstructions/{job}/exports/ply?metric=true").status_code == 404
     assert service.http.get(f"reconstructions/{job}/exports/blend").status_code == 422
     assert service.http.get(f"reconstructions/{job}/exports/ply?version=999").status_code == 404
+    for one in service.client.versions(job):  # the first may have been published before there were splats
+        answer = service.http.get(f"reconstructions/{job}/exports/depth?views=2&version={one.version}", timeout=120)
+        assert (answer.status_code, "has no splats" in answer.text) == ((200, False) if one.splats else (404, True))

@@ -17,6 +17,7 @@ import uvicorn
 from fastapi import FastAPI
 from pydantic import BaseModel
 from spiked_service.api.problems import install
+from spiked_service.api.routes import events
 from spiked_service.api.routes.events import event_routes
 from spiked_service.base.limits import ConcurrencyLimit
 from spiked_service.events.bus import Bus, Topic
@@ -94,7 +95,20 @@ def test_a_client_that_comes_back_goes_on_where_it_was(service: Service) -> None
         assert [message["seq"] for message in receive(client, 2)] == [4, 5]
 
 
-@pytest.mark.parametrize("query", ["topics=poses", "since=-1", "since=1e3", "since=" + "9" * 40, "topics=lost"])
+def test_a_silent_websocket_gets_empty_messages_if_it_asks_for_them(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(events, "_HEARTBEAT_S", 0.05)
+    with service.client("topics=pose&heartbeat=1") as beating, service.client("topics=pose") as silent:
+        assert [beating.recv(timeout=DEADLINE_S) for _ in range(3)] == ["", "", ""]
+        service.bus.publish(Topic.POSE, Note(number=7))
+        assert next(text for text in iter(lambda: beating.recv(timeout=DEADLINE_S), None) if text).startswith("{")
+        assert receive(silent, 1)[0]["data"]["number"] == 7
+
+
+@pytest.mark.parametrize(
+    "query", ["heartbeat=yes", "topics=poses", "since=-1", "since=1e3", "since=" + "9" * 40, "topics=lost"]
+)
 def test_a_wrong_question_is_refused_with_a_problem(service: Service, query: str) -> None:
     with pytest.raises(InvalidStatus) as refused:
         connect(f"ws://{service.address}?{query}")

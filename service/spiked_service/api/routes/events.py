@@ -21,7 +21,8 @@ CAPACITY = 1024
 _PREVIEWS = 2
 """Pictures queued for a client; older ones are dropped."""
 _HEARTBEAT_S = 15.0
-"""Interval of comments, which keep proxies from closing a silent stream and detect lost connections."""
+"""Interval of comments and empty messages, which keep proxies from closing a silent stream and detect lost
+connections."""
 _TURN = 4
 """Messages sent to a client before other clients are served and a lost connection is noticed."""
 CLOSE_SEND_ONLY = 1003
@@ -34,6 +35,8 @@ _STUCK = 1013
 class _EventQuery:
     topics: frozenset[Topic]
     since: int | None
+    heartbeat: bool
+    """Whether a silent WebSocket gets an empty message now and then."""
 
 
 def event_routes(bus: Bus, concurrency: ConcurrencyLimit) -> APIRouter:
@@ -52,7 +55,7 @@ def event_routes(bus: Bus, concurrency: ConcurrencyLimit) -> APIRouter:
             await websocket.send_denial_response(problem(HTTPStatus.SERVICE_UNAVAILABLE, str(error)))
             return
         try:
-            await _serve(websocket, _subscribe(bus, wanted))
+            await _serve(websocket, _subscribe(bus, wanted), heartbeat=wanted.heartbeat)
         finally:
             concurrency.release()
 
@@ -73,7 +76,10 @@ def event_routes(bus: Bus, concurrency: ConcurrencyLimit) -> APIRouter:
 
 
 def _parse_query(query: Mapping[str, str]) -> _EventQuery:
-    """Parse `topics=pose,scene` (default: all) and `since=SEQ` (default: from now on). Raises ConfigurationError."""
+    """Parse `topics=pose,scene` (default: all), `since=SEQ` (default: from now on) and `heartbeat=1`.
+
+    Raises ConfigurationError.
+    """
     known = ", ".join(sorted(PUBLISHED))
     topics = set()
     for name in query.get("topics", "").split(","):
@@ -84,22 +90,25 @@ def _parse_query(query: Mapping[str, str]) -> _EventQuery:
     since = query.get("since", "")
     if since and not (since.isascii() and since.isdigit() and len(since) < 19):
         raise ConfigurationError(f"since is the number of the last message received, not {since[:40]!r}")
-    return _EventQuery(frozenset(topics) or PUBLISHED, int(since) if since else None)
+    heartbeat = query.get("heartbeat", "0")
+    if heartbeat not in ("0", "1"):
+        raise ConfigurationError(f"heartbeat is 0 or 1, not {heartbeat[:40]!r}")
+    return _EventQuery(frozenset(topics) or PUBLISHED, int(since) if since else None, heartbeat == "1")
 
 
 def _subscribe(bus: Bus, wanted: _EventQuery) -> Subscription:
     return bus.subscribe(wanted.topics, CAPACITY, _PREVIEWS, wanted.since)
 
 
-async def _serve(websocket: WebSocket, subscription: Subscription) -> None:
-    """Send messages until the client disconnects, writes, or stops reading."""
+async def _serve(websocket: WebSocket, subscription: Subscription, *, heartbeat: bool) -> None:
+    """Send messages until the client disconnects, writes, or stops reading; with `heartbeat` empty ones in silence."""
     await websocket.accept()
     listening = asyncio.create_task(_hear(websocket, subscription))
     try:
         sent = 0
-        while (message := await subscription.next()) is not None:
+        while (text := await _next_text(subscription, _HEARTBEAT_S if heartbeat else None)) is not None:
             async with asyncio.timeout(streams.STUCK_S):
-                await websocket.send_text(message.json)
+                await websocket.send_text(text)
             sent += 1
             if sent % _TURN == 0:
                 await asyncio.sleep(0)
@@ -112,6 +121,16 @@ async def _serve(websocket: WebSocket, subscription: Subscription) -> None:
     finally:
         subscription.close()
         listening.cancel()
+
+
+async def _next_text(subscription: Subscription, silence_s: float | None) -> str | None:
+    """The next message as JSON, empty after a silence, None at the end."""
+    try:
+        async with asyncio.timeout(silence_s):
+            message = await subscription.next()
+    except TimeoutError:
+        return ""
+    return None if message is None else message.json
 
 
 async def _hear(websocket: WebSocket, subscription: Subscription) -> None:

@@ -1,10 +1,11 @@
 /** The Live page: picture, frame counters, control and reconstruction progress. */
 
-import { type JSX, useEffect } from "react";
+import type { JSX } from "react";
 
-import { useRoute } from "../../shared/state/route";
-import { loadReconstructions, newestCapture, newestReconstruction, useService } from "../../shared/state/store";
-import { Loading, Panel } from "../../shared/ui/parts";
+import { go, useRoute } from "../../shared/state/route";
+import { newestCapture, newestReconstruction, useService } from "../../shared/state/store";
+import { useWanted } from "../../shared/state/useWanted";
+import { ErrorMessage, Loading, Panel } from "../../shared/ui/parts";
 import { Control } from "./Control";
 import { PictureView } from "./PictureView";
 import { Progress } from "./Progress";
@@ -23,10 +24,12 @@ export function LivePage(): JSX.Element {
   const devices = useService((state) => state.devices);
   const system = useService((state) => state.system);
   const id = capture?.id ?? null;
-  useEffect(() => {
-    if (id !== null) loadReconstructions(id).catch(() => undefined); // shown by the banner at the top
-  }, [id]);
+  const problem = useWanted(wanted, capture);
   if (!loaded && connectionError === null) return <Loading what="the state of the service" />;
+  if (problem !== null)
+    return (
+      <ErrorMessage text={problem} again={() => go({ capture: null, reconstruction: null })} called="Newest capture" />
+    );
   const streaming = capture?.state === "streaming";
   return (
     <div className="live">

@@ -139,6 +139,11 @@ function useObserved(
   useEffect(() => {
     const ended = new AbortController();
     let shown: number | null = null;
+    const show = (next: string | null): void =>
+      setUrl((before) => {
+        if (before !== null) URL.revokeObjectURL(before);
+        return next;
+      });
     let busy = false;
     const ask = async (): Promise<void> => {
       const requested = wanted.current;
@@ -146,15 +151,14 @@ function useObserved(
       busy = true;
       shown = requested;
       try {
-        const picture = address.preview(captureId, "interval", { frame: requested, white });
-        const next = URL.createObjectURL(await (await fetched(picture, ended.signal)).blob());
-        setUrl((before) => {
-          if (before !== null) URL.revokeObjectURL(before);
-          return next;
-        });
+        const picture = address.preview(captureId, "interval", { frame: requested, white, undistorted: true });
+        show(URL.createObjectURL(await (await fetched(picture, ended.signal)).blob()));
         setMissing(false);
       } catch {
-        if (!ended.signal.aborted) setMissing(true);
+        if (!ended.signal.aborted) {
+          setMissing(true);
+          show(null); // that of another frame would be compared
+        }
       }
       busy = false;
     };

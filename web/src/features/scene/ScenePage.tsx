@@ -2,21 +2,13 @@
 
 import { type JSX, useCallback, useEffect, useRef, useState } from "react";
 
-import { capture as askCapture } from "../../shared/api/calls";
 import type { Capture, Reconstruction, Version } from "../../shared/api/types";
 import { calledOf, nameOf } from "../../shared/state/capture";
 import { count } from "../../shared/state/format";
 import { adjust, go, route, useRoute } from "../../shared/state/route";
-import {
-  isEnded,
-  loadReconstructions,
-  newestCapture,
-  newestReconstruction,
-  storeCapture,
-  useService,
-  errorText,
-} from "../../shared/state/store";
+import { isEnded, newestCapture, newestReconstruction, useService, errorText } from "../../shared/state/store";
 import { toast } from "../../shared/state/toasts";
+import { useWanted } from "../../shared/state/useWanted";
 import { Empty, ErrorMessage, JobReason, Loading, trackingHint } from "../../shared/ui/parts";
 import { CompareStage, type Names } from "./CompareStage";
 import { Inspector } from "./Inspector";
@@ -74,20 +66,6 @@ function Wanted(): JSX.Element {
       </Empty>
     );
   return <SceneView key={job.id} capture={capture} jobId={job.id} />;
-}
-
-/** Fetch a capture that the URL names and the store does not hold. */
-function useWanted(id: string | null, known: Capture | null): string | null {
-  const [problem, setProblem] = useState<{ id: string; text: string } | null>(null);
-  const missing = id !== null && known === null;
-  const knownId = known?.id ?? null;
-  useEffect(() => {
-    if (missing) askCapture(id).then(storeCapture, (error: unknown) => setProblem({ id, text: errorText(error) }));
-  }, [id, missing]);
-  useEffect(() => {
-    if (knownId !== null) loadReconstructions(knownId).catch(() => undefined); // shown by the banner at the top
-  }, [knownId]);
-  return missing && problem?.id === id ? problem.text : null;
 }
 
 function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX.Element | null {

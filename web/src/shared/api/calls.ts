@@ -262,7 +262,12 @@ export const address = {
   preview: (
     id: string,
     kind: PreviewKind,
-    extra: { gain?: number | undefined; frame?: number | undefined; white?: number | undefined } = {},
+    extra: {
+      gain?: number | undefined;
+      frame?: number | undefined;
+      white?: number | undefined;
+      undistorted?: boolean;
+    } = {},
   ): string => `${API}/captures/${id}/preview${query({ kind, ...extra })}`,
   /** A picture of what is known of each pixel; `file` makes it another one after a new calibration. */
   calibration: (device: string, kind: string, file: string): string =>

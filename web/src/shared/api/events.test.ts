@@ -55,6 +55,27 @@ it("waits longer after each failure, up to ten seconds", () => {
   expect(backoff(20, 0)).toBe(5000);
 });
 
+it("stays connected in silence as long as heartbeats come", () => {
+  expect(String(newest().url)).toContain("heartbeat=1");
+  newest().readyState = Socket.OPEN;
+  newest().onopen?.();
+  for (let beat = 0; beat < 12; beat += 1) {
+    vi.advanceTimersByTime(15_000);
+    newest().onmessage?.({ data: "" });
+  }
+  expect(Socket.made.length).toBe(1);
+  expect([seen, gaps]).toEqual([[], 0]);
+});
+
+it("fetches nothing again for pictures that a slow connection has lost", () => {
+  newest().onopen?.();
+  newest().say({ seq: 5, topic: "lost", data: { why: "slow", by_topic: { preview: 3 } } });
+  expect(gaps).toBe(0);
+  newest().say({ seq: 6, topic: "lost", data: { why: "slow", by_topic: { preview: 3, capture: 1 } } });
+  newest().say({ seq: 7, topic: "lost", data: { why: "restart", by_topic: {} } });
+  expect(gaps).toBe(2);
+});
+
 it("comes back and asks for what it has missed", () => {
   newest().onopen?.();
   newest().say({ seq: 41, topic: "pose" });

@@ -27,7 +27,14 @@ export interface EventsHooks {
   onGap: () => void;
 }
 
-export const TOPICS: readonly Topic[] = ["device", "capture", "job", "pose", "scene", "preview", "log"];
+export const TOPICS: readonly Topic[] = ["device", "capture", "job", "pose", "scene", "preview"];
+
+/** Whether a slow connection lost pictures alone: newer ones follow, and nothing has to be fetched again. */
+const onlyPictures = (lost: unknown): boolean => {
+  const { why, by_topic: topics } = lost as { why?: string; by_topic?: Record<string, number> };
+  const lostTopics = Object.keys(topics ?? {});
+  return why === "slow" && lostTopics.length > 0 && lostTopics.every((topic) => topic === "preview");
+};
 
 export class Events {
   private socket: WebSocket | null = null;
@@ -72,7 +79,7 @@ export class Events {
 
   private connect(): void {
     this.hooks.onLink({ state: "connecting" });
-    const query = new URLSearchParams({ topics: this.topics.join(",") });
+    const query = new URLSearchParams({ topics: this.topics.join(","), heartbeat: "1" });
     if (this.seq !== null) query.set("since", String(this.seq));
     const url = new URL(`${API}/events?${query.toString()}`, document.baseURI);
     url.protocol = url.protocol === "https:" ? "wss:" : "ws:";
@@ -85,7 +92,7 @@ export class Events {
     };
     socket.onmessage = (event: MessageEvent<string>) => {
       this.heard = performance.now();
-      this.take(JSON.parse(event.data) as Message);
+      if (event.data !== "") this.take(JSON.parse(event.data) as Message); // empty: a heartbeat
     };
     socket.onclose = () => {
       this.socket = null;
@@ -99,7 +106,7 @@ export class Events {
 
   private take(message: Message): void {
     if (message.topic === "lost") {
-      this.hooks.onGap();
+      if (!onlyPictures(message.data)) this.hooks.onGap();
       return;
     }
     // Sequence numbers restart with the daemon.

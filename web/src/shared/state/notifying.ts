@@ -37,5 +37,11 @@ export function notifyOfEnd(before: Reconstruction | undefined, job: Reconstruct
   if (job.state !== "complete" && job.state !== "failed") return;
   const text =
     job.state === "complete" ? "A reconstruction is complete." : `A reconstruction has failed: ${job.reason}`;
-  new Notification("spiked", { body: text, silent: true });
+  try {
+    new Notification("spiked", { body: text, silent: true });
+  } catch {
+    // Chrome on Android has the class, but lets only service workers use it.
+    useStored.setState({ on: false });
+    toast("This browser does not allow notifications of this page.", { tone: "problem" });
+  }
 }

@@ -1,4 +1,4 @@
-import { beforeEach, expect, it } from "vitest";
+import { beforeEach, expect, it, vi } from "vitest";
 
 import { adjust, dropToken, formatRoute, go, HOME, parseRoute, route } from "./route";
 
@@ -43,6 +43,37 @@ it("lets go of a version and a comparison with their reconstruction", () => {
   go({ page: "scene", reconstruction: "b" });
   expect(route().version).toBeNull();
   expect(route().against).toBeNull();
+});
+
+it("lets go of a version when the capture changes without a new entry, too", () => {
+  go({ page: "scene", capture: "x", reconstruction: "a", version: 3, camera: [1, 2, 3, 4, 5, 6, 7] });
+  adjust({ capture: null });
+  expect(route()).toMatchObject({ page: "scene", reconstruction: null, version: null, camera: null });
+  go({ capture: "y", reconstruction: "b", frame: 7 });
+  expect(route()).toMatchObject({ capture: "y", reconstruction: "b", frame: 7 });
+  adjust({ capture: "y", frame: 8 });
+  expect(route().reconstruction).toBe("b");
+});
+
+it("plays through more frames than a browser allows changes of the address", () => {
+  vi.useFakeTimers();
+  const real = window.history.replaceState.bind(window.history);
+  let calls = 0;
+  const spy = vi.spyOn(window.history, "replaceState").mockImplementation((...all) => {
+    calls += 1;
+    if (calls > 100) throw new DOMException("too many", "SecurityError");
+    real(...all);
+  });
+  for (let frame = 1; frame <= 600; frame += 1) {
+    adjust({ frame });
+    expect(route().frame).toBe(frame);
+    vi.advanceTimersByTime(16);
+  }
+  vi.advanceTimersByTime(1000);
+  expect(calls).toBeLessThan(50);
+  expect(window.location.search).toContain("frame=600");
+  spy.mockRestore();
+  vi.useRealTimers();
 });
 
 it("takes the token out of the address", () => {

@@ -99,26 +99,66 @@ const subscribe = (listener: () => void): (() => void) => {
   return () => listeners.delete(listener);
 };
 
+/** Browsers refuse more than some ten changes of the address a second, and a played path has sixty. */
+const ADDRESS_MS = 400;
+let writtenMs = -Infinity;
+let pending: ReturnType<typeof setTimeout> | undefined;
+
 function set(route: Route, push: boolean): void {
   if (formatRoute(route) === formatRoute(current)) return;
+  if (push) flush(); // the entry that is left shows what was seen last
   current = route;
-  window.history[push ? "pushState" : "replaceState"](null, "", formatRoute(route));
   for (const listener of listeners) listener();
+  const waitMs = push ? 0 : writtenMs + ADDRESS_MS - performance.now();
+  if (waitMs <= 0) writeAddress(push ? "pushState" : "replaceState");
+  else pending ??= setTimeout(writeAddress, waitMs);
 }
 
+function writeAddress(how: "pushState" | "replaceState" = "replaceState"): void {
+  clearTimeout(pending);
+  pending = undefined;
+  writtenMs = performance.now();
+  try {
+    window.history[how](null, "", formatRoute(current));
+  } catch {
+    pending = setTimeout(writeAddress, 10 * ADDRESS_MS); // refused: the limit counts other parts of the page, too
+  }
+}
+
+function flush(): void {
+  if (pending !== undefined) writeAddress();
+}
+window.addEventListener("pagehide", flush);
+
 window.addEventListener("popstate", () => {
+  clearTimeout(pending);
+  pending = undefined;
   current = parseRoute(window.location.search);
   for (const listener of listeners) listener();
 });
 
 /** What belongs to one reconstruction. */
-const OF_ONE: Partial<Route> = { version: null, against: null, againstVersion: null, how: "" };
+const OF_ONE: Partial<Route> = {
+  version: null,
+  against: null,
+  againstVersion: null,
+  how: "",
+  camera: null,
+  frame: null,
+  ride: false,
+};
 
-/** Navigate, with a new history entry. Version and comparison are reset when the reconstruction changes. */
-export const go = (change: Partial<Route>): void =>
-  set({ ...current, ...("capture" in change || "reconstruction" in change ? OF_ONE : {}), ...change }, true);
+/** The route after a change; what belongs to one reconstruction is reset when another one, or another capture, is shown. */
+function changed(change: Partial<Route>): Route {
+  const capture = "capture" in change && change.capture !== current.capture;
+  const other = capture || ("reconstruction" in change && change.reconstruction !== current.reconstruction);
+  return { ...current, ...(other ? OF_ONE : {}), ...(capture ? { reconstruction: null } : {}), ...change };
+}
+
+/** Navigate, with a new history entry. */
+export const go = (change: Partial<Route>): void => set(changed(change), true);
 /** Change parameters without a new history entry. */
-export const adjust = (change: Partial<Route>): void => set({ ...current, ...change }, false);
+export const adjust = (change: Partial<Route>): void => set(changed(change), false);
 export const route = (): Route => current;
 export const useRoute = (): Route => useSyncExternalStore(subscribe, route);
 

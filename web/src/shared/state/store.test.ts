@@ -1,5 +1,6 @@
-import { beforeEach, expect, it } from "vitest";
+import { beforeEach, expect, it, vi } from "vitest";
 
+import * as calls from "../api/calls";
 import type { Capture, Message, Reconstruction } from "../api/types";
 import { ApiError } from "../api/http";
 import { progressText } from "./capture";
@@ -8,6 +9,7 @@ import {
   newestCapture,
   newestReconstruction,
   handleMessage,
+  refresh,
   activeJobs,
   useService,
   errorText,
@@ -33,6 +35,42 @@ it("shows the newest reconstruction that has a scene, and one without only if th
   expect(newestReconstruction(jobs, "a")?.id).toBe("x");
   expect(newestReconstruction({ y: jobs.y }, "a")?.id).toBe("y");
   expect(newestReconstruction(jobs, "c")).toBeNull();
+});
+
+const pending = <T>(): { promise: Promise<T>; resolve: (value: T) => void } => {
+  let resolve: (value: T) => void = () => undefined;
+  const promise = new Promise<T>((done) => (resolve = done));
+  return { promise, resolve };
+};
+
+it("keeps older and removed captures, and what messages told meanwhile, when it fetches again", async () => {
+  const page = pending<Awaited<ReturnType<typeof calls.captures>>>();
+  const open = pending<Reconstruction[]>();
+  vi.spyOn(calls, "devices").mockResolvedValue([]);
+  vi.spyOn(calls, "captures").mockReturnValue(page.promise);
+  vi.spyOn(calls, "unfinished").mockReturnValue(open.promise);
+  vi.spyOn(calls, "reconstructions").mockResolvedValue([]);
+  const removed = capture("d", { deleted_at: "2026-11-21T00:00:00Z" });
+  const [ends, fails] = [job("x", "e", 1), job("y", "e", 1)];
+  useService.setState({
+    captures: { a: capture("a"), d: removed, c: capture("c"), e: capture("e") },
+    reconstructions: { x: { ...ends, state: "running" }, y: { ...fails, state: "running" } },
+  });
+  const again = refresh();
+  handleMessage(message("job", { ...ends, state: "complete" }));
+  handleMessage(message("job", { ...job("z", "e", 0), state: "queued" }));
+  handleMessage(message("capture", capture("f")));
+  page.resolve({ items: [capture("e", { state: "complete" }), capture("b")], next_cursor: "more" });
+  open.resolve([{ ...ends, state: "running" }]);
+  await again;
+  const { captures, reconstructions } = useService.getState();
+  expect(Object.keys(captures).sort()).toEqual(["a", "b", "d", "e", "f"]); // c is not there any more
+  expect(captures["e"]?.state).toBe("complete");
+  expect(Object.values(reconstructions).map((one) => [one.id, one.state])).toEqual([
+    ["x", "complete"],
+    ["z", "queued"],
+  ]);
+  vi.restoreAllMocks();
 });
 
 it("follows a device that comes and goes", () => {

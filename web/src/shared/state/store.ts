@@ -104,6 +104,31 @@ function measureRate(capture: Capture): number | null {
   return rate;
 }
 
+/**
+ * A message tells the newest state; an answer that was asked for before it came is older, and must not replace it.
+ * `heard` has when each object was last told of, or removed, on a clock that counts these and the requests.
+ */
+let clock = 0;
+const heard = new Map<string, number>();
+const hear = (id: string): void => void heard.set(id, ++clock);
+const isNewer = (id: string, asked: number): boolean => (heard.get(id) ?? 0) > asked;
+
+/** `stored` with what a request made at `asked` has answered; of objects that it does not list, those that `kept` keeps. */
+function merged<T extends { id: string }>(
+  stored: Record<string, T>,
+  answered: T[],
+  asked: number,
+  kept: (one: T) => boolean,
+): Record<string, T> {
+  const listed = new Set(answered.map((one) => one.id));
+  return Object.fromEntries([
+    ...Object.values(stored)
+      .filter((one) => isNewer(one.id, asked) || (!listed.has(one.id) && kept(one)))
+      .map((one) => [one.id, one] as const),
+    ...answered.filter((one) => !isNewer(one.id, asked)).map((one) => [one.id, one] as const),
+  ]);
+}
+
 export function storeCapture(capture: Capture): void {
   set((state) => ({
     captures: { ...state.captures, [capture.id]: capture },
@@ -115,18 +140,21 @@ export function storeCapture(capture: Capture): void {
 }
 
 export function storeReconstruction(job: Reconstruction): void {
-  notifyOfEnd(get().reconstructions[job.id], job);
+  const before = get().reconstructions[job.id];
   set((state) => ({ reconstructions: { ...state.reconstructions, [job.id]: job } }));
+  notifyOfEnd(before, job);
 }
 
 const without = <T>(all: Record<string, T>, id: string): Record<string, T> =>
   Object.fromEntries(Object.entries(all).filter(([key]) => key !== id));
 
 export function removeReconstruction(id: string): void {
+  hear(id);
   set((state) => ({ reconstructions: without(state.reconstructions, id) }));
 }
 
 export function removeFromStore(id: string): void {
+  hear(id);
   set((state) => ({ captures: without(state.captures, id) }));
 }
 
@@ -134,6 +162,7 @@ export function handleMessage(message: Message): void {
   switch (message.topic) {
     case "device": {
       const device = message.data;
+      hear(device.id);
       set((state) => ({
         devices: state.devices.some((one) => one.id === device.id)
           ? state.devices.map((one) => (one.id === device.id ? device : one))
@@ -142,9 +171,11 @@ export function handleMessage(message: Message): void {
       return;
     }
     case "capture":
+      hear(message.data.id);
       storeCapture(message.data);
       return;
     case "job":
+      hear(message.data.id);
       storeReconstruction(message.data);
       return;
     case "pose":
@@ -188,44 +219,35 @@ export function errorText(error: unknown): string {
   return error instanceof Error ? error.message : String(error);
 }
 
-const byId = (jobs: Reconstruction[]): Record<string, Reconstruction> =>
-  Object.fromEntries(jobs.map((job) => [job.id, job]));
-
-/** Only ended reconstructions: the service lists all others afresh. */
-const withoutUnfinished = (jobs: Record<string, Reconstruction>): Record<string, Reconstruction> =>
-  byId(Object.values(jobs).filter(isEnded));
-
 /** Fetch everything shown on more than one page. */
 export async function refresh(): Promise<void> {
+  const asked = ++clock;
   try {
     const [devices, captures, unfinished] = await Promise.all([
       calls.devices(),
       calls.captures({ limit: NEWEST }),
       calls.unfinished(),
     ]);
-    const known = Object.fromEntries(captures.items.map((one) => [one.id, one]));
+    // The list ends there: what is older, or removed, is not in it.
+    const oldest = captures.next_cursor === null ? "" : (captures.items.at(-1)?.id ?? "");
     set((state) => ({
-      devices,
-      captures: known,
-      reconstructions: { ...withoutUnfinished(state.reconstructions), ...byId(unfinished) },
+      devices: devices.map((one) => (isNewer(one.id, asked) && state.devices.find(({ id }) => id === one.id)) || one),
+      captures: merged(state.captures, captures.items, asked, (one) => one.id < oldest || one.deleted_at !== null),
+      reconstructions: merged(state.reconstructions, unfinished, asked, isEnded),
       loaded: true,
       connectionError: null,
     }));
-    const newest = newestCapture(known);
-    if (newest !== null) {
-      storeCapture(newest);
-      await loadReconstructions(newest.id);
-    }
+    const newest = newestCapture(get().captures);
+    if (newest !== null) await loadReconstructions(newest.id);
   } catch (error) {
     set({ connectionError: errorText(error) });
   }
 }
 
 export async function loadReconstructions(captureId: string): Promise<void> {
+  const asked = ++clock;
   const jobs = await calls.reconstructions(captureId);
-  set((state) => ({
-    reconstructions: { ...state.reconstructions, ...byId(jobs) },
-  }));
+  set((state) => ({ reconstructions: merged(state.reconstructions, jobs, asked, () => true) }));
 }
 
 async function refreshSystem(): Promise<void> {

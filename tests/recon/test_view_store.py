@@ -24,7 +24,7 @@ def view(number: int) -> View:
     frames = np.tile(np.uint8([[0xFF], [0x00]]), (LENGTH, SENSOR.height))
     begin = LENGTH * number
     window = aligned_window(frames, SENSOR, begin - LENGTH // 2, begin, begin + LENGTH)
-    return make_view(window, after_gap=False)
+    return make_view(window, SENSOR, after_gap=False)
 
 
 class Frames:

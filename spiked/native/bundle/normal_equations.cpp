@@ -387,7 +387,7 @@ void linearise(const In3& rotations, const In2& centres, const In2& points, cons
 void bind_normal_equations(nb::module_& m) {
     m.def("residuals", &residuals, nb::arg("rotations"), nb::arg("centres"), nb::arg("points"), nb::arg("camera"),
           nb::arg("point"), nb::arg("pixels"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"),
-          nb::arg("out"), nb::arg("lens") = nb::none(),
+          nb::arg("out").noconvert(), nb::arg("lens") = nb::none(),
           "Image minus observation in px, [M, 2]; infinite for a point at or behind its camera.");
     m.def("cost", &cost, nb::arg("rotations"), nb::arg("centres"), nb::arg("points"), nb::arg("camera"),
           nb::arg("point"), nb::arg("pixels"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"),
@@ -396,8 +396,9 @@ void bind_normal_equations(nb::module_& m) {
     m.def("linearise", &linearise, nb::arg("rotations"), nb::arg("centres"), nb::arg("points"), nb::arg("camera"),
           nb::arg("point"), nb::arg("pixels"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"),
           nb::arg("scale"), nb::arg("damping"), nb::arg("slots"), nb::arg("shares"), nb::arg("focal"),
-          nb::arg("radial"), nb::arg("hessian"), nb::arg("gradient"), nb::arg("eliminated"),
-          nb::arg("whitened_gradient"), nb::arg("roots"), nb::arg("pose_hessian"), nb::arg("lens") = nb::none(),
+          nb::arg("radial"), nb::arg("hessian").noconvert(), nb::arg("gradient").noconvert(),
+          nb::arg("eliminated").noconvert(), nb::arg("whitened_gradient").noconvert(), nb::arg("roots").noconvert(),
+          nb::arg("pose_hessian").noconvert(), nb::arg("lens") = nb::none(),
           "Hessian [D, D] and gradient [D] of what the poses are made of: slots [C, K] of six numbers each, with\n"
           "shares [C, K], and of the free optics: the logarithm of the focal length, then k1 and k2 of the lens. Each "
           "point's damped 3x3 Hessian V\n"

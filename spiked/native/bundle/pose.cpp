@@ -133,8 +133,8 @@ double displacement(const Array<const double, 2>& hessian, const Array<const dou
 
 void bind_pose(nb::module_& m) {
     m.def("fit_pose", &fit_pose, nb::arg("points"), nb::arg("pixels"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"),
-          nb::arg("cy"), nb::arg("scales"), nb::arg("rotation"), nb::arg("centre"), nb::arg("error"),
-          nb::arg("hessian"), nb::arg("move"), nb::arg("lens") = nb::none(),
+          nb::arg("cy"), nb::arg("scales"), nb::arg("rotation").noconvert(), nb::arg("centre").noconvert(),
+          nb::arg("error").noconvert(), nb::arg("hessian").noconvert(), nb::arg("move"), nb::arg("lens") = nb::none(),
           "Gauss-Newton with Cauchy weights, a step for each of `scales` (px) until they are small at the last: "
           "changes rotation and centre in place;\n"
           "`error` [n] (px) and `hessian` [6, 6] are those before the last step. Without `move` the pose is not "

@@ -137,11 +137,14 @@ class ChargeLoss {
         const int64_t upper = std::min(first / job.cell, job.rows - 2);
         const int64_t lower = std::min((last + job.cell - 1) / job.cell + 1, job.rows - 1);
         float least = 0, most = 0;
+        bool finite = true;
         for (int64_t f = 0; f < job.frames; ++f)
             for (int64_t k = upper * job.columns; k < (lower + 1) * job.columns; ++k) {
                 const float moved = job.grids[(f * job.rows * job.columns + k) * 2 + 1];
                 least = std::min(least, moved), most = std::max(most, moved);
+                finite = finite && std::isfinite(moved);
             }
+        if (!finite) return {0, job.image_height};
         const float low = std::floor((static_cast<float>(first) + least) / job.pixel) - 2;
         const float high = std::ceil((static_cast<float>(last) + most) / job.pixel) + 3;
         const float height = static_cast<float>(job.image_height);
@@ -163,7 +166,7 @@ void bind_charge(nb::module_& m) {
         .def("run", &ChargeLoss::run, nb::kw_only(), nb::arg("frames"), nb::arg("width"), nb::arg("height"),
              nb::arg("row_stride"), nb::arg("flipped"), nb::arg("msb"), nb::arg("tile"), nb::arg("grids"),
              nb::arg("cell"), nb::arg("image"), nb::arg("pixel"), nb::arg("every"), nb::arg("phase"), nb::arg("gain"),
-             nb::arg("dark").none(), nb::arg("floor"), nb::arg("jitter"), nb::arg("slope"));
+             nb::arg("dark").none(), nb::arg("floor"), nb::arg("jitter"), nb::arg("slope").noconvert());
 }
 
 }  // namespace spiked

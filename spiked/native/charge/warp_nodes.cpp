@@ -61,7 +61,7 @@ void warp_nodes(Array<const float, 2> inverse, float shrink, Array<const float, 
 
 void bind_warp_nodes(nb::module_& m) {
     m.def("warp_nodes", &warp_nodes, nb::arg("inverse"), nb::arg("shrink"), nb::arg("turn"), nb::arg("shift"),
-          nb::arg("cell"), nb::arg("nearest"), nb::arg("moved"), nb::arg("straight") = nb::none(),
+          nb::arg("cell"), nb::arg("nearest"), nb::arg("moved").noconvert(), nb::arg("straight") = nb::none(),
           nb::arg("camera") = nb::none(), nb::arg("lens") = nb::none());
 }
 

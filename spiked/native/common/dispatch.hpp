@@ -33,13 +33,19 @@ std::vector<const Kernels*> runnable_kernels(std::initializer_list<KernelChoice<
 }
 
 #if defined(__x86_64__)
+// Asked once: CPUID leaves a virtual machine, which takes some 60 us.
+inline const CpuFeatures& features_here() {
+    static const CpuFeatures cpu = cpu_features();
+    return cpu;
+}
+
 // The instructions that the floating-point kernels are compiled for.
 inline bool has_avx2_floats() {
-    const CpuFeatures cpu = cpu_features();
+    const CpuFeatures& cpu = features_here();
     return cpu.avx2 && cpu.fma;
 }
 inline bool has_avx512_floats() {
-    const CpuFeatures cpu = cpu_features();
+    const CpuFeatures& cpu = features_here();
     return has_avx2_floats() && cpu.avx512f && cpu.avx512dq && cpu.avx512bw && cpu.avx512vl;
 }
 #endif

@@ -25,6 +25,7 @@ class Pool {
     void run(int tasks, const std::function<void(int task, int thread)>& work);
 
   private:
+    void stop();
     void serve(int thread);
     void take(int thread);
 

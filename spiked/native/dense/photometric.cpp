@@ -105,8 +105,8 @@ size_t photometric_normals(const Image& error, const Image& du, const Image& dv,
 void bind_photometric(nb::module_& m) {
     m.def("photometric_normals", &photometric_normals, nb::arg("error"), nb::arg("du"), nb::arg("dv"), nb::arg("depth"),
           nb::arg("weight"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"), nb::arg("rotation"),
-          nb::arg("centre"), nb::arg("width_rad"), nb::arg("pose"), nb::arg("keys"), nb::arg("landmarks"),
-          nb::arg("lens") = nb::none(),
+          nb::arg("centre"), nb::arg("width_rad"), nb::arg("pose").noconvert(), nb::arg("keys").noconvert(),
+          nb::arg("landmarks").noconvert(), nb::arg("lens") = nb::none(),
           "Sums over the pixels of a view with `weight` above 0, for `error` = map - view, its slopes `du`, `dv` and "
           "`depth` [h, w].\n"
           "`pose` [6, 7] gets the Hessian by (rotation vector on the left, centre) and the gradient. Pixels that see "

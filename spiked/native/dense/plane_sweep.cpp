@@ -90,9 +90,11 @@ void best_plane(const Array<const float, 3>& cost, int apart, const Image& plane
 }  // namespace
 
 void bind_plane_sweep(nb::module_& m) {
-    m.def("add_cost", &add_cost,
+    m.def("add_cost", &add_cost, nb::arg("warped"), nb::arg("reference"), nb::arg("weight"), nb::arg("most"),
+          nb::arg("unseen"), nb::arg("total").noconvert(),
           "Adds min(|warped - reference| weight, `most`) to `total`, or `unseen` where the warped image is NaN.");
-    m.def("best_plane", &best_plane,
+    m.def("best_plane", &best_plane, nb::arg("cost"), nb::arg("apart"), nb::arg("plane_number").noconvert(),
+          nb::arg("margin").noconvert(),
           "Of costs [planes, H, W]: the plane of least cost, to a fraction of a plane by a parabola through its\n"
           "neighbours, and by what share of that cost the best plane more than `apart` away costs more.");
 }

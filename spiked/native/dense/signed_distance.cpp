@@ -76,8 +76,8 @@ void add_distances(const Array<const double, 2>& corners, double step, int side,
 
 void bind_signed_distance(nb::module_& m) {
     m.def("add_distances", &add_distances, nb::arg("corners"), nb::arg("step"), nb::arg("side"), nb::arg("depth"),
-          nb::arg("rotation"), nb::arg("centre"), nb::arg("camera"), nb::arg("reach"), nb::arg("total"),
-          nb::arg("seen"), nb::arg("lens") = nb::none(),
+          nb::arg("rotation"), nb::arg("centre"), nb::arg("camera"), nb::arg("reach"), nb::arg("total").noconvert(),
+          nb::arg("seen").noconvert(), nb::arg("lens") = nb::none(),
           "For blocks of side^3 voxels with these corners [n, 3]: adds min(distance / reach, 1) in front of the\n"
           "surface that a depth image shows, and down to -1 behind it, and counts the voxels that it was added to.");
 }

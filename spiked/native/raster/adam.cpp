@@ -62,12 +62,13 @@ class AdamSteps {
 }  // namespace
 
 void bind_adam(nb::module_& m) {
-    m.def("adam_corrections", &adam_corrections, nb::arg("seen"), nb::arg("taken"), nb::arg("correction"),
-          nb::arg("beta1"), nb::arg("beta2"));
+    m.def("adam_corrections", &adam_corrections, nb::arg("seen"), nb::arg("taken").noconvert(),
+          nb::arg("correction").noconvert(), nb::arg("beta1"), nb::arg("beta2"));
     nb::class_<AdamSteps>(m, "AdamSteps")
         .def(nb::init<int>(), nb::arg("threads"))
-        .def("step", &AdamSteps::step, nb::arg("parameter"), nb::arg("gradient"), nb::arg("first"), nb::arg("second"),
-             nb::arg("correction"), nb::arg("rate"), nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"));
+        .def("step", &AdamSteps::step, nb::arg("parameter").noconvert(), nb::arg("gradient"),
+             nb::arg("first").noconvert(), nb::arg("second").noconvert(), nb::arg("correction"), nb::arg("rate"),
+             nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"));
 }
 
 }  // namespace spiked

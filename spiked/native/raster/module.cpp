@@ -119,13 +119,15 @@ NB_MODULE(_raster, m) {
             },
             nb::kw_only(), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"), nb::arg("width"),
             nb::arg("height"), nb::arg("near"), nb::arg("threads"), nb::arg("lens") = nb::none())
-        .def("forward", &forward, nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"), nb::arg("opacity_logits"),
-             nb::arg("colours"), nb::arg("rotations"), nb::arg("centres"), nb::arg("weights").none(),
-             nb::arg("windows").none(), nb::arg("channels").none(), nb::arg("background"), nb::arg("values"),
-             nb::arg("alpha"), nb::arg("depth"))
-        .def("backward", &backward, nb::arg("d_values"), nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"),
-             nb::arg("opacity_logits"), nb::arg("colours"), nb::arg("rotation"), nb::arg("centre"),
-             nb::arg("contribution"), nb::arg("radius_px"))
+        .def("forward", &forward, nb::arg("means").noconvert(), nb::arg("quats").noconvert(),
+             nb::arg("log_scales").noconvert(), nb::arg("opacity_logits").noconvert(), nb::arg("colours").noconvert(),
+             nb::arg("rotations").noconvert(), nb::arg("centres").noconvert(), nb::arg("weights").none().noconvert(),
+             nb::arg("windows").none().noconvert(), nb::arg("channels").none().noconvert(), nb::arg("background"),
+             nb::arg("values").noconvert(), nb::arg("alpha").noconvert(), nb::arg("depth").noconvert())
+        .def("backward", &backward, nb::arg("d_values"), nb::arg("means").noconvert(), nb::arg("quats").noconvert(),
+             nb::arg("log_scales").noconvert(), nb::arg("opacity_logits").noconvert(), nb::arg("colours").noconvert(),
+             nb::arg("rotation").noconvert(), nb::arg("centre").noconvert(), nb::arg("contribution").noconvert(),
+             nb::arg("radius_px").noconvert())
         .def_prop_ro("instructions", &Renderer::instructions)
         .def_prop_ro("threads", &Renderer::threads)
         .def_prop_ro("block_evaluations", &Renderer::block_evaluations);

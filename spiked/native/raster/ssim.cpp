@@ -24,7 +24,8 @@ double mean_ssim(Array<const float, 2> rendered, Array<const float, 2> target, f
 }  // namespace
 
 void bind_ssim(nb::module_& m) {
-    m.def("mean_ssim", &mean_ssim, nb::arg("rendered"), nb::arg("target"), nb::arg("white"), nb::arg("d_rendered"));
+    m.def("mean_ssim", &mean_ssim, nb::arg("rendered"), nb::arg("target"), nb::arg("white"),
+          nb::arg("d_rendered").noconvert());
 }
 
 }  // namespace spiked

@@ -5,8 +5,8 @@
 
 #include <algorithm>
 #include <stdexcept>
-#include <thread>
 
+#include "../common/pool.hpp"
 #include "room.hpp"
 #include "sensor.hpp"
 
@@ -44,13 +44,9 @@ void expose(Map first, Map last, Array<const float, 1> weights, Array<const floa
     uint8_t* bytes = out.data();
     nb::gil_scoped_release release;
     const auto part = [&](int i) { return static_cast<int>(static_cast<int64_t>(format.height) * i / threads); };
-    const auto work = [&](int i) {
+    Pool(threads).run(threads, [&](int i, int) {
         expose_rows(exposure, maps, format, jitter, seed, charge, bytes, part(i), part(i + 1));
-    };
-    std::vector<std::thread> helpers;
-    for (int i = 1; i < threads; ++i) helpers.emplace_back(work, i);
-    work(0);
-    for (std::thread& helper : helpers) helper.join();
+    });
 }
 
 Room make_room(int channels, Array<const float, 2> boxes, Array<const int32_t, 2> faces,
@@ -110,12 +106,12 @@ void render(const Room& room, Array<const double, 2> rotation, Array<const doubl
 NB_MODULE(_simulate, m) {
     m.def("expose", &expose, nb::arg("first"), nb::arg("last"), nb::arg("weights"), nb::arg("gains"),
           nb::arg("first_frame"), nb::arg("gain"), nb::arg("dark"), nb::arg("threshold"), nb::arg("noise_factor"),
-          nb::arg("jitter"), nb::arg("seed"), nb::arg("missing"), nb::arg("out"), nb::arg("stride"), nb::arg("flipped"),
-          nb::arg("msb_first"), nb::arg("row_tagged"), nb::arg("threads"));
+          nb::arg("jitter"), nb::arg("seed"), nb::arg("missing").noconvert(), nb::arg("out").noconvert(),
+          nb::arg("stride"), nb::arg("flipped"), nb::arg("msb_first"), nb::arg("row_tagged"), nb::arg("threads"));
     nb::class_<Room>(m, "Room")
         .def_ro("channels", &Room::channels)
         .def("render", &render, nb::arg("rotation"), nb::arg("centre"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"),
-             nb::arg("cy"), nb::arg("image"), nb::arg("depth"), nb::arg("threads"));
+             nb::arg("cy"), nb::arg("image").noconvert(), nb::arg("depth").noconvert(), nb::arg("threads"));
     m.def("make_room", &make_room, nb::arg("channels"), nb::arg("boxes"), nb::arg("faces"), nb::arg("textures"),
           nb::arg("texels_per_unit"), nb::arg("texels"));
 }

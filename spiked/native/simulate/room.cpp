@@ -1,13 +1,12 @@
 #include "room.hpp"
 
 #include <algorithm>
-#include <atomic>
 #include <cmath>
 #include <cstring>
 #include <limits>
-#include <thread>
 
 #include "../common/clones.hpp"
+#include "../common/pool.hpp"
 
 namespace spiked {
 namespace {
@@ -296,22 +295,15 @@ void Room::render(const Pinhole& camera, float* image, float* depth, int threads
     Painter painter{*this, camera, {}, image, depth};
     for (const Box& box : boxes) painter.views.push_back(view_of(box, camera));
     const int across = (camera.width + kTile - 1) / kTile, down = (camera.height + kTile - 1) / kTile;
-    std::atomic<int> next{0};
-    const auto work = [&] {
-        for (int row = next++; row < down; row = next++) {
-            for (int tile = 0; tile < across; ++tile) {
-                if (channels == 1) {
-                    painter.paint_tile<1>(tile, row);
-                } else {
-                    painter.paint_tile<3>(tile, row);
-                }
+    Pool(threads).run(down, [&](int row, int) {
+        for (int tile = 0; tile < across; ++tile) {
+            if (channels == 1) {
+                painter.paint_tile<1>(tile, row);
+            } else {
+                painter.paint_tile<3>(tile, row);
             }
         }
-    };
-    std::vector<std::thread> helpers;
-    for (int i = 1; i < threads; ++i) helpers.emplace_back(work);
-    work();
-    for (std::thread& helper : helpers) helper.join();
+    });
 }
 
 }  // namespace spiked

@@ -320,7 +320,8 @@ void bind_rates(nb::module_& m) {
     bind_intervals<uint8_t>(m);
     bind_intervals<uint16_t>(m);
     m.def("quantile", &quantile, "The quantile `share` of an image's values; none may be negative.");
-    m.def("picture", &picture, "255 sqrt(rate / white), at most 255, blurred by a Gaussian of 0.8 px.");
+    m.def("picture", &picture, nb::arg("rate"), nb::arg("white"), nb::arg("out").noconvert(),
+          "255 sqrt(rate / white), at most 255, blurred by a Gaussian of 0.8 px.");
 }
 
 }  // namespace spiked

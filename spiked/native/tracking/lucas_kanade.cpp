@@ -408,7 +408,8 @@ void bind_lucas_kanade(nb::module_& m) {
     m.attr("MARGIN_PX") = kMargin;
     m.def("pad", &pad, "Copies an image [H, W] to floats, with MARGIN_PX around it that repeat its edge.");
     m.def(
-        "track", &track,
+        "track", &track, nb::arg("a"), nb::arg("b"), nb::arg("start"), nb::arg("at").noconvert(), nb::arg("reach"),
+        nb::arg("back"), nb::arg("good").noconvert(),
         "Tracks the positions `start` [n, 2] from pyramid `a` to pyramid `b`, whose levels are half the size of the "
         "one\n"
         "before, padded by `pad`. `at` [n, 2] holds guesses and gets the result. `good` [n]: found and, with `back`,\n"

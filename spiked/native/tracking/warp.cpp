@@ -132,7 +132,8 @@ void warp_spikes(const Frames& frames, size_t width, size_t height, size_t row_s
 
 void bind_warp(nb::module_& m) {
     m.def("warp_spikes", &warp_spikes, nb::arg("frames"), nb::arg("width"), nb::arg("height"), nb::arg("row_stride"),
-          nb::arg("flipped"), nb::arg("msb"), nb::arg("grids"), nb::arg("cell"), nb::arg("spikes"), nb::arg("weight"),
+          nb::arg("flipped"), nb::arg("msb"), nb::arg("grids"), nb::arg("cell"), nb::arg("spikes").noconvert(),
+          nb::arg("weight").noconvert(),
           "Adds each frame's spikes, moved by its grid of displacements (px), to `spikes`, and the number of sensor\n"
           "pixels that arrive at each place to `weight`, which has a pixel for every 4x4 of the sensor's.");
 }

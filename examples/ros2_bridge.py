@@ -43,6 +43,7 @@ def forward(address: str, make: RosMessages, send: Send, captures: int) -> None:
         connect(f"{address}/api/v1/events?topics=pose,preview,job", max_size=None) as events,
     ):
         print("connected", flush=True)
+        ended: set[str] = set()
         for message in map(json.loads, events):
             data = message["data"]
             at = round(datetime.fromisoformat(message["at"]).timestamp() * 1e9)
@@ -55,8 +56,8 @@ def forward(address: str, make: RosMessages, send: Send, captures: int) -> None:
             elif message["topic"] == "preview" and data["kind"] == "interval":
                 send("/camera/image_raw", at, make.image(at, CAMERA, picture(data)))
             elif message["topic"] == "job" and data["state"] in ("complete", "cancelled", "failed"):
-                captures -= 1
-                if captures == 0:
+                ended.add(data["id"])  # a job that has ended may be told of again, as when it is renamed
+                if len(ended) == captures:
                     return
 
 

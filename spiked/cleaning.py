@@ -123,7 +123,7 @@ class Cleaned:
 def clean(
     scene: Scene,
     path: Trajectory,
-    camera: Camera,
+    camera: Camera | None,
     box: Box | None = None,
     removal: FloaterRemoval | None = None,
     progress: Callable[[float], None] | None = None,
@@ -131,7 +131,8 @@ def clean(
 ) -> Cleaned:
     """The scene without what is outside of `box` or inside of `outline`, and without floaters if `removal` is given.
 
-    Raises ConfigurationError if nothing would be left.
+    Views of `camera` along `path` tell floaters; a box and an outline need neither. Raises ConfigurationError where
+    they are not known, and if nothing would be left.
     """
     kept = scene if box is None else scene.select(box.contains(scene))
     outside, outlined, floaters, shrunk = len(scene) - len(kept), 0, 0, 0
@@ -139,6 +140,8 @@ def clean(
         chosen = outline.contains(kept)
         outlined, kept = int(chosen.sum()), kept.select(~chosen)
     if removal is not None and len(kept):
+        if camera is None or not len(path):
+            raise ConfigurationError("the camera or the path of this scene is not known, so no view can tell floaters")
         rows = evenly(len(path), removal.views)
         chosen = removal.floaters(kept, _seen(kept, path, camera, rows, removal.least_px, progress), len(rows))
         floaters = int(chosen.sum())

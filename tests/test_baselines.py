@@ -119,6 +119,8 @@ def test_pictures_and_map_of_an_earlier_run_are_not_taken(room: Recording, tmp_p
 def test_a_map_is_fitted_to_given_poses(room: Recording, tmp_path: Path) -> None:
     out = tmp_path / "out"
     arguments = ["--poses", "given", "--images", "tfp", "--steps", "20"]
+    refused = CliRunner().invoke(app, ["baseline", str(room.path), "-o", str(out), *arguments, "--pictures-only"])
+    assert isinstance(refused.exception, ConfigurationError) and "is for COLMAP" in str(refused.exception)
     done = CliRunner().invoke(app, ["baseline", str(room.path), "-o", str(out), *arguments])
     assert done.exit_code == 0, done.output
     assert (out / "scene.ply").exists()

@@ -19,6 +19,7 @@ from spiked.datasets.pictures import picture_size
 from spiked.datasets.spikes import PICTURE_SUFFIXES, files_in, recorded_blocks, same_sensor, whole_frames
 from spiked.datasets.transforms import FILE
 from spiked.errors import DatasetError
+from spiked.natural_order import natural
 from spiked.recording import Recording, RecordingGeometry
 from spiked.recording.geometry import Assumable
 from spiked.sensor import Sensor
@@ -153,7 +154,8 @@ def _truth(scene: Path, middles: NDArray[np.float64], sensor: Sensor, pictures: 
     if not path.is_file():
         return Truth()
     content = Transforms.read(path)
-    poses = content.poses(path)[np.argsort([frame.file_path for frame in content.frames])]
+    order = sorted(range(len(content.frames)), key=lambda row: natural(content.frames[row].file_path))
+    poses = content.poses(path)[order]
     for what, count in (("poses in transforms.json", len(poses)), (f"pictures in {_SHARP}", len(pictures))):
         if count not in (0, len(middles)):
             raise DatasetError(f"{scene} has {len(middles)} clips and {count} {what}: a clip or a picture is missing")

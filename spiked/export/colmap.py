@@ -49,7 +49,7 @@ def write_pictures(source: ExportSource, folder: Path, options: ExportOptions) -
     tracks = find_tracks(pictures)
     (folder / "images").mkdir(exist_ok=True)
     for picture in pictures:
-        write_png(folder / "images" / picture.name, picture.pixels)
+        write_png(folder / "images" / picture.name, picture.colour())
     return pictures, tracks
 
 

@@ -35,6 +35,10 @@ class KeyPicture:
         """Of its file, within the folder of pictures."""
         return f"{self.view.time_s:.9f}.png"
 
+    def colour(self) -> NDArray[np.uint8]:
+        """RGB [H, W, 3], three equal channels of a grey picture: loaders of COLMAP folders take the first three."""
+        return self.pixels if self.pixels.ndim == 3 else np.repeat(self.pixels[..., None], 3, axis=2)
+
     def grey(self) -> NDArray[np.uint8]:
         """[H, W]."""
         return self.pixels if self.pixels.ndim == 2 else np.asarray(np.rint(self.pixels.mean(-1)), np.uint8)

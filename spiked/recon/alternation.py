@@ -37,6 +37,8 @@ class _Kind(Enum):
     """Choose key frames."""
 
 
+_STEPS = _Kind.SCENE, _Kind.POSE
+"""Kinds that count as steps."""
 _Action = tuple[_Kind, int]
 """What is done, and how many steps of it."""
 
@@ -87,7 +89,7 @@ class Alternator:
         if self._plan is None:
             self._plan = self._begin(most_steps)
         plan, progress, reported = self._plan, self._progress, self._progress.done
-        total = sum(count for kind, count in plan if kind in (_Kind.SCENE, _Kind.POSE))
+        total = sum(count for kind, count in plan if kind in _STEPS)
         for share in progress.shares(total, deadline, cancelled, save):
             self._act(*plan[self._next], share)
             self._next += 1
@@ -120,8 +122,9 @@ class Alternator:
         self._use(self._used)
         if steps == 0:
             return []
-        growth = int(self._options.growth_share * steps)
-        return [*self._growth(len(ids) - 1, growth), (_Kind.WHOLE, 0), *self._epochs(steps - growth)]
+        growth = self._growth(len(ids) - 1, int(self._options.growth_share * steps))
+        taken = sum(count for kind, count in growth if kind in _STEPS)
+        return [*growth, (_Kind.WHOLE, 0), *self._epochs(max(steps - taken, 0))]
 
     def _growth(self, views: int, steps: int) -> list[_Action]:
         """Add this many views within `steps`, each with `LEAST_STEPS` at least."""

@@ -25,7 +25,7 @@ class NoiseOptions(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     electrons_a_spike: float = Field(default=_REAL.electrons_a_spike, ge=1, le=1e12)
-    """Photo-electrons of one spike; shot noise is Poisson in electrons (Eq 13, 14)."""
+    """Photo-electrons of one spike; shot noise is normal with the variance of a Poisson law (Eq 13, 14)."""
     temperature_k: float = Field(default=300.0, ge=0, le=1000)
     """Absolute temperature in kelvin, of the thermal noise of a reset, sqrt(k T / C) (Eq 16); dark current is apart."""
     swing_v: float = Field(default=1.0, ge=0.01, le=100)

@@ -1,5 +1,6 @@
 """Every layout of spikes gives the frames that were written into it, and so the same trajectory."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from spiked.recon import Options, Reconstructor
 from spiked.recording import RecordingWriter, open_recording
 from spiked.sensor import Mosaic, Response, Sensor
 
-from .layouts import LAYOUTS, Source, numbered, wision
+from .layouts import LAYOUTS, Source, numbered, usp_gaussian, wision
 
 References = dict[tuple[int, tuple[int, int]], str]
 
@@ -138,6 +139,26 @@ def test_hot_pixels_are_left_out(source: Source, tmp_path: Path) -> None:
     recording = clip.write(tmp_path / "made", "wision")
     np.testing.assert_array_equal(Calibration.read(recording.parent / "calibration.npz").dead, masks.any(0))
     assert clip.sensor.response is Response.BERNOULLI and clip.sensor.frame_rate_hz == 20_000
+
+
+@pytest.mark.parametrize(("name", "masks"), [("photoncube", False), ("shot1", False), ("hot_pixels", True)])
+def test_masks_are_known_by_whole_words(tmp_path: Path, name: str, masks: bool) -> None:
+    np.save(tmp_path / f"{name}.npy", np.zeros((20, 256, 64), np.uint8))
+    assert find_kind("wision").recognises(tmp_path) is not masks
+
+
+def test_poses_are_those_of_clips_whose_names_are_not_padded(source: Source, tmp_path: Path) -> None:
+    usp_gaussian(tmp_path / "set", source)
+    scene = next(path.parent for path in tmp_path.rglob("transforms.json"))
+    content = json.loads((scene / "transforms.json").read_text())
+    before = find_kind("usp-gaussian").open(tmp_path / "set").items[0].truth.path
+    assert before is not None and len(before) >= 3
+    for number, frame in enumerate(sorted(content["frames"], key=lambda one: one["file_path"]), 9):
+        frame["file_path"] = f"{number}.png"
+    content["frames"].reverse()
+    (scene / "transforms.json").write_text(json.dumps(content))
+    after = find_kind("usp-gaussian").open(tmp_path / "set").items[0].truth.path
+    np.testing.assert_array_equal(after.centres, before.centres)
 
 
 def test_a_label_of_spikecv_states_the_mosaic(source: Source, tmp_path: Path) -> None:

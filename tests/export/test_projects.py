@@ -34,7 +34,7 @@ def test_pycolmap_projects_points_to_the_pixels_where_pictures_show_them(source:
         row = int(np.argmin(np.abs(source.path.times_s - float(image.name.removesuffix(".png")))))
         rotation, centre = source.path.rotations[row], source.path.centres[row]
         pixels = cv2.imread(str(project / "images" / image.name), cv2.IMREAD_UNCHANGED)
-        assert pixels.shape == (160, 240) and pixels.std() > 10
+        assert pixels.shape == (160, 240, 3) and pixels.std() > 10 and not np.ptp(pixels, axis=2).any()
         for point in image.get_observation_points2D():
             position = model.points3D[point.point3D_id].xyz
             theirs = image.project_point(position)

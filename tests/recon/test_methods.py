@@ -118,6 +118,11 @@ def test_the_method_of_the_paper_runs_without_tracks_and_poses(room: Room) -> No
     assert made.trainer.loss is LossName.ACCUMULATION_BINOMIAL
 
 
+def test_steps_that_add_views_are_taken_from_those_asked_for(room: Room) -> None:
+    made = room.reconstruct(Options(steps=80, method=MethodName.NOPE_SGS))
+    assert 40 < made.trainer.mapper.steps < 60
+
+
 def test_its_first_view_is_fitted_before_any_other(room: Room) -> None:
     """Flat, by the interval loss; then one view after the other at constant velocity."""
     made = room.reconstruct(Options(steps=0, method=MethodName.NOPE_SGS))

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -107,6 +108,11 @@ def test_a_run_scores_writes_a_table_and_keeps_what_is_finished(streams: Path, t
     again = spiked(*command)
     assert again.output.count("finished before") == 2
     assert (out / "results" / "classB__train" / "report.json").stat().st_mtime_ns == before
+    retried = spiked(*command, "--retry")
+    assert retried.output.count("finished before") == 1 and "classB/wheel: finished" not in retried.output
+    os.utime(streams / "classB" / "train.dat")
+    changed = spiked(*command)
+    assert "classB/wheel: finished before" in changed.output and "classB/train: finished" not in changed.output
     other = spiked("run", "recvidarreal", streams, "-o", out, "--steps", "1")
     assert isinstance(other.exception, SpikedError) and "give the same ones to go on" in str(other.exception)
 

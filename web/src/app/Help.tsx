@@ -67,7 +67,8 @@ export function Help({ open, onClose }: { open: boolean; onClose: () => void }):
         ))}
       </dl>
       <p>
-        <a href="docs/guide">Documentation</a> · <a href="docs">API documentation</a>
+        <a href="docs/guide">Documentation</a> · <a href="docs/guide/glossary/">Glossary</a> ·{" "}
+        <a href="docs/guide/troubleshooting/">Troubleshooting by symptom</a> · <a href="docs">API documentation</a>
       </p>
     </dialog>
   );

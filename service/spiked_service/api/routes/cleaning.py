@@ -6,7 +6,6 @@ from fastapi import APIRouter
 from fastapi.routing import APIRoute
 
 from spiked.cleaning import FloaterRemoval, clean
-from spiked.errors import ConfigurationError
 from spiked.scene import Scene
 from spiked_service.api.idempotency import IdempotencyKey
 from spiked_service.api.problems import problems
@@ -34,14 +33,11 @@ def cleaning_routes(rows: ReconstructionRepository, results: Results, route_clas
         `:revert` undoes it.
         """
         result = results.of(rows.get(reconstruction_id), body.version)
-        camera, path = result.camera, result.path(_POSES)
-        if camera is None or not len(path):
-            raise ConfigurationError("the camera or the path of this scene is not known, so no view can tell floaters")
         with results.downloads():
             found = clean(
                 Scene.read_ply(result.scene),
-                path,
-                camera,
+                result.path(_POSES),
+                result.camera,
                 None if body.box is None else body.box.box(),
                 FloaterRemoval(shrink=body.shrink) if body.floaters else None,
                 outline=None if body.outline is None else body.outline.outline(),

@@ -7,11 +7,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from spiked.baselines import ImageKind, PictureOptions, SpikePicture, interpolated, run_colmap, spike_pictures
 from spiked.baselines.pictures import bin_pixels, picture_intrinsics
-from spiked.errors import SpikedError
+from spiked.errors import ConfigurationError, SpikedError
 from spiked.recon import LossName, MapOptions, Options, Reconstructor
 from spiked.recording import Recording
 from spiked.trajectory import Trajectory
@@ -118,7 +119,7 @@ def baseline(
         bool,
         typer.Option(
             "--all-frames/--pictures-only",
-            help="Interpolate poses of the frames between COLMAP's pictures, or write those of the pictures alone.",
+            help="Interpolate poses of the frames between COLMAP's pictures, or write one frame of each picture alone.",
         ),
     ] = True,
     *,
@@ -151,7 +152,7 @@ def baseline(
     recording = replace(recording, sensor=optics.of(recording.sensor))
     options = made.options()
     if poses is PoseSource.GIVEN:
-        posed = _Posed(Trajectory.read_tum(given or file.parent / TRUTH), {})
+        posed = _given(given or file.parent / TRUTH, all_frames=all_frames)
     else:
         posed = _by_colmap(recording, options, out, (fit.threads, fit.seed), all_frames=all_frames)
     report: dict[str, Any] = {"images": made.images, "poses": poses, "map": map, **posed.report}
@@ -161,6 +162,12 @@ def baseline(
         return
     chosen = fit.options(options, recording, posed.trajectory)
     _map(recording, Reconstructor(recording.sensor, chosen, recording=recording), out, report)
+
+
+def _given(path: Path, *, all_frames: bool) -> _Posed:
+    if not all_frames:
+        raise ConfigurationError("--pictures-only is for COLMAP's poses: leave it out with --poses given")
+    return _Posed(Trajectory.read_tum(path), {})
 
 
 def _window(options: PictureOptions, recording: Recording) -> int:
@@ -186,10 +193,13 @@ def _by_colmap(
     with outputs.writing("--out", out):
         found = run_colmap(made, intrinsics, out / "colmap", threads=threads, seed=seed)
     poses, rate_hz = (found.rotations, found.centres), recording.sensor.frame_rate_hz
-    if all_frames:
-        path = interpolated(found.times, poses, frames=recording.frames, frame_rate_hz=rate_hz)
-    else:
-        path = Trajectory(found.times / rate_hz, *poses)
+    path = interpolated(found.times, poses, frames=recording.frames, frame_rate_hz=rate_hz)
+    if (
+        not all_frames
+    ):  # of a picture of an even number of frames: half a frame after its middle, where the truth has a pose
+        frames = np.floor(path.times_s * rate_hz)
+        seen = np.isin(frames, np.floor(found.times))
+        path = Trajectory(path.times_s[seen], path.rotations[seen], path.centres[seen])
     if found.models > 1:
         report_warning(f"COLMAP made {found.models} models that it could not join; the largest one is taken")
     return _Posed(

@@ -113,12 +113,14 @@ def run(
     keep_recordings: Annotated[
         bool, typer.Option("--keep-recordings", help="Keep recordings that were converted or simulated.")
     ] = False,
+    retry: Annotated[bool, typer.Option("--retry", help="Reconstruct again what failed before.")] = False,
 ) -> None:
     """Reconstruct every recording of a data set and score what truth there is.
 
     All further options go to `spiked reconstruct`. OUT has table.md and table.csv, a folder of results for each
     recording, and NAME.zip to share: tables, reports, pictures, trajectories and versions, without recordings and
-    scenes. A run that was killed goes on if the same command is given again; finished recordings are kept.
+    scenes. A run that was killed goes on if the same command is given again; finished recordings are kept, unless a
+    file of theirs has changed.
 
     Exits with 1 if a recording could not be reconstructed.
 
@@ -133,7 +135,7 @@ def run(
     for item in dataset.items:
         for note in item.notes if isinstance(item, Clip) else ():
             report_warning(note)
-    work = DatasetRun(kind, dataset, out, list(context.args), shlex.split(simulate), keep_recordings, _say)
+    work = DatasetRun(kind, dataset, out, list(context.args), shlex.split(simulate), keep_recordings, retry, _say)
     work.begin()
     try:
         with outputs.alone("--out", out, "run of a data set"):

@@ -1,9 +1,10 @@
 """Reconstructs every recording of a data set. What is finished is kept: a run that was killed goes on."""
 
 import json
+import shlex
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,6 +25,8 @@ from spiked_service.cli.dataset_runs.table import Row, Table, write_zip
 
 _DONE = "done.json"
 """In the folder of a result: its row, written when all else is."""
+COMPLETE = "complete"
+"""Outcome of a recording that was reconstructed."""
 _USAGE = 2
 """Exit status for options or files that cannot be used."""
 
@@ -53,6 +56,8 @@ class DatasetRun:
     simulation: list[str]
     """For `spiked simulate`, of scenes of pictures."""
     keep_recordings: bool
+    retry: bool
+    """Reconstruct again what failed before."""
     show: Callable[[str], None]
     _rows: list[Row] = field(default_factory=list)
 
@@ -90,8 +95,8 @@ class DatasetRun:
             shutil.rmtree(left)  # of a run that was killed
         for number, item in enumerate(items, 1):
             folder = self.out / "results" / _folder_name(item.name)
-            done = _finished(folder)
-            if done is not None:
+            done = _finished(folder, self._files(item))
+            if done is not None and not (self.retry and done.outcome != COMPLETE):
                 self.show(f"[{number}/{len(items)}] {item.name}: finished before")
             else:
                 self.show(f"[{number}/{len(items)}] {item.name}")
@@ -99,8 +104,13 @@ class DatasetRun:
             self._rows.append(done)
         return self._write()
 
+    def _files(self, item: Clip | PictureScene) -> tuple[Path, ...]:
+        """What an item is made of."""
+        return item.files if isinstance(item, Clip) else (*item.pictures, *item.described_by)
+
     def _write(self) -> Table:
-        table = Table(self.kind, self.options, self._rows)
+        said = ["--simulate", shlex.quote(shlex.join(self.simulation))] if self.simulation else []
+        table = Table(self.kind, [*said, *self.options], self._rows)
         results = {_folder_name(row.name): self.out / "results" / _folder_name(row.name) for row in self._rows}
         with outputs.writing("--out", self.out):
             write_atomically(self.out / "table.md", table.markdown().encode())
@@ -145,7 +155,7 @@ class DatasetRun:
         return next(place.glob("*.dat"))
 
     def _simulate(self, scene: PictureScene, part: Path, log: Path) -> None:
-        pictures = part.with_suffix(".pictures")
+        pictures = part.with_name(f"{part.name}.pictures")
         arguments = simulation_arguments(scene, pictures, part, "simulated", self.simulation)
         status = self._run(arguments, log)
         if status != 0:
@@ -173,7 +183,7 @@ class DatasetRun:
         figures = {"frames": float(frames), "poses": float(poses), "seconds": seconds, **score(result, recording, log)}
         (result / "score.json").write_text(json.dumps(figures, indent=1), "utf-8")
         notes += json.loads(report.read_text("utf-8")).get("warnings", [])
-        return Row(name=item.name, outcome="complete", figures=figures, notes=notes)
+        return Row(name=item.name, outcome=COMPLETE, figures=figures, notes=notes)
 
     def _run(self, arguments: list[str], log: Path) -> int:
         status = run_spiked(arguments, log, lambda line: self.show(f"    {line}"))
@@ -194,9 +204,16 @@ def _folder_name(name: str) -> str:
     return name.replace("/", "__")
 
 
-def _finished(folder: Path) -> Row | None:
+def _finished(folder: Path, files: Iterable[Path]) -> Row | None:
+    """The row of before, unless a file has changed since."""
+    path = folder / _DONE
     try:
-        return Row.model_validate_json((folder / _DONE).read_bytes())
+        written = path.stat().st_mtime_ns
+        return (
+            None
+            if any(one.stat().st_mtime_ns > written for one in files)
+            else Row.model_validate_json(path.read_bytes())
+        )
     except (OSError, ValidationError):
         return None
 

@@ -55,19 +55,19 @@ interface Selection {
   onNone: () => void;
 }
 
-/** Whether a change is under way, and what makes one of all chosen captures, one after the other. */
+/** Whether a change is under way, and what makes one of all chosen captures in turn; it tells those that were changed. */
 function useEach(
   chosen: readonly Capture[],
   onDone: () => void,
-): [boolean, (change: (capture: Capture) => Promise<unknown>) => Promise<void>] {
+): [boolean, (change: (capture: Capture) => Promise<unknown>) => Promise<Capture[]>] {
   const [busy, setBusy] = useState(false);
-  const each = async (change: (capture: Capture) => Promise<unknown>): Promise<void> => {
+  const each = async (change: (capture: Capture) => Promise<unknown>): Promise<Capture[]> => {
+    const changed: Capture[] = [];
     setBusy(true);
-    await attempt(async () => {
-      for (const one of chosen) await change(one);
-    });
+    for (const one of chosen) if (await attempt(() => change(one))) changed.push(one);
     setBusy(false);
     onDone();
+    return changed;
   };
   return [busy, each];
 }
@@ -75,16 +75,18 @@ function useEach(
 export function SelectionBar({ chosen, onDone, onNone }: Selection): JSX.Element {
   const [busy, each] = useEach(chosen, onDone);
   const remove = async (): Promise<void> => {
-    const before = [...chosen];
-    await each(async (one) => {
+    const removed = await each(async (one) => {
       await calls.removeCapture(one.id);
       removeFromStore(one.id);
     });
     const undo = async (): Promise<void> => {
-      for (const one of before) storeCapture(await calls.restoreCapture(one.id));
+      for (const one of removed) storeCapture(await calls.restoreCapture(one.id));
       onDone();
     };
-    toast(`Deleted ${before.length} captures`, { action: { label: "Undo", run: () => void attempt(undo) } });
+    if (removed.length === 0) return;
+    toast(`Deleted ${removed.length} ${removed.length === 1 ? "capture" : "captures"}`, {
+      action: { label: "Undo", run: () => void attempt(undo) },
+    });
   };
   const recorded = chosen.filter((one) => one.recording !== null);
   const jobs = useService((state) => state.reconstructions);

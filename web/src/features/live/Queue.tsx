@@ -1,4 +1,4 @@
-/** Running and queued reconstructions of all captures. */
+/** Running and queued reconstructions of all captures; that of the capture shown, while it is recorded, is elsewhere on the page. */
 
 import type { JSX } from "react";
 
@@ -16,7 +16,7 @@ import { JobBadge, Panel } from "../../shared/ui/parts";
 export function Queue({ shown }: { shown: string | null }): JSX.Element | null {
   const all = useService((state) => state.reconstructions);
   const jobs = activeJobs(all);
-  if (jobs.every((job) => job.capture_id === shown)) return null;
+  if (jobs.every((job) => job.live && job.capture_id === shown)) return null;
   return (
     <Panel title="Reconstructions under way" aside={<NotifySwitch />}>
       <ol className="queue">

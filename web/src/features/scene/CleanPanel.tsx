@@ -9,7 +9,7 @@ import { count } from "../../shared/state/format";
 import { isEnded } from "../../shared/state/store";
 import { toast } from "../../shared/state/toasts";
 import { ActionButton } from "../../shared/ui/access";
-import { type Box, cut, NO_CUT, SIDES } from "./cropBox";
+import { type Box, cut, NO_CUT, opened, SIDES } from "./cropBox";
 import { LassoTool } from "./LassoTool";
 import type { Viewer } from "./Viewer";
 
@@ -106,7 +106,7 @@ function Cleaning({ viewer, job, newest, free, whole }: CleanProps & { viewer: V
                 version: job.version,
                 floaters: false,
                 shrink: false,
-                box: boxOf(box),
+                box: boxOf(opened(box, shares)),
                 outline: null,
               }),
             (found) => `Removed ${count(found.outside)} splats outside of the box`,

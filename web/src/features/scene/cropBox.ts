@@ -13,6 +13,17 @@ export const SIDES = ["left", "right", "top", "bottom", "near", "far"] as const;
 export const NO_CUT: readonly number[] = SIDES.map(() => 0);
 /** Share of each side that stays at least. */
 const LEAST = 0.02;
+/** Beyond every splat. */
+const FAR = 1e9;
+
+/** `box` without the sides that nothing is cut from: there may be splats beyond those that were loaded. */
+export function opened(box: Box, shares: readonly number[]): Box {
+  const side = (to: readonly number[], first: number, sign: number): [number, number, number] => {
+    const [x, y, z] = to.map((value, k) => ((shares[2 * k + first] ?? 0) > 0 ? value : sign * FAR));
+    return [x ?? 0, y ?? 0, z ?? 0];
+  };
+  return { low: side(box.low, 0, -1), high: side(box.high, 1, 1) };
+}
 
 /** The box without a share of it at each side. */
 export function cut(bounds: Box, shares: readonly number[]): Box {

@@ -50,6 +50,9 @@ it("keeps older and removed captures, and what messages told meanwhile, when it 
   vi.spyOn(calls, "captures").mockReturnValue(page.promise);
   vi.spyOn(calls, "unfinished").mockReturnValue(open.promise);
   vi.spyOn(calls, "reconstructions").mockResolvedValue([]);
+  vi.spyOn(calls, "reconstruction").mockImplementation((id) =>
+    Promise.resolve({ ...job(id, "e", 1), state: "failed" } as Reconstruction),
+  );
   const removed = capture("d", { deleted_at: "2026-11-21T00:00:00Z" });
   const [ends, fails] = [job("x", "e", 1), job("y", "e", 1)];
   useService.setState({
@@ -69,6 +72,7 @@ it("keeps older and removed captures, and what messages told meanwhile, when it 
   expect(Object.values(reconstructions).map((one) => [one.id, one.state])).toEqual([
     ["x", "complete"],
     ["z", "queued"],
+    ["y", "failed"], // its message was missed
   ]);
   vi.restoreAllMocks();
 });

@@ -229,6 +229,7 @@ export async function refresh(): Promise<void> {
       calls.unfinished(),
     ]);
     // The list ends there: what is older, or removed, is not in it.
+    const before = get().reconstructions;
     const oldest = captures.next_cursor === null ? "" : (captures.items.at(-1)?.id ?? "");
     set((state) => ({
       devices: devices.map((one) => (isNewer(one.id, asked) && state.devices.find(({ id }) => id === one.id)) || one),
@@ -239,9 +240,23 @@ export async function refresh(): Promise<void> {
     }));
     const newest = newestCapture(get().captures);
     if (newest !== null) await loadReconstructions(newest.id);
+    await tellEnds(Object.values(before).filter((job) => !isEnded(job)));
   } catch (error) {
     set({ connectionError: errorText(error) });
   }
+}
+
+/** Of jobs that were under way and are no longer listed as such, their messages were missed: ask how they ended. */
+async function tellEnds(before: Reconstruction[]): Promise<void> {
+  for (const job of before)
+    if (get().reconstructions[job.id] === undefined)
+      await calls.reconstruction(job.id).then(
+        (now) => {
+          notifyOfEnd(job, now);
+          set((state) => ({ reconstructions: { ...state.reconstructions, [now.id]: now } }));
+        },
+        () => undefined, // it was deleted meanwhile, or the service is out of reach again
+      );
 }
 
 export async function loadReconstructions(captureId: string): Promise<void> {

@@ -4,7 +4,7 @@ import { type JSX, type SubmitEvent, useState } from "react";
 
 import type { OptionSchema, OptionValues } from "../api/types";
 import { ActionButton } from "./access";
-import { fieldsOf, OptionInput, textOf, valuesOf } from "./options";
+import { fieldsOf, OptionInput, textOf, valuesOf, withoutField } from "./options";
 import { Markup } from "./parts";
 
 export function OptionsForm({
@@ -28,16 +28,17 @@ export function OptionsForm({
   const [texts, setTexts] = useState<Record<string, string>>(() =>
     Object.fromEntries(fields.map((field) => [field.key, textOf(initial[field.key] ?? field.initial)])),
   );
+  const hidden = withoutField(fields, initial);
   const [busy, setBusy] = useState(false);
   const change = (key: string, text: string): void => {
     const now = { ...texts, [key]: text };
     setTexts(now);
-    onChange?.(valuesOf(fields, now));
+    onChange?.({ ...hidden, ...valuesOf(fields, now) });
   };
   const submit = (event: SubmitEvent): void => {
     event.preventDefault();
     setBusy(true);
-    void onSubmit(valuesOf(fields, texts)).finally(() => setBusy(false));
+    void onSubmit({ ...hidden, ...valuesOf(fields, texts) }).finally(() => setBusy(false));
   };
   return (
     <form className="options" onSubmit={submit}>

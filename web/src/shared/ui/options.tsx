@@ -52,6 +52,12 @@ export function fieldsOf(schema: OptionSchema): Field[] {
   });
 }
 
+/** Values that no field shows: they stay as they are. */
+export const withoutField = (fields: readonly Field[], values: OptionValues): OptionValues =>
+  Object.fromEntries(
+    Object.entries(values).filter(([key, value]) => value !== null && !fields.some((field) => field.key === key)),
+  );
+
 /** Values for the service, from the texts of the inputs; defaults are left out. */
 export function valuesOf(fields: readonly Field[], texts: Record<string, string>): OptionValues {
   const values: OptionValues = {};

@@ -194,9 +194,7 @@ def _by_colmap(
         found = run_colmap(made, intrinsics, out / "colmap", threads=threads, seed=seed)
     poses, rate_hz = (found.rotations, found.centres), recording.sensor.frame_rate_hz
     path = interpolated(found.times, poses, frames=recording.frames, frame_rate_hz=rate_hz)
-    if (
-        not all_frames
-    ):  # of a picture of an even number of frames: half a frame after its middle, where the truth has a pose
+    if not all_frames:  # the middle of an even number of frames lies between two, where a truth has no pose
         frames = np.floor(path.times_s * rate_hz)
         seen = np.isin(frames, np.floor(found.times))
         path = Trajectory(path.times_s[seen], path.rotations[seen], path.centres[seen])

@@ -20,8 +20,6 @@ def test_queued_ones_are_moved_held_named_and_cancelled(
     ids = [one.http.post("reconstructions", json=job).json()["id"] for _ in range(4)]
     for which, number in zip(ids, ("first", "second", "third", "fourth"), strict=True):
         one.http.patch(f"reconstructions/{which}", json={"name": number})
-    other = {"source": SOURCE, "frames": 64, "name": "another", "reconstruct": False}
-    one.http.post("captures", json=other)
     page = visit(one.address)
 
     def names() -> list[str]:
@@ -35,7 +33,7 @@ def test_queued_ones_are_moved_held_named_and_cancelled(
     page.get_by_role("button", name="Later: the reconstruction of second").click()
     until(lambda: names() == ["first", "fourth", "second", "third"], "it has moved down")
     page.get_by_role("button", name="Hold the reconstruction of fourth").click()
-    page.get_by_text("held: others go before it").wait_for()
+    page.locator("ol.queue").get_by_text("held: others go before it").wait_for()
     assert one.http.get(f"reconstructions/{ids[3]}").json()["held"]
     assert violations(page) == []
     page.locator("ol.queue").scroll_into_view_if_needed()
@@ -47,7 +45,7 @@ def test_queued_ones_are_moved_held_named_and_cancelled(
     until(lambda: not one.http.get(f"reconstructions/{ids[3]}").json()["held"], "let go")
     until(lambda: one.http.get(f"reconstructions/{ids[2]}").json()["progress"] > 0.001, "it refines")
     page.get_by_role("button", name="Pause the reconstruction of third").click()
-    page.get_by_text("it goes on from there when it is let go").wait_for()
+    page.locator("ol.queue").get_by_text("it goes on from there when it is let go").wait_for()
     until(lambda: one.http.get(f"reconstructions/{ids[3]}").json()["state"] == "running", "the fourth instead")
     keep(page, pictures_folder / "queue-paused.webp")
 

@@ -7,7 +7,7 @@ losses: maps fitted to given poses with each loss, for equal steps, and then for
 poses:  a map fitted to the true poses of living is kept; a path disturbed by 0.2 degrees and 0.5 % is corrected by the
         pose gradient of the paper and by our alignment.
 depths: the paper's method from a first view that is flat, or at the depth of --scene, a PLY with the unit and frame of
-        the truth of living, with noise of a share of the depth.
+        the truth, with noise of a share of the depth. Without a PLY it is the depth of our map on the true path.
 paths:  no poses are given: the paper's method as it is and with parts of ours, beside ours.
 
 STREAMS_DIR holds folders as `spiked simulate` writes them (NAME.dat, sidecar, groundtruth.tum, views.json, views/). The
@@ -18,7 +18,7 @@ import argparse
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -177,13 +177,14 @@ def paths(streams: list[Stream], steps: int, seeds: int, window_frames: int | No
                 yield row | {"loss": made.trainer.mapper.loss, "steps": made.trainer.mapper.steps, "s": made.work_s}
 
 
-def depths(stream: Stream, scene: Path, steps: int, seeds: int) -> Iterator[dict[str, Any]]:
+def depths(stream: Stream, ply: Path | None, steps: int, seeds: int) -> Iterator[dict[str, Any]]:
     """The path that grows with its map, from first views of several qualities."""
     sensor, truth = stream.recording.sensor, stream.truth
     assert sensor.intrinsics is not None
     rasteriser = rasteriser_for(Camera(sensor.intrinsics, sensor.width, sensor.height))
     at = truth.rotations[FIRST_VIEW_FRAME][None], truth.centres[FIRST_VIEW_FRAME][None]
-    depth = rasteriser.forward(Scene.read_ply(scene), *at).depth.astype(np.float64)
+    scene = Scene.read_ply(ply) if ply else replace(stream, frames=None).reconstruct(Options(poses=truth)).scene()
+    depth = rasteriser.forward(scene, *at).depth.astype(np.float64)
     noise = np.random.default_rng(0).normal(size=depth.shape)
     chosen = {"flat": None, **{f"true, noise {share:.0%}": depth * np.exp(share * noise) for share in (0.0, 0.1, 0.3)}}
     for name, given in chosen.items():
@@ -211,7 +212,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="of the table paths")
     parser.add_argument("--window-frames", type=int, help="of a view, not of losses; default: by the motion")
     parser.add_argument("--frames", type=int, help="first frames of each recording; default: all")
-    parser.add_argument("--scene", type=Path, help="of the table depths")
+    parser.add_argument("--scene", type=Path, help="of the table depths; default: our map")
     parser.add_argument("--json", type=Path, help="file for the rows")
     options = parser.parse_args()
     if options.row:

@@ -20,6 +20,7 @@ import pytest
 from rich.console import Console
 from spiked_service.cli.commands.reconstruct import ProgressDisplay, reconstruct
 from spiked_service.cli.commands.simulate import show_progress
+from spiked_service.cli.dataset_runs.scores import notes
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 
 from spiked.recon import Options, State, Status
@@ -187,6 +188,12 @@ def test_reconstruct_with_known_poses_writes_all_results(room: Path, tmp_path: P
     scored = run("evaluate", tmp_path, "--recording", bare / "room.dat")
     assert scored.returncode == 0 and scored.stderr == "", scored.stderr
     assert "ate_percent" in scored.stdout and "psnr" not in scored.stdout
+    (bare / "views").symlink_to(room / "views")
+    seen = json.loads((room / "views.json").read_text()) | {"held_out": False}
+    (bare / "views.json").write_text(json.dumps(seen))
+    scored = run("evaluate", tmp_path, "--recording", bare / "room.dat")
+    assert scored.returncode == 0 and "made of the scored pictures" in scored.stderr and "psnr_db" in scored.stdout
+    assert "made of" in notes(bare / "room.dat")[0] and notes(room / "room.dat") == []
 
 
 def test_a_recording_without_a_path_in_it_says_why_and_exits_with_1(tmp_path: Path) -> None:

@@ -205,6 +205,7 @@ def test_spikes_made_of_a_scene_of_pictures_are_reconstructed(
     write_colmap(scene / "sparse" / "0", names, path.matrices(), source)
     given = ("--simulate", "--picture-rate 5000 --gamma linear")
     out = tmp_path / "out"
+    (out / "recordings" / "room.part.pictures").mkdir(parents=True)  # of a run that was killed
     done = spiked("run", "tanks-and-temples", tmp_path / "tanks", "-o", out, *given, "--steps", "200")
     assert done.exit_code == 0, f"{done.output} {done.exception}"
     with (out / "table.csv").open() as file:

@@ -286,6 +286,26 @@ def test_a_recording_is_reconstructed_again_with_other_options(service: Any, don
     assert gone.value.status == 404
 
 
+def test_parts_of_the_paper_s_method_are_options(service: Any, done: CaptureOut) -> None:
+    options = {
+        "method": "nope-sgs",
+        "initialisation": "tracks",
+        "loss": "charge",
+        "pose_step": "alignment",
+        "steps": 30,
+    }
+    answer = service.http.post("reconstructions", json={"capture_id": done.id, "options": options})
+    assert answer.status_code == 202, answer.text
+    over = service.client.wait_for_reconstruction(answer.json()["id"], 120)
+    assert over.state == "complete", over.reason
+    with zipfile.ZipFile(io.BytesIO(service.http.get(f"reconstructions/{over.id}/bundle").content)) as bundle:
+        report = json.loads(bundle.read(next(name for name in bundle.namelist() if name.endswith("/report.json"))))
+    assert {name: report["options"][name] for name in options} == options
+    wrong = service.http.post("reconstructions", json={"capture_id": done.id, "options": {"loss": "photons"}})
+    assert wrong.status_code == 422 and "accumulation" in wrong.json()["detail"]
+    service.client.remove_reconstruction(over.id)
+
+
 def test_cancel_and_restart(service: Any, done: CaptureOut) -> None:
     client = service.client
     started = client.start_reconstruction(done.id, options=ReconstructionOptions(steps=100_000))

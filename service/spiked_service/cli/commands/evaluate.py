@@ -21,7 +21,7 @@ from spiked.scene import Scene
 from spiked.trajectory import Trajectory
 from spiked.whole_files import whole_folder, write_atomically
 from spiked_service.cli import outputs
-from spiked_service.cli.console import output
+from spiked_service.cli.console import output, report_warning
 
 _LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)  # the weights by which the truth's grey pictures were made
 
@@ -116,6 +116,11 @@ def _score_views(
     files = [view.lens_file if through_lens else view.file for view in held_out.views]
     if not files or None in files:
         return None
+    if not held_out.held_out and not through_lens:
+        report_warning(
+            "the recording was made of the scored pictures, too: PSNR, SSIM and LPIPS say how well they are "
+            "reproduced, not how good views between them are"
+        )
     similarity = similarity_of_trajectories(truth=paths[0], estimate=paths[1], frame_rate_hz=sensor.frame_rate_hz)
     matrices = [np.array(view.c2w) for view in held_out.views]
     poses = [similarity.poses(matrix[:3, :3], matrix[:3, 3]) for matrix in matrices]
@@ -151,6 +156,8 @@ class _View(BaseModel):
 class _Views(BaseModel):
     median_depth: float
     views: list[_View]
+    held_out: bool = True
+    """False: the recording was made of these pictures, too."""
 
 
 def _read_views(path: Path) -> _Views:

@@ -20,7 +20,7 @@ from spiked_service.cli.commands.reconstruct import reconstruct
 from spiked_service.cli.commands.simulate import simulate
 from spiked_service.cli.dataset_runs.children import INTERRUPTED, run_spiked
 from spiked_service.cli.dataset_runs.pictures import simulation_arguments
-from spiked_service.cli.dataset_runs.scores import score
+from spiked_service.cli.dataset_runs.scores import notes, score
 from spiked_service.cli.dataset_runs.table import Row, Table, write_zip
 
 _DONE = "done.json"
@@ -172,18 +172,18 @@ class DatasetRun:
         seconds = time.monotonic() - begin
         if status == _USAGE:
             raise ConfigurationError(f"{item.name}: {_last_error(log)}; see {log}")
-        notes = list(item.notes) if isinstance(item, Clip) else []
+        said = [*(item.notes if isinstance(item, Clip) else ()), *notes(recording)]
         frames = open_recording(recording).frames
         report = result / "report.json"
         if status != 0 or not report.is_file():
             return Row(
-                name=item.name, outcome=_last_error(log) or "failed", figures={"frames": float(frames)}, notes=notes
+                name=item.name, outcome=_last_error(log) or "failed", figures={"frames": float(frames)}, notes=said
             )
         poses = sum(not line.startswith("#") for line in (result / "trajectory.tum").open(encoding="utf-8"))
         figures = {"frames": float(frames), "poses": float(poses), "seconds": seconds, **score(result, recording, log)}
         (result / "score.json").write_text(json.dumps(figures, indent=1), "utf-8")
-        notes += json.loads(report.read_text("utf-8")).get("warnings", [])
-        return Row(name=item.name, outcome=COMPLETE, figures=figures, notes=notes)
+        said += json.loads(report.read_text("utf-8")).get("warnings", [])
+        return Row(name=item.name, outcome=COMPLETE, figures=figures, notes=said)
 
     def _run(self, arguments: list[str], log: Path) -> int:
         status = run_spiked(arguments, log, lambda line: self.show(f"    {line}"))

@@ -33,6 +33,15 @@ def score(result: Path, recording: Path, log: Path) -> dict[str, float]:
     return figures
 
 
+def notes(recording: Path) -> list[str]:
+    """What a reader of the scores of pictures has to know."""
+    try:
+        held_out = json.loads((recording.parent / "views.json").read_text("utf-8")).get("held_out", True)
+    except OSError:
+        return []
+    return [] if held_out else ["scored on pictures that the spikes were made of: too far apart to leave some aside"]
+
+
 def _pose_figures(result: Path, recording: Path, frame_rate_hz: float) -> dict[str, float]:
     truth = Trajectory.read_tum(recording.parent / "groundtruth.tum")
     try:

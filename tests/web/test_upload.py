@@ -104,6 +104,13 @@ def test_what_has_no_sidecar_is_described_by_hand(idle: Any, visit: Callable[...
     assert sensor["intrinsics"]["fx"] == 140
 
 
+def test_a_file_dropped_beside_the_place_for_it_is_not_opened(idle: Any, visit: Callable[..., Any]) -> None:
+    page = opened(visit, idle)
+    drop = "(target) => target.dispatchEvent(new DragEvent('drop', { bubbles: true, cancelable: true }))"
+    assert page.locator("h1").first.evaluate(drop) is False
+    assert page.locator("input[type=file]").first.evaluate(drop) is True, "the browser takes it there"
+
+
 def test_what_cannot_be_used_is_told(idle: Any, visit: Callable[..., Any], files: Path) -> None:
     page = opened(visit, idle)
     choose_files(page, files / "desk.json")

@@ -41,6 +41,17 @@ export function App(): JSX.Element {
     document.title = `${tab?.label ?? ""} · spiked`;
   }, [page]);
   useEffect(() => {
+    // A file that is dropped beside a place for it would be opened instead of the page, and end its uploads.
+    const refuse = (event: Event): void => {
+      if (!(event.target instanceof HTMLInputElement && event.target.type === "file")) event.preventDefault();
+    };
+    const kinds = ["dragover", "drop"] as const;
+    for (const kind of kinds) window.addEventListener(kind, refuse);
+    return () => {
+      for (const kind of kinds) window.removeEventListener(kind, refuse);
+    };
+  }, []);
+  useEffect(() => {
     const onKey = (event: KeyboardEvent): void => {
       const typing = event.target instanceof HTMLElement && /^(INPUT|TEXTAREA|SELECT)$/.test(event.target.tagName);
       if (typing || event.ctrlKey || event.metaKey || event.altKey) return;

@@ -468,7 +468,9 @@ class NoiseModel(BaseModel):
     )
     electrons_a_spike: Annotated[
         float,
-        Field(description="Photo-electrons of one spike; shot noise is Poisson in electrons (Eq 13, 14)."),
+        Field(
+            description="Photo-electrons of one spike; shot noise is normal with the variance of a Poisson law (Eq 13, 14)."
+        ),
     ] = 4000.0
     temperature_k: Annotated[
         float,

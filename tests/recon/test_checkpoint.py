@@ -136,7 +136,7 @@ def views(reconstructor: Reconstructor) -> list[dict[str, Any]]:
 @pytest.mark.parametrize("most", [12, 45], ids=["while views are added", "between pose steps and scene steps"])
 def test_the_method_of_the_paper_is_resumed_with_the_same_bits(room: Recording, tmp_path: Path, most: int) -> None:
     """A checkpoint is a position in its list of actions, with the running means of its pose gradient."""
-    options = Options(steps=30, method=MethodName.NOPE_SGS, window_frames=32)
+    options = Options(steps=100, method=MethodName.NOPE_SGS, window_frames=32)
     alone = Reconstructor(room.sensor, options, recording=room)
     run(room, alone)
     interrupted(room, tmp_path / "checkpoint", lambda one: one.trainer.mapper.steps >= most, options=options)

@@ -2894,7 +2894,7 @@ export interface components {
         NoiseModel: {
             /**
              * Electrons A Spike
-             * @description Photo-electrons of one spike; shot noise is Poisson in electrons (Eq 13, 14).
+             * @description Photo-electrons of one spike; shot noise is normal with the variance of a Poisson law (Eq 13, 14).
              * @default 4000
              */
             electrons_a_spike?: number;

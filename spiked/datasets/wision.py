@@ -28,8 +28,8 @@ WIDTH, HALF_HEIGHT, FULL_HEIGHT = 512, 256, 512
 """Pixels of frames in `.bin` files, of half of the array or of the whole."""
 COLMAP_FILES = ("cameras", "images", "points3D", "frames", "rigs")
 """Names of the binary files of a COLMAP model."""
-_MASK_WORDS = {"mask", "masks", "hot", "hotpixels", "hotpixel", "dead", "deadpixels", "inpaint", "inpainting"}
-"""Words of the name of a file with pixels to leave out; a photon cube is none."""
+_MASK_NAME = re.compile("mask|(?<![a-z])(hot|dead|inpaint)")
+"""In the name of a file with pixels to leave out; a photon cube is none."""
 
 
 def recognises(folder: Path) -> bool:
@@ -50,7 +50,7 @@ def read(folder: Path) -> tuple[Clip, ...]:
 
 
 def _is_mask(path: Path) -> bool:
-    return not _MASK_WORDS.isdisjoint(re.split("[^a-z]+", path.stem.lower()))
+    return _MASK_NAME.search(path.stem.lower()) is not None
 
 
 def _packed_width(path: Path) -> int | None:

@@ -37,8 +37,6 @@ class _Kind(Enum):
     """Choose key frames."""
 
 
-_STEPS = _Kind.SCENE, _Kind.POSE
-"""Kinds that count as steps."""
 _Action = tuple[_Kind, int]
 """What is done, and how many steps of it."""
 
@@ -89,7 +87,7 @@ class Alternator:
         if self._plan is None:
             self._plan = self._begin(most_steps)
         plan, progress, reported = self._plan, self._progress, self._progress.done
-        total = sum(count for kind, count in plan if kind in _STEPS)
+        total = _steps_of(plan)
         for share in progress.shares(total, deadline, cancelled, save):
             self._act(*plan[self._next], share)
             self._next += 1
@@ -123,8 +121,7 @@ class Alternator:
         if steps == 0:
             return []
         growth = self._growth(len(ids) - 1, int(self._options.growth_share * steps))
-        taken = sum(count for kind, count in growth if kind in _STEPS)
-        return [*growth, (_Kind.WHOLE, 0), *self._epochs(max(steps - taken, 0))]
+        return [*growth, (_Kind.WHOLE, 0), *self._epochs(max(steps - _steps_of(growth), 0))]
 
     def _growth(self, views: int, steps: int) -> list[_Action]:
         """Add this many views within `steps`, each with `LEAST_STEPS` at least."""
@@ -190,6 +187,10 @@ class Alternator:
         trainer = self._trainer
         losses = np.array([trainer.compare(self.path, i).value for i in self._used])
         self._use([i for i, loss in zip(self._used, losses, strict=True) if loss >= losses.mean()])
+
+
+def _steps_of(plan: list[_Action]) -> int:
+    return sum(count for kind, count in plan if kind in (_Kind.SCENE, _Kind.POSE))
 
 
 def _scaled(depth: Array | None, shape: tuple[int, ...]) -> Image:

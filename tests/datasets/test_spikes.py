@@ -141,8 +141,11 @@ def test_hot_pixels_are_left_out(source: Source, tmp_path: Path) -> None:
     assert clip.sensor.response is Response.BERNOULLI and clip.sensor.frame_rate_hz == 20_000
 
 
-@pytest.mark.parametrize(("name", "masks"), [("photoncube", False), ("shot1", False), ("hot_pixels", True)])
-def test_masks_are_known_by_whole_words(tmp_path: Path, name: str, masks: bool) -> None:
+@pytest.mark.parametrize(
+    ("name", "masks"),
+    [("photoncube", False), ("shot1", False), ("hot_pixels", True), ("spad_hotPixelMask", True), ("badmask", True)],
+)
+def test_a_mask_is_known_by_its_name(tmp_path: Path, name: str, masks: bool) -> None:
     np.save(tmp_path / f"{name}.npy", np.zeros((20, 256, 64), np.uint8))
     assert find_kind("wision").recognises(tmp_path) is not masks
 

@@ -25,7 +25,7 @@ from spiked_service.cli.dataset_runs.table import Row, Table, write_zip
 
 _DONE = "done.json"
 """In the folder of a result: its row, written when all else is."""
-COMPLETE = "complete"
+_COMPLETE = "complete"
 """Outcome of a recording that was reconstructed."""
 _USAGE = 2
 """Exit status for options or files that cannot be used."""
@@ -95,18 +95,14 @@ class DatasetRun:
             shutil.rmtree(left)  # of a run that was killed
         for number, item in enumerate(items, 1):
             folder = self.out / "results" / _folder_name(item.name)
-            done = _finished(folder, self._files(item))
-            if done is not None and not (self.retry and done.outcome != COMPLETE):
+            done = _finished(folder, self.dataset.of([item]).files)
+            if done is not None and not (self.retry and done.outcome != _COMPLETE):
                 self.show(f"[{number}/{len(items)}] {item.name}: finished before")
             else:
                 self.show(f"[{number}/{len(items)}] {item.name}")
                 done = self._one(item, folder)
             self._rows.append(done)
         return self._write()
-
-    def _files(self, item: Clip | PictureScene) -> tuple[Path, ...]:
-        """What an item is made of."""
-        return item.files if isinstance(item, Clip) else (*item.pictures, *item.described_by)
 
     def _write(self) -> Table:
         said = ["--simulate", shlex.quote(shlex.join(self.simulation))] if self.simulation else []
@@ -183,7 +179,7 @@ class DatasetRun:
         figures = {"frames": float(frames), "poses": float(poses), "seconds": seconds, **score(result, recording, log)}
         (result / "score.json").write_text(json.dumps(figures, indent=1), "utf-8")
         said += json.loads(report.read_text("utf-8")).get("warnings", [])
-        return Row(name=item.name, outcome=COMPLETE, figures=figures, notes=said)
+        return Row(name=item.name, outcome=_COMPLETE, figures=figures, notes=said)
 
     def _run(self, arguments: list[str], log: Path) -> int:
         status = run_spiked(arguments, log, lambda line: self.show(f"    {line}"))
@@ -209,11 +205,9 @@ def _finished(folder: Path, files: Iterable[Path]) -> Row | None:
     path = folder / _DONE
     try:
         written = path.stat().st_mtime_ns
-        return (
-            None
-            if any(one.stat().st_mtime_ns > written for one in files)
-            else Row.model_validate_json(path.read_bytes())
-        )
+        if any(one.stat().st_mtime_ns > written for one in files):
+            return None
+        return Row.model_validate_json(path.read_bytes())
     except (OSError, ValidationError):
         return None
 

@@ -18,11 +18,9 @@ const FAR = 1e9;
 
 /** `box` without the sides that nothing is cut from: there may be splats beyond those that were loaded. */
 export function opened(box: Box, shares: readonly number[]): Box {
-  const side = (to: readonly number[], first: number, sign: number): [number, number, number] => {
-    const [x, y, z] = to.map((value, k) => ((shares[2 * k + first] ?? 0) > 0 ? value : sign * FAR));
-    return [x ?? 0, y ?? 0, z ?? 0];
-  };
-  return { low: side(box.low, 0, -1), high: side(box.high, 1, 1) };
+  const low = (k: 0 | 1 | 2): number => ((shares[2 * k] ?? 0) > 0 ? box.low[k] : -FAR);
+  const high = (k: 0 | 1 | 2): number => ((shares[2 * k + 1] ?? 0) > 0 ? box.high[k] : FAR);
+  return { low: [low(0), low(1), low(2)], high: [high(0), high(1), high(2)] };
 }
 
 /** The box without a share of it at each side. */

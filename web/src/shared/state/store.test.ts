@@ -4,6 +4,7 @@ import * as calls from "../api/calls";
 import type { Capture, Message, Reconstruction } from "../api/types";
 import { ApiError } from "../api/http";
 import { progressText } from "./capture";
+import * as notifying from "./notifying";
 import {
   isAcquiring,
   newestCapture,
@@ -49,15 +50,22 @@ it("keeps older and removed captures, and what messages told meanwhile, when it 
   vi.spyOn(calls, "devices").mockResolvedValue([]);
   vi.spyOn(calls, "captures").mockReturnValue(page.promise);
   vi.spyOn(calls, "unfinished").mockReturnValue(open.promise);
-  vi.spyOn(calls, "reconstructions").mockResolvedValue([]);
+  vi.spyOn(calls, "reconstructions").mockImplementation((id) =>
+    Promise.resolve([{ ...job("w", id, 1), state: "complete" }]),
+  );
+  const told = vi.spyOn(notifying, "notifyOfEnd").mockReturnValue();
   vi.spyOn(calls, "reconstruction").mockImplementation((id) =>
     Promise.resolve({ ...job(id, "e", 1), state: "failed" } as Reconstruction),
   );
   const removed = capture("d", { deleted_at: "2026-11-21T00:00:00Z" });
-  const [ends, fails] = [job("x", "e", 1), job("y", "e", 1)];
+  const [ends, fails, newest] = [job("x", "e", 1), job("y", "e", 1), job("w", "f", 1)];
   useService.setState({
     captures: { a: capture("a"), d: removed, c: capture("c"), e: capture("e") },
-    reconstructions: { x: { ...ends, state: "running" }, y: { ...fails, state: "running" } },
+    reconstructions: {
+      x: { ...ends, state: "running" },
+      y: { ...fails, state: "running" },
+      w: { ...newest, state: "running" },
+    },
   });
   const again = refresh();
   handleMessage(message("job", { ...ends, state: "complete" }));
@@ -72,8 +80,11 @@ it("keeps older and removed captures, and what messages told meanwhile, when it 
   expect(Object.values(reconstructions).map((one) => [one.id, one.state])).toEqual([
     ["x", "complete"],
     ["z", "queued"],
-    ["y", "failed"], // its message was missed
+    ["w", "complete"], // their messages were missed
+    ["y", "failed"],
   ]);
+  const ended = told.mock.calls.filter(([before, now]) => before?.state === "running" && now.state !== "running");
+  expect(ended.map(([, now]) => now.id).sort()).toEqual(["w", "x", "y"]);
   vi.restoreAllMocks();
 });
 

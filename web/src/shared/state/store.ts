@@ -228,8 +228,8 @@ export async function refresh(): Promise<void> {
       calls.captures({ limit: NEWEST }),
       calls.unfinished(),
     ]);
+    const active = activeJobs(get().reconstructions);
     // The list ends there: what is older, or removed, is not in it.
-    const before = get().reconstructions;
     const oldest = captures.next_cursor === null ? "" : (captures.items.at(-1)?.id ?? "");
     set((state) => ({
       devices: devices.map((one) => (isNewer(one.id, asked) && state.devices.find(({ id }) => id === one.id)) || one),
@@ -238,25 +238,25 @@ export async function refresh(): Promise<void> {
       loaded: true,
       connectionError: null,
     }));
+    const missed = active.filter((job) => get().reconstructions[job.id] === undefined);
     const newest = newestCapture(get().captures);
     if (newest !== null) await loadReconstructions(newest.id);
-    await tellEnds(Object.values(before).filter((job) => !isEnded(job)));
+    for (const job of missed) await tellEnd(job);
   } catch (error) {
     set({ connectionError: errorText(error) });
   }
 }
 
-/** Of jobs that were under way and are no longer listed as such, their messages were missed: ask how they ended. */
-async function tellEnds(before: Reconstruction[]): Promise<void> {
-  for (const job of before)
-    if (get().reconstructions[job.id] === undefined)
-      await calls.reconstruction(job.id).then(
-        (now) => {
-          notifyOfEnd(job, now);
-          set((state) => ({ reconstructions: { ...state.reconstructions, [now.id]: now } }));
-        },
-        () => undefined, // it was deleted meanwhile, or the service is out of reach again
-      );
+/** Tell the end of a job that was under way, is no longer listed as such, and whose messages were missed. */
+async function tellEnd(before: Reconstruction): Promise<void> {
+  if (get().reconstructions[before.id] === undefined) {
+    const asked = ++clock;
+    const found = await calls.reconstruction(before.id).catch(() => null);
+    if (found === null) return; // it was deleted meanwhile, or the service is out of reach again
+    set((state) => ({ reconstructions: merged(state.reconstructions, [found], asked, () => true) }));
+  }
+  const now = get().reconstructions[before.id];
+  if (now !== undefined) notifyOfEnd(before, now);
 }
 
 export async function loadReconstructions(captureId: string): Promise<void> {

@@ -28,13 +28,16 @@ def main(out: Path, true_scene: Path, true_path: Path) -> None:
     found, truth = MapFolder.read(out), Scene.read_ply(true_scene)
     path = Trajectory.read_tum(true_path)
     to_found = similarity_of_trajectories(truth=path, estimate=found.trajectory, frame_rate_hz=RATE_HZ)
-    cleaned, shrunk = (
-        clean(found.scene, found.trajectory, found.camera, removal=FloaterRemoval(shrink=shrink))
-        for shrink in (False, True)
+    removed, cleaned = (
+        clean(found.scene, found.trajectory, found.camera, removal=FloaterRemoval(split=split))
+        for split in (False, True)
     )
     rasteriser = Rasteriser(found.camera)
-    print(f"{len(found.scene)} splats, {cleaned.floaters} floaters, {shrunk.shrunk} too large")
-    for name, scene in (("before", found.scene), ("after", cleaned.scene), ("shrunk", shrunk.scene)):
+    print(
+        f"{len(found.scene)} splats, {cleaned.floaters} floaters, {cleaned.split} split, {cleaned.shrunk} shrunk, "
+        f"{len(cleaned.scene)} at the end"
+    )
+    for name, scene in (("before", found.scene), ("removed", removed.scene), ("split, too", cleaned.scene)):
         scores = [psnr_db(rasteriser, scene, truth, *pose, to_found) for pose in off_path(rasteriser, truth, path)]
         low, high = np.percentile(scene.means, (1, 99), axis=0)
         largest = 3 * float(np.exp(scene.log_scales.max())) / float(np.linalg.norm(high - low))

@@ -1,8 +1,8 @@
-"""Cleaning of a scene: what lies outside a box or inside an outline, and floaters, which few views see or which stick
-out."""
+"""Cleaning of a scene: what lies outside a box or inside an outline, floaters, which few views see or which stick out,
+and splats that are too large."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,15 @@ from spiked.recon.statistics import evenly
 from spiked.render import Camera
 from spiked.render.cpu import Rasteriser
 from spiked.scene import Scene
+from spiked.splitting import split_large
 from spiked.trajectory import Trajectory
 
 __all__ = ["Box", "Cleaned", "FloaterRemoval", "Outline", "clean"]
 
 Mask = NDArray[np.bool_]
+
+SEEN = 0.25
+"""Share of the work that is counting the views of each splat, where large ones are split."""
 
 
 @dataclass(frozen=True)
@@ -88,13 +92,13 @@ class FloaterRemoval:
     """Percentiles of the means along each axis that give the size of the scene."""
     span_share: float = 1 / 12
     """Largest standard deviation of a splat over the size of the scene: three of them are a quarter of it."""
-    shrink: bool = False
-    """Make larger splats smaller. Where the background is a few huge splats this costs quality."""
+    split: bool = True
+    """Replace larger splats by smaller ones that together show the same (`spiked.splitting`)."""
 
-    def largest(self, scene: Scene) -> float:
-        """Largest standard deviation of a splat, in the scene's unit."""
+    def span(self, scene: Scene) -> float:
+        """Size of the scene, in its unit."""
         low, high = np.percentile(scene.means, self.span_percentiles, axis=0)
-        return self.span_share * float(np.linalg.norm(high - low))
+        return float(np.linalg.norm(high - low))
 
     def floaters(self, scene: Scene, seen: NDArray[np.int64], views: int) -> Mask:
         """Splats [N] to be removed; `seen` [N] is the number of views that see each."""
@@ -116,8 +120,10 @@ class Cleaned:
     """Splats that lay inside the outline."""
     floaters: int
     """Splats that were removed as floaters."""
+    split: int
+    """Splats that were larger than a quarter of the scene, and were replaced by several."""
     shrunk: int
-    """Splats that were made smaller: they were larger than a quarter of the scene."""
+    """Splats so large that no view sees, and those beyond the number that can be replaced: they were made smaller."""
 
 
 def clean(
@@ -129,13 +135,14 @@ def clean(
     progress: Callable[[float], None] | None = None,
     outline: Outline | None = None,
 ) -> Cleaned:
-    """The scene without what is outside of `box` or inside of `outline`, and without floaters if `removal` is given.
+    """The scene without what is outside of `box` or inside of `outline`; with a `removal` also without floaters and
+    without splats larger than a quarter of it.
 
     Views of `camera` along `path` tell floaters; a box and an outline need neither. Raises ConfigurationError where
     they are not known, and if nothing would be left.
     """
     kept = scene if box is None else scene.select(box.contains(scene))
-    outside, outlined, floaters, shrunk = len(scene) - len(kept), 0, 0, 0
+    outside, outlined, floaters, split, shrunk = len(scene) - len(kept), 0, 0, 0, 0
     if outline is not None:
         chosen = outline.contains(kept)
         outlined, kept = int(chosen.sum()), kept.select(~chosen)
@@ -143,16 +150,23 @@ def clean(
         if camera is None or not len(path):
             raise ConfigurationError("the camera or the path of this scene is not known, so no view can tell floaters")
         rows = evenly(len(path), removal.views)
-        chosen = removal.floaters(kept, _seen(kept, path, camera, rows, removal.least_px, progress), len(rows))
+        chosen = removal.floaters(
+            kept, _seen(kept, path, camera, rows, removal.least_px, _part(progress, SEEN, 0)), len(rows)
+        )
         floaters = int(chosen.sum())
         kept = kept.select(~chosen)
     if not len(kept):
         raise ConfigurationError("nothing of the scene would be left: choose a larger box or a smaller outline")
-    if removal is not None and removal.shrink:
-        most = np.float32(np.log(removal.largest(kept)))
-        shrunk = int((kept.log_scales > most).any(axis=1).sum())
-        kept = replace(kept, log_scales=np.minimum(kept.log_scales, most))
-    return Cleaned(kept, outside, outlined, floaters, shrunk)
+    if removal is not None and removal.split and camera is not None:
+        span = removal.span(kept)
+        done = split_large(kept, removal.span_share * span, path, camera, span, _part(progress, 1 - SEEN, SEEN))
+        kept, split, shrunk = done.scene, done.split, done.shrunk
+    return Cleaned(kept, outside, outlined, floaters, split, shrunk)
+
+
+def _part(progress: Callable[[float], None] | None, share: float, begin: float) -> Callable[[float], None] | None:
+    """Progress of a part of the work."""
+    return None if progress is None else lambda done: progress(begin + share * done)
 
 
 def _seen(

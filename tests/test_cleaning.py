@@ -7,8 +7,10 @@ import pytest
 
 from spiked.cleaning import Box, FloaterRemoval, Outline, clean
 from spiked.errors import ConfigurationError
+from spiked.pose import exp_so3, quaternion
 from spiked.render.cpu import Rasteriser
 from spiked.scene import Scene
+from spiked.splitting import LEAST_BUDGET, split_large
 
 from .room_map import CAMERA, RoomMap, room_map
 
@@ -30,22 +32,57 @@ def floaters(room: RoomMap, count: int) -> Scene:
 def test_floaters_go_and_pictures_stay(room: RoomMap) -> None:
     dirty = room.scene.join(floaters(room, 50))
     cleaned = clean(dirty, room.path, CAMERA, removal=FloaterRemoval(views=12))
-    assert cleaned.floaters >= 50 and (cleaned.shrunk, cleaned.outside) == (0, 0)
+    assert cleaned.floaters >= 50 and (cleaned.split, cleaned.shrunk, cleaned.outside) == (0, 0, 0)
     rasteriser, row = Rasteriser(CAMERA), len(room.path) // 2
     pose = room.path.rotations[row][None], room.path.centres[row][None]
     wanted, got = (rasteriser.forward(scene, *pose).values for scene in (room.scene, cleaned.scene))
     assert -10 * np.log10(np.mean((wanted - got) ** 2) / wanted.max() ** 2) > 30
 
 
-def test_no_splat_is_larger_than_a_quarter_of_the_scene(room: RoomMap) -> None:
-    large = room.scene.log_scales.copy()
-    large[len(large) // 3] = np.log(50.0)
-    cleaned = clean(
-        replace(room.scene, log_scales=large), room.path, CAMERA, removal=FloaterRemoval(views=4, shrink=True)
+def with_large_splats(room: RoomMap) -> Scene:
+    """The room with three huge splats that views see: two sheets and a stick, behind everything; and one behind the
+    camera that none sees."""
+    row = len(room.path) // 2
+    rotation, centre = room.path.rotations[row], room.path.centres[row]
+    distance = 1.2 * np.percentile(((room.scene.means - centre) @ rotation)[:, 2], 99)
+    at = np.array([[0.1, 0.2, distance], [-0.1, 0, 1.1 * distance], [0, 0.3, 0.2 * distance], [0, 0, -distance]])
+    sizes = np.array([[50, 20, 0.02], [30, 9, 0.05], [40, 0.02, 0.02], [60, 60, 60]])
+    huge = room.scene.select(np.zeros(4, np.int64))
+    huge = replace(
+        huge,
+        means=np.asarray(at @ rotation.T + centre, np.float32),
+        quats=np.tile(np.asarray(quaternion(rotation @ exp_so3([0.1, 0.2, 0.7])), np.float32), (4, 1)),
+        log_scales=np.log(sizes).astype(np.float32),
+        opacity_logits=np.array([2.0, 4.0, 0.5, 4.0], np.float32),
     )
+    return room.scene.join(huge)
+
+
+def test_large_splats_become_several_that_show_the_same(room: RoomMap) -> None:
+    scene = with_large_splats(room)
+    shares: list[float] = []
+    removal = FloaterRemoval(views=4, least_views=0, lonely_views=0)
+    cleaned = clean(scene, room.path, CAMERA, removal=removal, progress=shares.append)
+    assert (cleaned.split, cleaned.shrunk) == (3, 1)
+    assert shares == sorted(shares) and shares[-1] == 1
     low, high = np.percentile(cleaned.scene.means, (1, 99), axis=0)
-    assert cleaned.shrunk == 1
     assert 3 * np.exp(cleaned.scene.log_scales.max()) <= 0.26 * np.linalg.norm(high - low)
+    rasteriser = Rasteriser(CAMERA)
+    for row in np.linspace(0, len(room.path) - 1, 5).astype(int):
+        pose = room.path.rotations[row][None], room.path.centres[row][None]
+        without, wanted, got = (rasteriser.forward(s, *pose).values for s in (room.scene, scene, cleaned.scene))
+        error, effect = np.mean((got - wanted) ** 2), np.mean((without - wanted) ** 2)
+        assert error < 0.1 * effect, (row, error / effect)
+
+
+def test_a_scene_of_nothing_but_large_splats_keeps_to_a_budget(room: RoomMap) -> None:
+    scene = with_large_splats(room)
+    few = scene.select(np.arange(len(scene) - 2000, len(scene)))
+    many = few.join(few.select(np.full(400, len(few) - 3, np.int64)))
+    split = split_large(many, 0.1, room.path, CAMERA, 3.0)
+    assert split.shrunk > 0 and split.split > 0
+    assert len(split.scene) <= len(many) + LEAST_BUDGET
+    assert np.exp(split.scene.log_scales.max()) <= 0.1001
 
 
 def test_a_box_cuts(room: RoomMap) -> None:

@@ -213,7 +213,14 @@ class EditedOut(BaseModel):
     outside: Annotated[int, Field(description="Splats that lay outside the box.")]
     outlined: Annotated[int, Field(description="Splats that lay inside the outline.")]
     floaters: Annotated[int, Field(description="Splats that were removed as floaters.")]
-    shrunk: Annotated[int, Field(description="Splats that were made smaller.")]
+    split: Annotated[
+        int,
+        Field(description="Splats larger than a quarter of the scene that were replaced by several."),
+    ]
+    shrunk: Annotated[
+        int,
+        Field(description="Splats so large that were made smaller: no view sees them, or they are too many."),
+    ]
 
 
 class ExportFormatOut(BaseModel):
@@ -1293,10 +1300,12 @@ class CleanRequest(BaseModel):
         Field(description="Splats inside are removed, however far behind it."),
     ] = None
     floaters: Annotated[bool, Field(description="Remove splats that few views see.")] = True
-    shrink: Annotated[
+    split: Annotated[
         bool,
-        Field(description="With floaters: also make splats smaller that are larger than a quarter of the scene."),
-    ] = False
+        Field(
+            description="With floaters: also replace splats larger than a quarter of the scene by smaller ones that show the same."
+        ),
+    ] = True
 
 
 class ConsumerOut(BaseModel):

@@ -30,6 +30,8 @@ def cleaning_routes(rows: ReconstructionRepository, results: Results, route_clas
     def clean_scene(reconstruction_id: str, body: CleanRequest, idempotency_key: IdempotencyKey = None) -> EditedOut:
         """Publish a version without what is outside of a box, inside of an outline, and without floaters.
 
+        With floaters, splats larger than a quarter of the scene are replaced by smaller ones that show the same.
+
         `:revert` undoes it.
         """
         result = results.of(rows.get(reconstruction_id), body.version)
@@ -39,7 +41,7 @@ def cleaning_routes(rows: ReconstructionRepository, results: Results, route_clas
                 result.path(_POSES),
                 result.camera,
                 None if body.box is None else body.box.box(),
-                FloaterRemoval(shrink=body.shrink) if body.floaters else None,
+                FloaterRemoval(split=body.split) if body.floaters else None,
                 outline=None if body.outline is None else body.outline.outline(),
             )
         published = rows.publish_edit(
@@ -51,6 +53,7 @@ def cleaning_routes(rows: ReconstructionRepository, results: Results, route_clas
             outside=found.outside,
             outlined=found.outlined,
             floaters=found.floaters,
+            split=found.split,
             shrunk=found.shrunk,
         )
 
@@ -65,7 +68,7 @@ def cleaning_routes(rows: ReconstructionRepository, results: Results, route_clas
             lambda publisher: _published_again(publisher, earlier, folder, body.version),
         )
         return EditedOut(
-            version=published.version, splats=published.splats, outside=0, outlined=0, floaters=0, shrunk=0
+            version=published.version, splats=published.splats, outside=0, outlined=0, floaters=0, split=0, shrunk=0
         )
 
     return router

@@ -60,8 +60,10 @@ class CleanRequest(In):
     box: BoxModel | None = Field(None, description="Splats outside are removed.")
     outline: OutlineModel | None = Field(None, description="Splats inside are removed, however far behind it.")
     floaters: StrictBool = Field(True, description="Remove splats that few views see.")
-    shrink: StrictBool = Field(
-        False, description="With floaters: also make splats smaller that are larger than a quarter of the scene."
+    split: StrictBool = Field(
+        True,
+        description="With floaters: also replace splats larger than a quarter of the scene by smaller ones that show "
+        "the same.",
     )
 
 
@@ -82,4 +84,5 @@ class EditedOut(Out):
     outside: int = Field(description="Splats that lay outside the box.")
     outlined: int = Field(description="Splats that lay inside the outline.")
     floaters: int = Field(description="Splats that were removed as floaters.")
-    shrunk: int = Field(description="Splats that were made smaller.")
+    split: int = Field(description="Splats larger than a quarter of the scene that were replaced by several.")
+    shrunk: int = Field(description="Splats so large that were made smaller: no view sees them, or they are too many.")

@@ -28,14 +28,15 @@ def clean(
         typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Remove splats outside of this box, in the scene's axes."),
     ] = None,
     floaters: Annotated[bool, typer.Option(help="Remove splats that few views see.")] = True,
-    shrink: Annotated[
-        bool, typer.Option(help="Also make splats smaller that are larger than a quarter of the scene.")
-    ] = False,
+    split: Annotated[
+        bool,
+        typer.Option(help="Replace splats larger than a quarter of the scene by smaller ones that show the same."),
+    ] = True,
 ) -> None:
     """Remove floaters from a scene, and what is outside of a box.
 
-    A floater is a splat that fewer than two views along the path see, or a lonely one that few see. OUT is an output
-    folder like the other one, which stays as it is.
+    A floater is a splat that fewer than two views along the path see, or a lonely one that few see. Splats larger than
+    a quarter of the scene become several. OUT is an output folder like the other one, which stays as it is.
 
     Examples:
 
@@ -54,10 +55,11 @@ def clean(
             found.trajectory,
             found.camera,
             None if box is None else Box(box[:3], box[3:]),
-            FloaterRemoval(shrink=shrink) if floaters or shrink else None,
+            FloaterRemoval(split=split) if floaters else None,
             lambda share: bar.update(task, completed=share),
         )
-    counts = {"outside": cleaned.outside, "floaters": cleaned.floaters, "shrunk": cleaned.shrunk}
+    counts = {"outside": cleaned.outside, "floaters": cleaned.floaters}
+    counts |= {"split": cleaned.split, "shrunk": cleaned.shrunk}
     report = json.loads((map_folder / "report.json").read_bytes()) | {"splats": len(cleaned.scene), "cleaned": counts}
     with outputs.writing("--out", out), replacing(out) as making:
         shutil.copyfile(map_folder / "trajectory.tum", making / "trajectory.tum")
@@ -69,6 +71,6 @@ def clean(
         (making / "report.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
     output.print(
         f"{out}: {len(cleaned.scene)} of {len(found.scene)} splats; removed {cleaned.outside} outside and "
-        f"{cleaned.floaters} floaters, made {cleaned.shrunk} smaller",
+        f"{cleaned.floaters} floaters, split {cleaned.split} large ones, made {cleaned.shrunk} smaller",
         markup=False,
     )

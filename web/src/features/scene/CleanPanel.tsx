@@ -70,9 +70,10 @@ function Cleaning({ viewer, job, newest, free, whole }: CleanProps & { viewer: V
         disabled={!ready}
         onClick={() =>
           void edit(
-            () =>
-              calls.clean(job.id, { version: job.version, floaters: true, shrink: false, box: null, outline: null }),
-            (found) => `Removed ${count(found.floaters)} floaters`,
+            () => calls.clean(job.id, { version: job.version, floaters: true, split: true, box: null, outline: null }),
+            (found) =>
+              `Removed ${count(found.floaters)} floaters` +
+              (found.split + found.shrunk > 0 ? `, made ${count(found.split + found.shrunk)} huge splats smaller` : ""),
           )
         }
       >
@@ -105,7 +106,7 @@ function Cleaning({ viewer, job, newest, free, whole }: CleanProps & { viewer: V
               calls.clean(job.id, {
                 version: job.version,
                 floaters: false,
-                shrink: false,
+                split: true,
                 box: boxOf(opened(box, shares)),
                 outline: null,
               }),
@@ -122,7 +123,7 @@ function Cleaning({ viewer, job, newest, free, whole }: CleanProps & { viewer: V
         whole={whole}
         onRemove={(outline) =>
           edit(
-            () => calls.clean(job.id, { version: job.version, floaters: false, shrink: false, box: null, outline }),
+            () => calls.clean(job.id, { version: job.version, floaters: false, split: true, box: null, outline }),
             (found) => `Removed ${count(found.outlined)} splats`,
           )
         }

@@ -1089,6 +1089,8 @@ export interface paths {
          * Clean Scene
          * @description Publish a version without what is outside of a box, inside of an outline, and without floaters.
          *
+         *     With floaters, splats larger than a quarter of the scene are replaced by smaller ones that show the same.
+         *
          *     `:revert` undoes it.
          *
          *     Scope of a token: `operate`.
@@ -2130,11 +2132,11 @@ export interface components {
              */
             floaters?: boolean;
             /**
-             * Shrink
-             * @description With floaters: also make splats smaller that are larger than a quarter of the scene.
-             * @default false
+             * Split
+             * @description With floaters: also replace splats larger than a quarter of the scene by smaller ones that show the same.
+             * @default true
              */
-            shrink?: boolean;
+            split?: boolean;
         };
         /**
          * ClockPair
@@ -2366,8 +2368,13 @@ export interface components {
              */
             floaters: number;
             /**
+             * Split
+             * @description Splats larger than a quarter of the scene that were replaced by several.
+             */
+            split: number;
+            /**
              * Shrunk
-             * @description Splats that were made smaller.
+             * @description Splats so large that were made smaller: no view sees them, or they are too many.
              */
             shrunk: number;
         };

@@ -1,0 +1,204 @@
+"""Splats that are too large, replaced by smaller ones that together show the same.
+
+A renderer draws a splat by its shape at its middle (the affine approximation of Zwicker et al., "EWA volume splatting",
+2001), so that a huge one is a flat ellipse at one depth wherever it reaches. It is divided there: in the view that it
+fills most, into a grid of pieces at that depth. A Gaussian of variance v is the sum of those of variance c, spread with
+the variance v - c. What hides along a ray adds up in -log(1 - opacity), which the pieces share. Gradient steps towards
+the pictures of the scene before, along the path and beside it, correct the rest.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.pose import quaternion, rotation_of
+from spiked.recon.statistics import evenly
+from spiked.render import Camera
+from spiked.render.cpu import Rasteriser
+from spiked.render.optimiser import Adam
+from spiked.scene import Scene
+from spiked.trajectory import Trajectory
+
+__all__ = ["Split", "split_large"]
+
+Doubles = NDArray[np.float64]
+
+VIEWS = 64
+"""Views along the path in which large splats are looked for."""
+PIECE = 0.8
+"""Standard deviation of a piece over the largest that is allowed, and spacing of the pieces in that deviation: the sum
+of Gaussians that far apart is even to 1e-8."""
+REACH = 3.5
+"""Standard deviations of a splat within which it is kept: beyond is 0.2 % of its opacity."""
+FAINT = 1 / 255
+"""Opacity below which renderers draw nothing."""
+BUDGET = 0.25
+"""Most pieces over the splats of the scene, and ..."""
+LEAST_BUDGET = 10_000
+"""... the number that is always allowed. What is left then is made smaller, the least visible first."""
+STEPS = 400
+"""Gradient steps, every second one on the path itself (decision 46)."""
+PIXELS = 130_000
+"""Most pixels of the pictures that are fitted; larger ones are rendered smaller."""
+ASIDE = 0.15
+"""Largest distance of a fitted view from the path to each side, over the median depth of the first view."""
+RATES = 6e-4, 8e-3, 3e-2, 2.4e-2
+"""Learning rates at the begin of means (over that depth), quaternions, logarithms of scales and opacity logits: 0.3 of
+those that a map begins with. They fall to a tenth."""
+BACKGROUND = 0.5
+"""Largest brightness of the random background of fitted views, over the white of the first one: pieces have to be as
+opaque as what they replace."""
+HUBER = 0.1
+"""Errors over white beyond which the loss is linear."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """A scene without large splats, and what was done."""
+
+    scene: Scene
+    split: int
+    """Splats that were replaced by several."""
+    shrunk: int
+    """Splats that were made smaller: no view sees them, or there were too many."""
+
+
+def split_large(
+    scene: Scene,
+    largest: float,
+    path: Trajectory,
+    camera: Camera,
+    reach: float,
+    progress: Callable[[float], None] | None = None,
+) -> Split:
+    """Replace splats of a standard deviation above `largest`.
+
+    What they show within `reach` of the scene's median stays, seen from `path` by `camera`; both lengths are in the
+    scene's unit.
+    """
+    large = np.flatnonzero(np.exp(scene.log_scales).max(axis=1) > largest)
+    if not len(large):
+        return Split(scene, 0, 0)
+    rasteriser, shared = _rasteriser(camera), _Grid(PIECE * largest, largest, np.median(scene.means, axis=0), reach)
+    filled, rows = _fullest(scene, large, path, rasteriser)
+    left, replaced, pieces = max(int(BUDGET * len(scene)), LEAST_BUDGET), [], []
+    for n in np.argsort(-filled):
+        if filled[n] <= 0:
+            break
+        found = shared.pieces(scene, int(large[n]), path.rotations[rows[n]], path.centres[rows[n]])
+        if len(found) > left:
+            continue
+        left -= len(found)
+        replaced.append(large[n])
+        pieces.append(found)
+    kept = scene.select(np.setdiff1d(np.arange(len(scene)), replaced))
+    made = replace(kept, log_scales=np.minimum(kept.log_scales, np.float32(np.log(largest))))
+    first = len(made)
+    for some in pieces:
+        made = made.join(some)
+    if pieces:
+        _fit(made, first, scene, largest, path, rasteriser, progress)
+    return Split(made, len(replaced), len(large) - len(replaced))
+
+
+def _rasteriser(camera: Camera) -> Rasteriser:
+    """For pictures of the camera, smaller if they are large."""
+    factor = int(np.ceil(np.sqrt(camera.width * camera.height / PIXELS)))
+    return Rasteriser(Camera(camera.intrinsics.scaled(1 / factor), camera.width // factor, camera.height // factor))
+
+
+def _fullest(
+    scene: Scene, chosen: NDArray[np.int64], path: Trajectory, rasteriser: Rasteriser
+) -> tuple[Doubles, NDArray[np.int64]]:
+    """Pixels that the chosen splats [n] fill in the view where they fill most, and its row of the path."""
+    filled, rows = np.zeros(len(chosen)), np.zeros(len(chosen), np.int64)
+    for row in evenly(len(path), VIEWS):
+        image = rasteriser.forward(scene, path.rotations[row][None], path.centres[row][None])
+        here = rasteriser.backward(np.zeros_like(image.values)).contribution[chosen]
+        rows[here > filled] = row
+        filled = np.maximum(filled, here)
+    return filled, rows
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """How splats are divided."""
+
+    deviation: float
+    """Of a piece, and the distance of two."""
+    largest: float
+    middle: Doubles
+    reach: float
+
+    def pieces(self, scene: Scene, n: int, rotation: Doubles, centre: Doubles) -> Scene:
+        """The pieces of a splat, for a view from a pose, camera to world."""
+        own = rotation.T @ rotation_of(scene.quats[n])
+        deviations = np.exp(scene.log_scales[n].astype(np.float64))
+        mean = rotation.T @ (scene.means[n] - centre)
+        # What a renderer sees of it: moving along a ray changes nothing.
+        across = np.array([[1, 0, -mean[0] / mean[2]], [0, 1, -mean[1] / mean[2]]]) @ own * deviations
+        axes, widths, _ = np.linalg.svd(across)
+        middle = (rotation.T @ (self.middle - centre) - mean)[:2] @ axes
+        (u, u_share), (v, v_share) = (self._line(widths[k], middle[k]) for k in (0, 1))
+        at = np.stack(np.meshgrid(u, v, indexing="ij"), -1).reshape(-1, 2)
+        hides = -np.log1p(-np.minimum(scene.opacities[n] * np.outer(u_share, v_share).ravel(), 1 - 1e-6))
+        opacities = 1 - np.exp(-hides / np.sqrt(2 * np.pi) ** int((widths > self.largest).sum()))
+        at, opacities = at[opacities > FAINT], opacities[opacities > FAINT]
+        turned = np.eye(3)
+        turned[:2, :2], turned[2, 2] = axes, np.linalg.det(axes)
+        depth = min(float(deviations.min()), self.deviation)
+        sizes = np.append(np.where(widths > self.largest, self.deviation, widths), depth)
+        means = mean + np.column_stack([at @ axes.T, np.zeros(len(at))])
+        return replace(
+            scene.select(np.full(len(at), n)),
+            means=np.asarray(means @ rotation.T + centre, np.float32),
+            quats=np.tile(np.asarray(quaternion(rotation @ turned), np.float32), (len(at), 1)),
+            log_scales=np.tile(np.log(np.maximum(sizes, 1e-12)).astype(np.float32), (len(at), 1)),
+            opacity_logits=np.log(opacities / (1 - opacities)).astype(np.float32),
+        )
+
+    def _line(self, width: float, middle: float) -> tuple[Doubles, Doubles]:
+        """Places of the pieces along an axis from the mean of a splat of that deviation, and its share there."""
+        if width <= self.largest:
+            return np.zeros(1), np.ones(1)
+        spread = np.sqrt(width**2 - self.deviation**2)
+        low, high = max(-REACH * spread, middle - self.reach), min(REACH * spread, middle + self.reach)
+        places = self.deviation * np.arange(np.floor(low / self.deviation), np.ceil(high / self.deviation) + 1)
+        return places, np.exp(-0.5 * (places / spread) ** 2)
+
+
+def _fit(
+    made: Scene,
+    first: int,
+    before: Scene,
+    largest: float,
+    path: Trajectory,
+    rasteriser: Rasteriser,
+    progress: Callable[[float], None] | None,
+) -> None:
+    """Fit the splats from `first` on, in place, to pictures of the scene before."""
+    rng, adam, most = np.random.default_rng(0), Adam(made.arrays()[:4], 0.9, 0.99), np.float32(np.log(largest))
+    start = rasteriser.forward(before.seen_from(path.centres[0]), path.rotations[:1], path.centres[:1])
+    opaque = start.alpha > 0.5
+    depth = float(np.median(start.depth[opaque])) if opaque.any() else 1.0
+    white = max(float(np.percentile(start.values, 99.5)), 1e-9)
+    pieces = np.arange(len(made)) >= first
+    for step in range(STEPS):
+        row = int(rng.integers(len(path)))
+        rotation = path.rotations[row]
+        aside = ASIDE * depth * (step % 2)
+        pose = rotation[None], (path.centres[row] + aside * rotation[:, :2] @ rng.uniform(-1, 1, 2))[None]
+        background = float(rng.uniform(0, BACKGROUND)) * white
+        wanted = rasteriser.forward(before.seen_from(pose[1][0]), *pose, background=background).values.copy()
+        shown = rasteriser.forward(made.seen_from(pose[1][0]), *pose, background=background).values
+        slope = np.clip((shown - wanted) / white, -HUBER, HUBER) / shown.size
+        gradients = rasteriser.backward(np.asarray(slope, np.float32))
+        means, *others = (0.1 ** (step / STEPS) * rate for rate in RATES)
+        adam.step(
+            made.arrays()[:4], gradients.arrays()[:4], (means * depth, *others), pieces & (gradients.radius_px > 0)
+        )
+        np.minimum(made.log_scales, most, out=made.log_scales)
+        if progress is not None:
+            progress((step + 1) / STEPS)

@@ -542,3 +542,66 @@ def test_a_reader_that_starts_too_far_back_gets_what_there_is() -> None:
             assert isinstance(gap, Gap) and isinstance(frames, Frames)
             assert frames.first == gap.count >= (40 - 16) * 8
             assert frames.valid()
+
+
+def test_an_onlooker_begins_at_the_newest_block_and_counts_what_it_loses(writer: RingWriter) -> None:
+    for _ in range(3):
+        put(writer, 8)
+    writer.clock_pair(ClockPair(23, 5_000))
+    put(writer, 8)
+    reader = RingReader.watch(writer.name)
+    assert spans(drain(reader)) == [(24, 8)]
+    assert reader.clock_pairs() == [ClockPair(23, 5_000)]
+    for _ in range(20):
+        put(writer, 8)
+    writer.end(EndReason.FINISHED)
+    items = drain(reader)
+    assert isinstance(items[0], Gap) and items[0].first == 32 and items[0].cause is LossCause.RING
+    assert items[0].count + sum(count for _, count in spans(items[1:])) == 160
+    assert items[-1] == End(192, EndReason.FINISHED)
+
+
+def test_an_onlooker_that_comes_before_the_first_frame_gets_all(writer: RingWriter) -> None:
+    reader = RingReader.watch(writer.name)
+    put(writer, 8)
+    put(writer, 3)
+    assert spans(drain(reader)) == [(0, 8), (8, 3)]
+
+
+def test_an_onlooker_has_no_place_and_no_source_waits_for_it(writer: RingWriter) -> None:
+    reader = RingReader.watch(writer.name)
+    for _ in range(40):
+        assert writer.wait_for_space(0)
+        put(writer, 8)
+    assert writer.status().readers == ()
+    assert not writer.wait_for_readers(1, 0)
+    assert not reader._segment.slot(0, 1).flags.writeable  # nothing in this process can write the ring through it
+
+
+def test_a_reader_closed_twice_frees_only_its_own_place(writer: RingWriter) -> None:
+    first = attach(writer)
+    first.close()
+    second = RingReader.attach(writer.name, Policy.LOSSLESS, "second")
+    put(writer, 8)
+    assert isinstance(first.next(0), Frames)
+    first.close()
+    assert [(one.consumer, one.frames_read) for one in writer.status().readers] == [("second", 0)]
+    second.close()
+    assert writer.status().readers == ()
+
+
+def test_a_ring_that_cannot_be_mapped_leaves_no_name() -> None:
+    program = """
+import resource
+from spiked.ring import RingError, RingWriter
+from spiked.sensor import Sensor
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + (8 << 20),) * 2)
+try:
+    RingWriter.create(Sensor(400, 250, 20_000.0), slots=1024, ring_id="unmappable")
+except RingError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert "cannot be mapped" in done.stdout
+    assert not Path("/dev/shm/spiked-unmappable").exists()

@@ -81,7 +81,8 @@ class RingReader:
     Earlier frames that the ring no longer holds when the reader attaches come as a gap, too. Used by one thread.
     """
 
-    def __init__(self, segment: Segment, policy: Policy, consumer: str, start_frame: int | None = None) -> None:
+    def __init__(self, segment: Segment, policy: Policy, consumer: str | None, start_frame: int | None = None) -> None:
+        """See `attach`, and without a `consumer` `watch`."""
         self._segment = segment
         self._control: Control = segment.control
         self._policy = policy
@@ -100,7 +101,7 @@ class RingReader:
         self._counters.next_slot = self._slot_of(self._counters.next_entry, writer)
         self._start = self._counters.next_entry  # earlier frames were missed by attaching late and are no overrun
         self._owner = own_identity()
-        self._place = self._claim_place(consumer)
+        self._place = None if consumer is None else self._claim_place(consumer)
 
     @classmethod
     def attach(cls, name: str, policy: Policy, consumer: str, start_frame: int | None = None) -> Self:
@@ -111,6 +112,21 @@ class RingReader:
         no place for another reader.
         """
         return cls(attach_segment(name), policy, consumer, start_frame)
+
+    @classmethod
+    def watch(cls, name: str) -> Self:
+        """Look on: read without a place among the readers, from the newest block on.
+
+        The writer does not know of it, and the memory is read-only here: a reader that sleeps, is killed or goes wrong
+        changes nothing for the capture. It may lag half of the ring, as with Policy.LOSSLESS, but a source that waits
+        for its readers does not wait for it. Frames before its first block are no gap. Raises RingError if there is no
+        such ring, or it belongs to another user.
+        """
+        segment = attach_segment(name, writable=False)
+        newest = segment.control.writer().next_frame - 1
+        reader = cls(segment, Policy.LOSSLESS, None, newest)
+        reader._begin_at_start(newest)
+        return reader
 
     def another(self, policy: Policy, consumer: str, start_frame: int) -> "RingReader":
         """One more reader of the same ring, whose name may have been removed meanwhile; see `attach`."""
@@ -180,8 +196,10 @@ class RingReader:
         """Release the frames held and detach; the reader's counters leave the ring's status."""
         if self._held is not None:
             self._held.release()
-        self._place.claim(self._owner, 0)
-        self._control.progress.ring()
+        if self._place is not None:
+            self._place.claim(self._owner, 0)
+            self._control.progress.ring()
+            self._place = None  # another reader may have it now
 
     def __enter__(self) -> Self:
         return self
@@ -190,6 +208,22 @@ class RingReader:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+    def _begin_at_start(self, newest_frame: int) -> None:
+        """Count from the entry that comes next, and keep the newest clock pair before it."""
+        start, writer = self._counters.next_entry, self._control.writer()
+        entry = self._control.read_entry(start)
+        if entry is not None:
+            self._counters.next_frame = entry.first
+        else:  # not there yet, or overwritten meanwhile: what came since is lost
+            self._counters.next_frame = writer.next_frame if start >= writer.entries else max(0, newest_frame)
+        for position in range(start - 1, -1, -1):
+            entry = self._control.read_entry(position)
+            if entry is None:
+                return  # overwritten
+            if is_clock_pair(entry):
+                self._clock_pairs.append(ClockPair(entry.first + entry.cause, entry.count))
+                return
 
     def _take(self) -> Item | None:
         if self._end is not None:
@@ -323,8 +357,9 @@ class RingReader:
         raise RingError(f"ring {self._segment.name} has {READER_PLACES} readers, which is the limit: end one of them")
 
     def _publish(self) -> None:
-        self._place.publish(self._counters)
-        self._control.progress.ring()
+        if self._place is not None:
+            self._place.publish(self._counters)
+            self._control.progress.ring()
 
 
 def _lease(policy: Policy, slots: int) -> int:

@@ -136,8 +136,9 @@ def create_segment(geometry: RingLayout, ring_id: str | None, keeper: int = 0) -
     try:
         _reserve_memory(file, geometry.total_bytes, name)
         os.pwrite(file, _HEADER.pack(_MAGIC, owner, keeper, 0, len(text)) + text, 0)
+        segment = Segment(name, geometry, _map(file, geometry, name))
         os.link(f"/proc/self/fd/{file}", name, dst_dir_fd=folder, follow_symlinks=True)
-        return Segment(name, geometry, _map(file, geometry))
+        return segment
     except FileExistsError as error:
         raise RingError(
             f"there is a ring {name} already: choose another id, or end the process that made it"
@@ -147,11 +148,14 @@ def create_segment(geometry: RingLayout, ring_id: str | None, keeper: int = 0) -
         os.close(folder)
 
 
-def attach_segment(name: str) -> Segment:
-    """The ring of that name. Raises RingError if there is none, or if the file is not a ring of this version."""
-    with _opened(FOLDER / name) as file:
+def attach_segment(name: str, *, writable: bool = True) -> Segment:
+    """The ring of that name. Raises RingError if there is none, or if the file is not a ring of this version.
+
+    Without `writable` the memory cannot be written: whatever this process does, the capture is not disturbed.
+    """
+    with _opened(FOLDER / name, os.O_RDWR if writable else os.O_RDONLY) as file:
         *_, geometry = _read_header(file, name)
-        return Segment(name, geometry, _map(file, geometry))
+        return Segment(name, geometry, _map(file, geometry, name, mmap.PROT_READ | (writable and mmap.PROT_WRITE)))
 
 
 def clean_stale() -> list[str]:
@@ -175,9 +179,9 @@ def remove_ring(ring_id: str) -> None:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[int]:
+def _opened(path: Path, access: int = os.O_RDWR) -> Iterator[int]:
     try:
-        file = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        file = os.open(path, access | os.O_CLOEXEC)
     except FileNotFoundError as error:
         raise RingError(f"there is no ring {path.name} in {FOLDER}") from error
     except OSError as error:
@@ -217,7 +221,16 @@ def _reserve_memory(file: int, size: int, name: str) -> None:
         ) from error
 
 
-def _map(file: int, geometry: RingLayout) -> NDArray[np.uint8]:
+def _map(
+    file: int, geometry: RingLayout, name: str, protection: int = mmap.PROT_READ | mmap.PROT_WRITE
+) -> NDArray[np.uint8]:
     """Map the whole file with all pages present: page faults would slow the first lap of a capture."""
     flags = mmap.MAP_SHARED | mmap.MAP_POPULATE
-    return np.frombuffer(mmap.mmap(file, geometry.total_bytes, flags=flags), np.uint8)
+    try:
+        memory = mmap.mmap(file, geometry.total_bytes, flags=flags, prot=protection)
+    except OSError as error:
+        raise RingError(
+            f"ring {name} of {geometry.total_bytes / 2**20:.0f} MiB cannot be mapped: {error.strerror}; use fewer "
+            "slots, or raise the memory limit of this process"
+        ) from error
+    return np.frombuffer(memory, np.uint8)

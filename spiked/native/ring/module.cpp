@@ -17,7 +17,7 @@ using namespace nb::literals;
 namespace spiked {
 namespace {
 
-using Memory = nb::ndarray<uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Memory = nb::ndarray<const uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 template <size_t N>
 std::array<char, N> to_chars(const std::string& text) {
@@ -39,8 +39,11 @@ class Control {
   public:
     static size_t bytes(size_t log_places) { return sizeof(Shared) + log_places * sizeof(LogPlace); }
 
+    // Of memory that is mapped read-only, only what reads may be called: `writer`, `read_entry`, `reserved`, waits.
     Control(Memory memory, size_t log_places)
-        : memory_(memory), shared_(reinterpret_cast<Shared*>(memory.data())), log_places_(log_places) {
+        : memory_(memory),
+          shared_(reinterpret_cast<Shared*>(const_cast<uint8_t*>(memory.data()))),
+          log_places_(log_places) {
         if (memory.size() < bytes(log_places)) throw std::invalid_argument("the memory is too small for the log");
         if (reinterpret_cast<uintptr_t>(memory.data()) % alignof(Shared))
             throw std::invalid_argument("the memory is not aligned to 64 bytes");

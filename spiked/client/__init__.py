@@ -3,6 +3,7 @@
 from spiked.client.client import Spiked
 from spiked.client.connection import ApiError, ServiceUnreachableError
 from spiked.client.events import Event
+from spiked.client.frames import FrameBlock, FrameStream
 from spiked.client.models import (
     CalibratedOut,
     CaptureOut,
@@ -33,6 +34,8 @@ __all__ = [
     "CaptureRequest",
     "CaptureState",
     "Event",
+    "FrameBlock",
+    "FrameStream",
     "GeometryModel",
     "Grade",
     "GroupOut",

@@ -14,6 +14,7 @@ import httpx
 
 from spiked.client.connection import ApiError, Connection, plain
 from spiked.client.events import Event, events_in
+from spiked.client.frames import FrameMethods
 from spiked.client.maps import MapMethods
 from spiked.client.models import (
     CalibratedOut,
@@ -55,7 +56,7 @@ _T = TypeVar("_T")
 _OVER = (JobState.complete, JobState.cancelled, JobState.failed)
 
 
-class Spiked(MapMethods, ResultMethods):
+class Spiked(MapMethods, ResultMethods, FrameMethods):
     """A client of one service. Usable from any thread, and as a context manager.
 
     Every method raises ApiError when the service refuses, and ServiceUnreachableError when it does not answer.

@@ -198,7 +198,9 @@ class Captures:
             live = self._live.get(row.id)
         row = row if live is None else live.row
         counters = row.counters if live is None or row.state.over else live.counters()
-        return Snapshot(row, counters, self._reconstructions.rows.of(row.id))
+        opened = None if live is None or row.state.over else live.opened
+        ring = None if opened is None else opened.name
+        return Snapshot(row, counters, self._reconstructions.rows.of(row.id), ring)
 
     def list(self, limit: int = 50, cursor: str | None = None, **wanted: Unpack[CaptureFilter]) -> Page[CaptureRow]:
         """Newest first."""

@@ -57,7 +57,7 @@ class LiveCapture:
         planned = {Role.RECORDER: row.plan.record, Role.RECONSTRUCTION: row.plan.reconstruct}
         self._readers = {role for role, wanted in planned.items() if wanted}
         """Readers of the ring that have not ended."""
-        self._opened: RingOpened | None = None
+        self.opened: RingOpened | None = None
         self._first_frame = 0
         self._stop_frame: int | None = None
         self._away: DeviceState | None = None
@@ -135,7 +135,7 @@ class LiveCapture:
         """Set the state from the counters; called periodically, because the ring sends no events."""
         with self._lock:
             counters = self.counters()
-            if self._stopping or not self.holds_device or self._opened is None or counters is None:
+            if self._stopping or not self.holds_device or self.opened is None or counters is None:
                 return
             event = device_event(counters, self._first_frame)
             self._away = counters.device if event is CaptureEvent.DEVICE_AWAY else None
@@ -203,7 +203,7 @@ class LiveCapture:
             self._source_ended = True
             if trouble is not None:
                 self._row.fail(trouble)
-            if self._opened is None:
+            if self.opened is None:
                 self._readers.clear()
             elif not self.row.state.over:
                 self._row.apply(CaptureEvent.SOURCE_ENDED)
@@ -250,7 +250,7 @@ class LiveCapture:
         with self._lock:
             if self._closing:
                 return
-            self._opened = opened
+            self.opened = opened
             sensor = replace(opened.sensor, intrinsics=self.row.plan.intrinsics or opened.sensor.intrinsics)
             frames = opened.frames if self._stop_frame is None else self._stop_frame - self._first_frame
             self._row.set(sensor=sensor, frames_planned=frames)

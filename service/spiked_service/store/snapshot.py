@@ -19,6 +19,8 @@ class Snapshot:
     """Counters now or at the end."""
     reconstructions: tuple[ReconstructionRow, ...]
     """Oldest first."""
+    ring: str | None = None
+    """Name of the ring in shared memory, while it can be read."""
 
     @property
     def id(self) -> str:

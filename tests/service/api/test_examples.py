@@ -45,13 +45,14 @@ def test_curl(daemon: Callable[..., Any], tmp_path: Path) -> None:
 
 
 def test_python(daemon: Callable[..., Any], tmp_path: Path) -> None:
-    first, follow, second = blocks("python", daemon().address)
+    first, follow, second, frames = blocks("python", daemon().address)
     told = run([sys.executable, "-c", first], tmp_path)
     assert "the camera went" in told and "422" in told
     came = run([sys.executable, "-c", follow], tmp_path).splitlines()
     assert " 0 splats came" not in came[0] and " 0 splats came" in came[-1], came
     poses = run([sys.executable, "-c", second], tmp_path).splitlines()
     assert len(poses) > 10, poses
+    assert run([sys.executable, "-c", frames], tmp_path).splitlines()[-1].startswith("finished ")
 
 
 def test_javascript(daemon: Callable[..., Any], tmp_path: Path) -> None:

@@ -398,6 +398,11 @@ class CaptureOut(Out):
     counters: CountersOut | None
     sensor: SensorOut | None = Field(description="Null until the source is open.")
     group: str | None = Field(None, description="Id of the group of captures that were started together.")
+    ring: str | None = Field(
+        None,
+        description="Name of the shared memory with the newest frames, for programs on the service's machine; null "
+        "when the capture does not run.",
+    )
 
     @classmethod
     def of(cls, snapshot: Snapshot) -> "CaptureOut":
@@ -425,6 +430,7 @@ class CaptureOut(Out):
             counters=CountersOut.of(snapshot.counters),
             sensor=SensorOut.of(row.sensor),
             group=row.group,
+            ring=snapshot.ring,
         )
 
 

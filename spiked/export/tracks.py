@@ -103,6 +103,7 @@ def _followed(
         back, returned = _flow(grey[other], grey[number], at, corners[rows])
         good &= returned & (np.linalg.norm(back - corners[rows], axis=1) < RETURN_PX)
         good &= np.linalg.norm(at - expected, axis=1) < SEARCH_PX
+        good &= ((at >= 0) & (at <= grey[other].shape[::-1])).all(axis=1)  # the flow runs over the border
         found[rows[good], other] = at[good]
     return found
 

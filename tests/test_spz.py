@@ -124,13 +124,13 @@ def test_a_sample_is_fixed_and_spread_evenly() -> None:
 
 
 def splat_transform() -> list[str]:
-    """@playcanvas/splat-transform: as named in SPIKED_SPLAT_TRANSFORM, installed in web/, or on the path."""
-    named = os.environ.get("SPIKED_SPLAT_TRANSFORM")
+    """@playcanvas/splat-transform as it is in web/package.json, or as named in SPIKED_SPLAT_TRANSFORM."""
     local = Path(__file__).parents[1] / "web" / "node_modules" / ".bin" / "splat-transform"
-    found = named or (str(local) if local.exists() else shutil.which("splat-transform"))
-    if not found or not shutil.which("node"):
-        pytest.skip("needs node and the npm package @playcanvas/splat-transform (in web/ or SPIKED_SPLAT_TRANSFORM)")
-    return [found]
+    if not shutil.which("node"):
+        pytest.skip("needs node")
+    found = Path(os.environ.get("SPIKED_SPLAT_TRANSFORM", local))
+    assert found.exists(), f"{found} is missing: `make page` installs the packages of web/"
+    return [str(found)]
 
 
 @pytest.mark.parametrize("version", list(SpzVersion))

@@ -83,7 +83,6 @@ def test_compressed_ply_decodes_to_the_scene(source: ExportSource, tmp_path: Pat
 
 @pytest.mark.parametrize("kind", ["sog", "compressed-ply"])
 def test_splat_transform_reads_the_scene(tmp_path: Path, kind: str) -> None:
-    """Where the npm package is at hand."""
     command = splat_transform()
     scene = ordered(random_scene(2000))
     source = ExportSource(None, None, scene)  # type: ignore[arg-type]

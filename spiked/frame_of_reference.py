@@ -1,6 +1,7 @@
 """The unit of length of a scene in metres, and which way is up: what a moving camera alone cannot know."""
 
 from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +12,49 @@ from spiked.pose import quaternion, rotation_of
 from spiked.scene import Scene, unit_quats
 from spiked.trajectory import Trajectory
 
-__all__ = ["FrameOfReference"]
+__all__ = ["FrameOfReference", "KnownScale"]
 
 Array = NDArray[np.float64]
 
 DOWN = np.array([0.0, 1.0, 0.0])
 """Downwards in the axes of OpenCV."""
+
+
+@dataclass(frozen=True)
+class KnownScale:
+    """What a file says of its unit of length and its axes; None where it is not known."""
+
+    unit: Literal["scene", "m"] = "scene"
+    metres_per_unit: float | None = None
+    scale_sigma: float | None = None
+    """Relative standard deviation of the scale, of a file in metres that of all its lengths."""
+    up: tuple[float, float, float] | None = None
+    """Direction of up in the axes of the file, of length 1."""
+
+    @property
+    def in_metres(self) -> "KnownScale":
+        """The same of a file in metres, with up along -y where up is known."""
+        return KnownScale("m", 1.0, self.scale_sigma, None if self.up is None else (0.0, -1.0, 0.0))
+
+    @property
+    def known(self) -> dict[str, Any]:
+        """The unit, and what is known of it, for files that hold names with values."""
+        values = {"metres_per_unit": self.metres_per_unit, "scale_sigma": self.scale_sigma}
+        listed = {"up": None if self.up is None else list(self.up)}
+        return {"unit": self.unit} | {name: value for name, value in (values | listed).items() if value is not None}
+
+    @property
+    def texts(self) -> dict[str, str]:
+        """The same as texts."""
+        return {
+            name: " ".join(map(repr, value)) if isinstance(value, list) else str(value)
+            for name, value in self.known.items()
+        }
+
+    @property
+    def notes(self) -> list[str]:
+        """The same as comments, one a line; none while nothing is known."""
+        return [f"{name} {text}" for name, text in self.texts.items()] if len(self.known) > 1 else []
 
 
 @dataclass(frozen=True)

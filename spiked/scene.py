@@ -148,12 +148,15 @@ class Scene:
         colours = self.colours + np.einsum("nk,nkc->nc", basis, self.harmonics)
         return replace(self, colours=np.maximum(colours, 0).astype(np.float32), harmonics=None)
 
-    def write_ply(self, path: Path | str, white: float | None = None) -> None:
+    def write_ply(self, path: Path | str, white: float | None = None, notes: Iterable[str] = ()) -> None:
         """Write a binary PLY with the standard 3DGS fields; see `ply`."""
-        Path(path).write_bytes(self.ply(white))
+        Path(path).write_bytes(self.ply(white, notes))
 
-    def ply(self, white: float | None = None) -> bytes:
-        """The bytes of the PLY file; radiance `white`, the scene's own if None, becomes colour 1 and is noted in it."""
+    def ply(self, white: float | None = None, notes: Iterable[str] = ()) -> bytes:
+        """The bytes of the PLY file; radiance `white`, the scene's own if None, becomes colour 1 and is noted in it.
+
+        `notes` become further comments.
+        """
         white = self.white if white is None else white
         rgb = np.broadcast_to(self.colours, (len(self), 3)) / (white or 1)
         rest = self.filled_harmonics(COEFFICIENTS[self.degree]) / (white or 1)
@@ -161,7 +164,7 @@ class Scene:
         names = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
         names += [*(f"f_rest_{number}" for number in range(rest.shape[1])), "opacity"]
         names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-        comments = [] if white is None else [f"radiance {white!r} spikes per frame is colour 1"]
+        comments = [*([] if white is None else [f"radiance {white!r} spikes per frame is colour 1"]), *notes]
         head = ply_header([("vertex", len(self), [f"float {name}" for name in names])], comments)
         quats = self.quats / np.maximum(np.linalg.norm(self.quats, axis=1, keepdims=True), 1e-12)
         columns = [self.means, np.zeros_like(self.means), (rgb - 0.5) / SH_C0, rest, self.opacity_logits[:, None]]

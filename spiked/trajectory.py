@@ -1,7 +1,7 @@
 """A camera trajectory as poses at times, and the files that other tools read: TUM, KITTI, COLMAP, nerfstudio."""
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -77,9 +77,9 @@ class Trajectory:
         """The text of nerfstudio's `transforms.json`: camera-to-world with OpenGL axes (y up, z back)."""
         return "".join(nerfstudio_lines([self], sensor))
 
-    def write_tum(self, path: Path | str) -> None:
-        """Write a TUM file."""
-        Path(path).write_text(self.tum(), encoding="utf-8")
+    def write_tum(self, path: Path | str, notes: Iterable[str] = ()) -> None:
+        """Write a TUM file; `notes` become comments."""
+        Path(path).write_text("".join(tum_lines([self], notes)), encoding="utf-8")
 
     def nearest(self, times_s: Array, within_s: float) -> NDArray[np.int64]:
         """For each time the index of the nearest pose, or -1 where none lies within `within_s`."""
@@ -132,8 +132,9 @@ def _parsed(rows: list[str]) -> Array | None:
     return table if sound else None
 
 
-def tum_lines(parts: Iterable[Trajectory]) -> Iterator[str]:
-    """The text of a TUM file (quaternions xyzw), piece by piece."""
+def tum_lines(parts: Iterable[Trajectory], notes: Iterable[str] = ()) -> Iterator[str]:
+    """The text of a TUM file (quaternions xyzw), piece by piece; `notes` become comments."""
+    yield from (f"# {note}\n" for note in notes)
     yield "# timestamp_s tx ty tz qx qy qz qw (camera to world, OpenCV axes, middle of each frame)\n"
     for part in parts:
         yield _written(" ".join(["%.9f"] * 8) + "\n", part.table())
@@ -145,8 +146,9 @@ def kitti_lines(parts: Iterable[Trajectory]) -> Iterator[str]:
         yield _written(" ".join(["%.9e"] * 12) + "\n", part.matrices()[:, :3].reshape(-1, 12))
 
 
-def colmap_lines(parts: Iterable[Trajectory]) -> Iterator[str]:
-    """The text of COLMAP's `images.txt`, piece by piece."""
+def colmap_lines(parts: Iterable[Trajectory], notes: Iterable[str] = ()) -> Iterator[str]:
+    """The text of COLMAP's `images.txt`, piece by piece; `notes` become comments."""
+    yield from (f"# {note}\n" for note in notes)
     yield "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, each followed by an empty line of points\n"
     first = 1
     for part in parts:
@@ -185,15 +187,21 @@ def colmap_lens(lens: Distortion | None) -> tuple[str, dict[str, float]]:
     return "FULL_OPENCV", named | {"k3": k3, "k4": 0.0, "k5": 0.0, "k6": 0.0}
 
 
-def nerfstudio_lines(parts: Iterable[Trajectory], sensor: Sensor) -> Iterator[str]:
-    """The text of nerfstudio's `transforms.json`, piece by piece. Raises SceneError without intrinsics."""
+def nerfstudio_lines(
+    parts: Iterable[Trajectory], sensor: Sensor, more: Mapping[str, Any] | None = None
+) -> Iterator[str]:
+    """The text of nerfstudio's `transforms.json`, piece by piece, with further fields.
+
+    Raises SceneError without intrinsics.
+    """
     if sensor.intrinsics is None:
         raise SceneError("nerfstudio's transforms.json needs intrinsics; give --intrinsics or --fov")
     k = sensor.intrinsics
     fisheye = k.distortion is not None and k.distortion.model is LensModel.FISHEYE
     camera = {"camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV", "w": sensor.width, "h": sensor.height}
     lens = {} if k.distortion is None else k.distortion.named()
-    yield json.dumps({**camera, "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, **lens})[:-1] + ', "frames": ['
+    optics = {"fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, **lens}
+    yield json.dumps({**camera, **optics, **(more or {})})[:-1] + ', "frames": ['
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     begin = "\n"
     for part in parts:

@@ -3,6 +3,7 @@
 The files are those of COLMAP's documentation ("Output Format"), little-endian.
 """
 
+import json
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,18 +23,21 @@ from spiked.trajectory import colmap_lens
 
 __all__ = ["KIND"]
 
+SCALE = "scale.json"
+"""What is known of the unit and of up, which COLMAP's files have no place for."""
 MODELS = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FULL_OPENCV": 6}
 """Numbers of the camera models."""
 
 
 def fill(source: ExportSource, folder: Path, options: ExportOptions) -> str:
-    """Write images/ and sparse/0/. Raises SceneError and ConfigurationError."""
+    """Write images/, sparse/0/ and scale.json. Raises SceneError and ConfigurationError."""
     pictures, tracks = write_pictures(source, folder, options)
     model = folder / "sparse" / "0"
     model.mkdir(parents=True, exist_ok=True)
     (model / "cameras.bin").write_bytes(cameras_bin(source.seen_by(options)))
     (model / "images.bin").write_bytes(images_bin(pictures, tracks))
     (model / "points3D.bin").write_bytes(points_bin(tracks))
+    (folder / SCALE).write_text(json.dumps(source.scale.known, indent=1), "utf-8")
     return said(pictures, tracks)
 
 

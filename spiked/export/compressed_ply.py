@@ -5,6 +5,8 @@ splat four 32-bit numbers: position 11-10-11 bits, rotation 2-10-10-10, scale 11
 a byte for each coefficient of view-dependent colour, from -4 to 4.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,8 +29,8 @@ Words = NDArray[np.uint32]
 Floats = NDArray[np.float32]
 
 
-def encode(scene: Scene, white: float = 1.0) -> bytes:
-    """The bytes of the file; radiance `white` becomes colour 1."""
+def encode(scene: Scene, white: float = 1.0, notes: Iterable[str] = ()) -> bytes:
+    """The bytes of the file; radiance `white` becomes colour 1, `notes` become comments."""
     scene = scene.select(morton_order(scene.means))
     count, groups = len(scene), -(-len(scene) // GROUP)
     dc = (np.broadcast_to(scene.colours, (count, 3)) / white - 0.5) / SH_C0
@@ -51,7 +53,7 @@ def encode(scene: Scene, white: float = 1.0) -> bytes:
     chunks = np.concatenate([side for low, high in ranges for side in (low, high)], 1)
     rest = _harmonics(scene, white)
     body = chunks.astype("<f4").tobytes() + table.astype("<u4").tobytes() + rest.tobytes()
-    return _header(groups, count, rest.shape[1]) + body
+    return _header(groups, count, rest.shape[1], notes) + body
 
 
 def _harmonics(scene: Scene, white: float) -> NDArray[np.uint8]:
@@ -61,13 +63,13 @@ def _harmonics(scene: Scene, white: float) -> NDArray[np.uint8]:
     return np.asarray(np.clip((rest / HARMONIC_RANGE + 0.5) * 256, 0, 255), np.uint8)
 
 
-def _header(groups: int, count: int, rest: int) -> bytes:
+def _header(groups: int, count: int, rest: int, notes: Iterable[str]) -> bytes:
     names = [f"{side}_{name}" for first in (0, 3, 6) for side in ("min", "max") for name in _RANGES[first : first + 3]]
     packed = [f"uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
     elements = [("chunk", groups, [f"float {name}" for name in names]), ("vertex", count, packed)]
     if rest:
         elements.append(("sh", count, [f"uchar f_rest_{number}" for number in range(rest)]))
-    return ply_header(elements)
+    return ply_header(elements, notes)
 
 
 def _in_groups(values: Floats, groups: int) -> tuple[Floats, Floats, NDArray[np.float64]]:

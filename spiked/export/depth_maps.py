@@ -76,6 +76,7 @@ def _write_index(
         "depth_png": "z = value * depth_png_unit",
         "normal": "unit vector in camera axes, towards the camera; 0 where there is none",
         "normal_png": "component = 2 * value / 65535 - 1",
+        "scale": source.scale.known,
         "frames": frames,
     }
     (folder / INDEX).write_text(json.dumps(index, indent=1), "utf-8")

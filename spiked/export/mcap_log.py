@@ -37,7 +37,8 @@ def fill(source: ExportSource, path: Path, options: ExportOptions) -> str:
     logging.getLogger("foxglove").setLevel(logging.WARNING)
     timeline = read_timeline(source, options)
     context = foxglove.Context()
-    with KeptErrors(path) as file, foxglove.open_mcap(file, context=context):
+    with KeptErrors(path) as file, foxglove.open_mcap(file, context=context) as writer:
+        writer.write_metadata("scale", source.scale.texts)
         log = _Log(foxglove, context)
         log.begin(timeline)
         for row in range(len(timeline.stamps_ns)):

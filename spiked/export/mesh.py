@@ -146,8 +146,19 @@ def _write(source: ExportSource, path: Path, options: ExportOptions, kind: str) 
     trimesh: Any = optional("trimesh")
     mesh = mesh_of(source, options)
     made = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colours, process=False)
-    path.write_bytes(made.export(file_type=kind))
+    path.write_bytes(_glb(made, source) if kind == "glb" else _noted(made.export(file_type=kind), source.scale.notes))
     return f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles"
+
+
+def _glb(mesh: Any, source: ExportSource) -> Any:
+    """The bytes of a glTF; what is known of the unit is in `asset.extras`."""
+    return mesh.export(file_type="glb", tree_postprocessor=lambda tree: tree["asset"].update(extras=source.scale.known))
+
+
+def _noted(ply: bytes, notes: list[str]) -> bytes:
+    """A PLY with further comments."""
+    comments = "".join(f"comment {note}\n" for note in notes)
+    return ply.replace(b"\nelement ", f"\n{comments}element ".encode(), 1)
 
 
 PLY = ExportKind(

@@ -28,16 +28,18 @@ def fill(source: ExportSource, folder: Path, options: ExportOptions) -> str:
         np.stack([view.centre for view in views]),
     )
     index = json.loads("".join(nerfstudio_lines([path], source.seen_by(options))))
-    (folder / "transforms.json").write_text(json.dumps({**index, "ply_file_path": POINTS}, indent=1), "utf-8")
-    (folder / POINTS).write_bytes(_ply(tracks))
+    (folder / "transforms.json").write_text(
+        json.dumps({**index, "ply_file_path": POINTS, "scale": source.scale.known}, indent=1), "utf-8"
+    )
+    (folder / POINTS).write_bytes(_ply(tracks, source.scale.notes))
     return said(pictures, tracks)
 
 
-def _ply(tracks: Tracks) -> bytes:
+def _ply(tracks: Tracks, notes: list[str]) -> bytes:
     table = np.zeros(len(tracks.points), _POINT)
     table["position"], table["colour"] = tracks.points, tracks.colours
     properties = [*(f"float {name}" for name in "xyz"), *(f"uchar {name}" for name in ("red", "green", "blue"))]
-    return ply_header([("vertex", len(table), properties)]) + table.tobytes()
+    return ply_header([("vertex", len(table), properties)], notes) + table.tobytes()
 
 
 KIND = ExportKind(

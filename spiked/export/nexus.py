@@ -35,6 +35,7 @@ def fill(source: ExportSource, path: Path, options: ExportOptions) -> str:
         entry = _group(file, "entry", "NXentry")
         entry.attrs["default"] = "key_views"
         entry["title"] = source.name
+        _group(entry, "scale", "NXcollection").attrs.update(source.scale.known)
         detector = _write_camera(entry, source)
         _write_path(entry, timeline, source)
         _write_views(entry, timeline, source)

@@ -1,5 +1,6 @@
 """Point clouds with normals and colours, as PLY and as PCD."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -19,18 +20,21 @@ _PCD = np.dtype([(name, "<f4") for name in ("x", "y", "z", "normal_x", "normal_y
 _TYPES = {"f4": "float", "u1": "uchar"}
 
 
-def ply(points: SurfacePoints) -> bytes:
-    """A binary PLY: positions and normals as floats, red, green and blue as bytes."""
+def ply(points: SurfacePoints, notes: Iterable[str] = ()) -> bytes:
+    """A binary PLY: positions and normals as floats, red, green and blue as bytes; `notes` become comments."""
     table = np.zeros(len(points), _PLY)
     _fill(table, points, ("nx", "ny", "nz"))
     for number, name in enumerate(("red", "green", "blue")):
         table[name] = points.colours[:, number]
     properties = [f"{_TYPES[_PLY[name].str[1:]]} {name}" for name in _PLY.names or ()]
-    return ply_header([("vertex", len(points), properties)]) + table.tobytes()
+    return ply_header([("vertex", len(points), properties)], notes) + table.tobytes()
 
 
-def pcd(points: SurfacePoints) -> bytes:
-    """A binary PCD of version 0.7, as the Point Cloud Library documents it; colours are packed into `rgb`."""
+def pcd(points: SurfacePoints, notes: Iterable[str] = ()) -> bytes:
+    """A binary PCD of version 0.7, as the Point Cloud Library documents it; colours are packed into `rgb`.
+
+    `notes` become comments.
+    """
     table = np.zeros(len(points), _PCD)
     _fill(table, points, ("normal_x", "normal_y", "normal_z"))
     red, green, blue = points.colours.T.astype(np.uint32)
@@ -38,6 +42,7 @@ def pcd(points: SurfacePoints) -> bytes:
     names = _PCD.names or ()
     head = [
         "# .PCD v0.7 - Point Cloud Data file format",
+        *(f"# {note}" for note in notes),
         "VERSION 0.7",
         f"FIELDS {' '.join(names)}",
         f"SIZE {' '.join('4' for _ in names)}",
@@ -60,13 +65,13 @@ def _fill(table: NDArray[np.void], points: SurfacePoints, normal: tuple[str, str
 
 def _write_ply(source: ExportSource, path: Path, options: ExportOptions) -> str:
     points = surface_points(source, options)
-    path.write_bytes(ply(points))
+    path.write_bytes(ply(points, source.scale.notes))
     return f"{len(points)} points"
 
 
 def _write_pcd(source: ExportSource, path: Path, options: ExportOptions) -> str:
     points = surface_points(source, options)
-    path.write_bytes(pcd(points))
+    path.write_bytes(pcd(points, source.scale.notes))
     return f"{len(points)} points"
 
 

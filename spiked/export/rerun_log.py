@@ -48,6 +48,7 @@ def _log_static(rr: ModuleType, stream: Any, source: ExportSource, timeline: Tim
     points, camera = timeline.points, timeline.camera
     k = camera.intrinsics
     stream.log("world", rr.ViewCoordinates.RDF, static=True)
+    stream.log("world", rr.AnyValues(**source.scale.known), static=True)
     stream.log("world/points", rr.Points3D(points.positions, colors=points.colours), static=True)
     stream.log("world/splats", _splats(rr, source.need_scene(), source.white), static=True)
     stream.log("world/path", rr.LineStrips3D([timeline.centres]), static=True)

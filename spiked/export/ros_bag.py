@@ -3,7 +3,7 @@
 import errno
 import os
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ def fill(source: ExportSource, folder: Path, options: ExportOptions) -> str:
     """Write the bag's folder. Raises SceneError and ConfigurationError."""
     timeline = read_timeline(source, options)
     make = RosMessages()
-    with RosBag(folder, make) as bag:
+    with RosBag(folder, make, source.scale.texts) as bag:
         for topic, at, message in _messages(make, timeline):
             bag.write(topic, at, message)
     return timeline.said()
@@ -57,8 +57,9 @@ def _messages(make: RosMessages, timeline: Timeline) -> Iterator[tuple[str, int,
 class RosBag:
     """Writes a bag into an empty folder, which names its files. After an error the folder is not a bag."""
 
-    def __init__(self, folder: Path, make: RosMessages) -> None:
-        """Raises ConfigurationError if rosbags is not installed."""
+    def __init__(self, folder: Path, make: RosMessages, about: Mapping[str, str] | None = None) -> None:
+        """`about` becomes `custom_data` of metadata.yaml. Raises ConfigurationError if rosbags is not installed."""
+        self._about = about or {}
         self._rosbag2 = optional("rosbags.rosbag2", "ros")
         self._folder, self._store = folder, make.store
         self._connections: dict[str, Any] = {}
@@ -68,6 +69,8 @@ class RosBag:
         self._writer = self._rosbag2.Writer(self._folder, version=VERSION)
         with _sqlite_errors():
             self._writer.open()
+        for name, text in self._about.items():
+            self._writer.set_custom_data(name, text)
         return self
 
     def write(self, topic: str, at_ns: int, message: Any) -> None:

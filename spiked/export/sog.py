@@ -8,6 +8,8 @@ components and the index of the largest; opacity is a byte. Axes are those of th
 import io
 import json
 import zipfile
+from collections.abc import Mapping
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,8 +33,11 @@ Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 
 
-def encode(scene: Scene, white: float = 1.0) -> bytes:
-    """The bytes of the file; radiance `white` becomes colour 1. Raises SceneError for a scene without splats."""
+def encode(scene: Scene, white: float = 1.0, about: Mapping[str, Any] | None = None) -> bytes:
+    """The bytes of the file; radiance `white` becomes colour 1, `about` stands in `asset` of meta.json.
+
+    Raises SceneError for a scene without splats.
+    """
     if not len(scene):
         raise SceneError("a scene without splats cannot be written as SOG; use PLY")
     scene = scene.select(morton_order(scene.means))
@@ -50,7 +55,7 @@ def encode(scene: Scene, white: float = 1.0) -> bytes:
     }
     meta = {
         "version": 2,
-        "asset": {"generator": "spiked"},
+        "asset": {"generator": "spiked", **(about or {})},
         "count": len(scene),
         "means": {"mins": ends[0].tolist(), "maxs": ends[1].tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scale_codes.tolist(), "files": ["scales.webp"]},

@@ -1,11 +1,11 @@
 """What an export is made of: a reconstruction, its camera, and the recording if it is at hand."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
 from spiked.errors import ConfigurationError, SceneError
-from spiked.frame_of_reference import FrameOfReference
+from spiked.frame_of_reference import FrameOfReference, KnownScale
 from spiked.recon.statistics import evenly
 from spiked.recording import Recording
 from spiked.render import Camera
@@ -54,8 +54,13 @@ class ExportSource:
     """Of files."""
     title: str = ""
     """For people, if it has another one."""
-    unit: str = "scene"
-    """Of lengths: `m` once it is in metres."""
+    scale: KnownScale = field(default_factory=KnownScale)
+    """What is known of the unit of lengths and the axes."""
+
+    @property
+    def unit(self) -> str:
+        """Of lengths: `m` once it is in metres."""
+        return self.scale.unit
 
     @classmethod
     def of_splats(cls, scene: Scene, name: str) -> "ExportSource":
@@ -65,7 +70,7 @@ class ExportSource:
     def in_frame(self, frame: FrameOfReference) -> "ExportSource":
         """The same in metres and upright axes."""
         scene = None if self.scene is None else frame.scene(self.scene)
-        return replace(self, path=frame.trajectory(self.path), scene=scene, unit="m")
+        return replace(self, path=frame.trajectory(self.path), scene=scene, scale=self.scale.in_metres)
 
     def need_scene(self) -> Scene:
         """Raises SceneError without splats."""

@@ -13,13 +13,13 @@ __all__ = ["COMPRESSED_PLY", "PLY", "SOG", "SPZ"]
 
 
 def _writer(
-    encode: Callable[[Scene, float], bytes], *, harmonics: bool = True
+    encode: Callable[[Scene, ExportSource], bytes], *, harmonics: bool = True
 ) -> Callable[[ExportSource, Path, ExportOptions], str]:
-    """What writes a scene as `encode` has it, with the radiance of white, and says if it leaves harmonics out."""
+    """What writes a scene as `encode` has it, and says if it leaves harmonics out."""
 
     def fill(source: ExportSource, path: Path, options: ExportOptions) -> str:
         scene = source.need_scene()
-        path.write_bytes(encode(scene, source.white))
+        path.write_bytes(encode(scene, source))
         if scene.harmonics is None:
             return f"{len(scene)} splats"
         degree = f"view-dependent colour of degree {scene.degree}"
@@ -34,7 +34,7 @@ PLY = ExportKind(
     readers="all viewers and trainers of splats",
     loses="nothing",
     suffix=".ply",
-    fill=_writer(lambda scene, white: scene.ply()),  # the scene's own white is noted in it
+    fill=_writer(lambda scene, source: scene.ply(notes=source.scale.notes)),  # the scene's own white is noted in it
 )
 COMPRESSED_PLY = ExportKind(
     name="compressed-ply",
@@ -42,7 +42,7 @@ COMPRESSED_PLY = ExportKind(
     readers="SuperSplat, PlayCanvas, Spark, splat-transform",
     loses="rounding: 1/2048 of a group of 256 splats; the radiance of white",
     suffix=".compressed.ply",
-    fill=_writer(compressed_ply.encode),
+    fill=_writer(lambda scene, source: compressed_ply.encode(scene, source.white, source.scale.notes)),
 )
 SPZ = ExportKind(
     name="spz",
@@ -50,7 +50,7 @@ SPZ = ExportKind(
     readers="Scaniverse, Spark, Babylon.js, Cesium",
     loses="rounding (spiked/spz.py has the bounds); the radiance of white",
     suffix=".spz",
-    fill=_writer(spz.encode),
+    fill=_writer(lambda scene, source: spz.encode(scene, source.white)),
 )
 SOG = ExportKind(
     name="sog",
@@ -58,5 +58,5 @@ SOG = ExportKind(
     readers="SuperSplat, PlayCanvas, Spark, splat-transform",
     loses="rounding: 256 values of scale and of colour; the radiance of white; view-dependent colour",
     suffix=".sog",
-    fill=_writer(sog.encode, harmonics=False),
+    fill=_writer(lambda scene, source: sog.encode(scene, source.white, source.scale.known), harmonics=False),
 )

@@ -74,6 +74,7 @@ def _about(source: ExportSource) -> dict[str, Any]:
     return {
         "name": source.title or source.name,
         "sensor": _seen_by(sensor),
+        "scale": source.scale.known,
         "times_s": path.times_s[rows].tolist(),
         "frames": np.round(path.times_s[rows] * rate - 0.5).astype(int).tolist(),
         "positions": path.centres[rows].tolist(),

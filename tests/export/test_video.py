@@ -9,6 +9,7 @@ import pytest
 
 from spiked.errors import ConfigurationError, SpikedError
 from spiked.export import ExportOptions, ExportSource, find_kind
+from spiked.frame_of_reference import KnownScale
 from spiked.pose import quaternion
 from spiked.simulate import Room
 from spiked.video import smoothed_path
@@ -58,4 +59,6 @@ def test_poses_that_are_none_are_refused(
 def test_chosen_poses_are_not_in_metres(source: ExportSource, tmp_path: Path) -> None:
     poses = ((0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0),) * 2
     with pytest.raises(ConfigurationError, match="leave metres out"):
-        find_kind("video").write(replace(source, unit="m"), tmp_path / "a.mp4", ExportOptions(through=poses))
+        find_kind("video").write(
+            replace(source, scale=KnownScale("m", 1.0)), tmp_path / "a.mp4", ExportOptions(through=poses)
+        )

@@ -55,7 +55,15 @@ class Exports:
         result = result.metric() if metric else result
         capture = self._captures.get(row.capture_id).row
         title = row.name or capture.name
-        known = (row.id, files.stamp(result.scene), kind.name, options, result.frame, title if kind.titled else "")
+        known = (
+            row.id,
+            files.stamp(result.scene),
+            kind.name,
+            options,
+            result.frame,
+            result.scale,
+            title if kind.titled else "",
+        )
         number = result.published.version
         made = self._place / f"{row.id}-{number:06d}-{zlib.crc32(repr(known).encode()):08x}"
         if not made.exists():
@@ -66,7 +74,9 @@ class Exports:
                     raise
                 raise NothingError(str(error)) from error  # of an early version: no other options would help
         name = f"{row.id}-{number:06d}-{kind.name}{kind.suffix or '.zip'}"
-        return files.ranged(request, made, name, kind.sent_as, **{"X-Scene-Version": str(number)})
+        return files.ranged(
+            request, made, name, kind.sent_as, **{"X-Scene-Version": str(number)}, **result.scale_headers
+        )
 
     def _command(
         self,
@@ -93,8 +103,8 @@ class Exports:
             sensor=result.sensor,
             recording=self._folder.recording(row.capture_id) if closed else None,
             first_frame=0 if capture.recording is None else capture.recording.first_frame,
-            metres_per_unit=None if result.frame is None else result.frame.metres_per_unit,
-            up=None if result.frame is None else result.frame.up,
+            scale=result.scale,
+            metric=result.frame is not None,
         )
 
     def _make(self, command: ExportCommand) -> None:

@@ -12,7 +12,7 @@ from fastapi import Request, Response
 
 from spiked import spz
 from spiked.errors import SceneError
-from spiked.frame_of_reference import FrameOfReference
+from spiked.frame_of_reference import FrameOfReference, KnownScale
 from spiked.poses import PoseFile
 from spiked.render import Camera
 from spiked.scene import Scene
@@ -26,7 +26,7 @@ from spiked_service.base.limits import ConcurrencyLimit
 from spiked_service.captures.captures import Captures
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.results.published import Published
-from spiked_service.results.scene_scale import MetricPoses, read_scale
+from spiked_service.results.scene_scale import MetricPoses, read_scale, scale_headers
 from spiked_service.results.shown_scene import ShownScene
 from spiked_service.results.versions import at
 from spiked_service.store.catalogue import UnknownIdError
@@ -81,6 +81,21 @@ class Result:
             return None
         return Camera(self.sensor.intrinsics, self.sensor.width, self.sensor.height)
 
+    @property
+    def scale(self) -> KnownScale:
+        """What is known of the scene's own unit and axes. Raises SceneError."""
+        return read_scale(self.folder).known_of(self.published.version)
+
+    @property
+    def scale_of_answer(self) -> KnownScale:
+        """The same of what is answered, which may be in metres. Raises SceneError."""
+        return self.scale if self.frame is None else self.scale.in_metres
+
+    @property
+    def scale_headers(self) -> dict[str, str]:
+        """The headers that say it. Raises SceneError."""
+        return scale_headers(self.scale_of_answer)
+
     def metric(self) -> "Result":
         """The same in metres, with up along -y. Raises NothingError while the scale is not known."""
         frame = read_scale(self.folder).frame_of(self.published.version)
@@ -99,14 +114,15 @@ class SceneFiles:
     def response(self, request: Request, result: Result, kind: SceneFormat, max_splats: int | None) -> Response:
         """The scene of a version, or a fixed sample of `max_splats`. Raises NotReadyError, SceneError."""
         version = {"X-Scene-Version": str(result.published.version), "X-White": repr(result.published.white)}
+        version |= result.scale_headers
         name = f"scene-{result.published.version:06d}.{kind}"
         if kind is SceneFormat.PLY and max_splats is None and result.frame is None:
             return files.ranged(request, result.scene, name, **version)
         stamp = files.stamp(result.scene)
-        tag = files.etag(result.published.version, kind, stamp, max_splats, result.frame)
+        tag = files.etag(result.published.version, kind, stamp, max_splats, result.frame, result.scale)
         if files.unchanged(request, tag):
             return files.not_modified(tag)
-        key = (result.scene, stamp, kind, max_splats, result.frame)
+        key = (result.scene, stamp, kind, max_splats, result.frame, result.scale)
         with self._lock:
             body = self._encoded.get(key) or _encoded(result, kind, max_splats)
             self._encoded[key] = body
@@ -162,7 +178,7 @@ def _encoded(result: Result, kind: SceneFormat, max_splats: int | None) -> bytes
         scene = result.frame.scene(scene)
     if max_splats is not None:
         scene = scene.sample(max_splats)
-    return spz.encode(scene, white) if kind is SceneFormat.SPZ else scene.ply(white)
+    return spz.encode(scene, white) if kind is SceneFormat.SPZ else scene.ply(white, result.scale_of_answer.notes)
 
 
 class Results:
@@ -216,7 +232,8 @@ class Results:
         version, poses, sensor = result.published.version, result.poses, result.sensor
         if path:
             poses, sensor = self._path(result, path)
-        return trajectory_response(request, poses(), version, sensor, kind, part, self.downloads)
+        scale = result.scale_of_answer
+        return trajectory_response(request, poses(), version, sensor, kind, part, self.downloads, scale)
 
     def _path(self, result: Result, path: int) -> tuple[Callable[[], PoseFile], Sensor | None]:
         """The poses of another recording in the map of a version, and its sensor."""

@@ -13,6 +13,7 @@ from fastapi import Request, Response
 from numpy.typing import NDArray
 
 from spiked.errors import ConfigurationError, SceneError
+from spiked.frame_of_reference import KnownScale
 from spiked.pose import Array
 from spiked.poses import PoseFile, Records, convert_tum
 from spiked.sensor import Sensor
@@ -30,7 +31,7 @@ from spiked_service.api.streams import GuardedStream
 from spiked_service.base.limits import ConcurrencyLimit
 from spiked_service.results.published import Published
 from spiked_service.results.report.zip_stream import Part, zip_pieces
-from spiked_service.results.scene_scale import MetricPoses
+from spiked_service.results.scene_scale import MetricPoses, scale_headers
 from spiked_service.results.timeline import Timeline, frames_at
 from spiked_service.results.versions import pose_file
 
@@ -120,13 +121,14 @@ def trajectory_response(
     kind: TrajectoryFormat,
     part: Range,
     concurrency: ConcurrencyLimit,
+    scale: KnownScale,
 ) -> Response:
-    """A range of poses in one of the formats; `concurrency` limits concurrent responses.
+    """A range of poses in one of the formats, with the scale of its unit; `concurrency` limits concurrent responses.
 
     Raises NoPoseError, ConfigurationError, OverloadedError.
     """
     frame = poses.frame if isinstance(poses, MetricPoses) else None
-    tag = files.etag(version, kind, files.stamp(poses.path), part.from_s, part.to_s, part.step, frame)
+    tag = files.etag(version, kind, files.stamp(poses.path), part.from_s, part.to_s, part.step, frame, scale)
     if files.unchanged(request, tag):
         return files.not_modified(tag)
     rows = part.of(poses)
@@ -134,27 +136,30 @@ def trajectory_response(
         raise ConfigurationError("this format needs the optics, which are unknown for this capture; use format=tum")
     media_type, ending = TRAJECTORY_TYPES[kind]
     headers = {**files.attached(tag, f"trajectory.{ending}"), "X-Scene-Version": str(version)}
+    headers |= scale_headers(scale)
     concurrency.acquire()
-    return GuardedStream(_written(poses, rows, version, sensor, kind), media_type, headers, over=concurrency.release)
+    return GuardedStream(
+        _written(poses, rows, version, sensor, kind, scale), media_type, headers, over=concurrency.release
+    )
 
 
 def _written(
-    poses: PoseFile, rows: range, version: int, sensor: Sensor | None, kind: TrajectoryFormat
+    poses: PoseFile, rows: range, version: int, sensor: Sensor | None, kind: TrajectoryFormat, scale: KnownScale
 ) -> Iterator[str] | Iterator[bytes]:
     parts = (poses.trajectory(piece) for piece in _pieces(rows))
     match kind:
         case TrajectoryFormat.TUM:
-            return tum_lines(parts)
+            return tum_lines(parts, scale.notes)
         case TrajectoryFormat.KITTI:
             return kitti_lines(parts)
         case TrajectoryFormat.JSON:
             return _json(poses, rows, version, _rate_hz(sensor))
         case TrajectoryFormat.NERFSTUDIO:
             assert sensor is not None
-            return nerfstudio_lines(parts, sensor)
+            return nerfstudio_lines(parts, sensor, {"scale": scale.known})
         case TrajectoryFormat.COLMAP:
             assert sensor is not None
-            return _colmap(parts, sensor)
+            return _colmap(parts, sensor, scale.notes)
 
 
 def _pieces(rows: range) -> Iterator[range]:
@@ -202,9 +207,9 @@ def _state(known: bytes) -> str | None:
     return known.decode() or None
 
 
-def _colmap(parts: Iterable[Trajectory], sensor: Sensor) -> Iterator[bytes]:
+def _colmap(parts: Iterable[Trajectory], sensor: Sensor, notes: Iterable[str]) -> Iterator[bytes]:
     """A ZIP of a text model without points."""
-    images = (text.encode() for text in colmap_lines(parts))
+    images = (text.encode() for text in colmap_lines(parts, notes))
     return zip_pieces(
         [
             Part("cameras.txt", [colmap_camera(sensor).encode()], packed=False),

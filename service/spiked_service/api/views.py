@@ -21,7 +21,6 @@ from spiked_service.api.schemas.views import MAX_PIXELS, PathModel, PointOut, Vi
 from spiked_service.api.trajectories import Range
 from spiked_service.results.image_encoding import ImageFormat, encode
 from spiked_service.results.rate_statistics import NotInImageError
-from spiked_service.results.scene_scale import read_scale
 from spiked_service.results.view_renderer import Output, Pose, ViewRenderer, shown
 
 SOLID = 0.5
@@ -42,7 +41,7 @@ def views_response(result: Result, request: ViewRequest, kind: ImageFormat, rend
         )
     white = result.published.white
     red, green, blue = (part * white for part in request.background)
-    headers = {"X-Scene-Version": str(result.published.version), "Cache-Control": "no-store"}
+    headers = {"X-Scene-Version": str(result.published.version), "Cache-Control": "no-store", **result.scale_headers}
     pictures = []
     for pose in poses:
         plane = shown(renderer.render(result.scene, camera, pose), request.output, (red, green, blue))
@@ -89,14 +88,16 @@ def point_at(result: Result, x: int, y: int, frame: int | None, renderer: ViewRe
     opacity, depth = float(image.alpha[y, x]), float(image.depth[y, x])
     version, solid = result.published.version, opacity >= SOLID
     ray = seen.intrinsics.unproject(np.array([x + 0.5, y + 0.5]))
-    scale = read_scale(result.folder).frame_of(version)
+    scale = result.scale
+    depth_m = depth * scale.metres_per_unit if solid and scale.metres_per_unit is not None else None
     return PointOut(
         version=version,
         frame=shown_frame,
         opacity=opacity,
         rate=np.ravel(image.values[y, x]).tolist(),
         depth=depth if solid else None,
-        depth_m=depth * scale.metres_per_unit if solid and scale is not None else None,
+        depth_m=depth_m,
+        depth_m_sigma=None if depth_m is None or scale.scale_sigma is None else depth_m * scale.scale_sigma,
         position=(pose.centre + pose.rotation @ ray * depth).tolist() if solid else None,
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from spiked.errors import ConfigurationError, SceneError
-from spiked.frame_of_reference import FrameOfReference
+from spiked.frame_of_reference import FrameOfReference, KnownScale
 from spiked.pose import quaternion, rotation_of
 from spiked.poses import PoseFile, Records
 from spiked.whole_files import write_atomically
@@ -52,9 +52,24 @@ class SceneScale(BaseModel):
         """The change to upright axes and metres; None while the scale is not known."""
         return None if self.metres_per_unit is None else FrameOfReference(self.metres_per_unit, self.up)
 
+    @property
+    def known(self) -> KnownScale:
+        """What files in the scene's own unit and axes say."""
+        return KnownScale("scene", self.metres_per_unit, self.sigma, self.up)
+
+    def known_of(self, version: int) -> KnownScale:
+        """The same for a version; nothing for one of an earlier run."""
+        return self.known if version > self.since else KnownScale()
+
     def frame_of(self, version: int) -> FrameOfReference | None:
         """The same for a version; None for one of an earlier run."""
         return self.frame if version > self.since else None
+
+
+def scale_headers(scale: KnownScale) -> dict[str, str]:
+    """The headers that say what is known of the unit of an answer's lengths."""
+    values = {"X-Metres-Per-Unit": scale.metres_per_unit, "X-Scale-Sigma": scale.scale_sigma}
+    return {name: repr(value) for name, value in values.items() if value is not None}
 
 
 def read_scale(folder: Path) -> SceneScale:

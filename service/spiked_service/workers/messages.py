@@ -8,6 +8,7 @@ from pydantic import BaseModel, Field, TypeAdapter
 
 from spiked.camera import StoredCameraOptions
 from spiked.export import ExportOptions
+from spiked.frame_of_reference import KnownScale
 from spiked.profile import CameraProfile
 from spiked.recon import State
 from spiked.recording.geometry import Assumable
@@ -190,9 +191,10 @@ class ExportCommand(_Command):
     recording: Path | None
     first_frame: int
     """Index in the capture of the recording's first frame."""
-    metres_per_unit: float | None
-    """None: in the scene's own unit and axes."""
-    up: tuple[float, float, float] | None
+    scale: KnownScale
+    """Of the scene."""
+    metric: bool
+    """Whether to write it in metres, by that scale, which is then known."""
 
 
 Command = Annotated[

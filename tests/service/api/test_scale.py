@@ -24,12 +24,24 @@ def test_a_scale_is_stored_once_and_answers_are_in_metres(service: Any, done: Ca
     np.testing.assert_allclose(metric["positions"], 2 * np.array(own["positions"]), atol=1e-8)
     point = http.get(f"{url}/point?x=80&y=50").json()
     assert point["depth"] > 0 and point["depth_m"] == 2 * point["depth"]
+    assert point["depth_m_sigma"] == pytest.approx(0.01 * point["depth_m"])
     up = http.put(f"{url}/scale", json={"revision": 1, "up": [0, 0, -3]}).json()
     assert up["up"] == [0, 0, -1] and up["metres_per_unit"] == 2.0
     turned = http.get(f"{url}/trajectory?step=50&metric=true").json()
     np.testing.assert_allclose(np.array(turned["positions"])[:, 1], 2 * np.array(own["positions"])[:, 2], atol=1e-8)
     plain, larger = (http.get(f"{url}/scene?metric={flag}").content for flag in ("false", "true"))
-    assert len(plain) == len(larger) and plain != larger
+    assert plain != larger and b"comment scale_sigma 0.01\ncomment up 0.0 -1.0 0.0\n" in larger[:2000]
+    for metric_flag, unit in (("false", "2.0"), ("true", "1.0")):
+        answers = [http.get(f"{url}/{path}metric={metric_flag}") for path in ("scene?", "trajectory?format=tum&")]
+        answers.append(http.get(f"{url}/exports/ply?metric={metric_flag}"))
+        for answer in answers:
+            assert answer.headers["X-Metres-Per-Unit"] == unit and answer.headers["X-Scale-Sigma"] == "0.01"
+    view = http.post(f"{url}/views", json={"camera": {"frame": 100}, "output": "depth"})
+    assert (view.headers["X-Metres-Per-Unit"], view.headers["X-Scale-Sigma"]) == ("2.0", "0.01")
+    tum = http.get(f"{url}/trajectory?format=tum&metric=true").text
+    assert tum.startswith("# unit m\n# metres_per_unit 1.0\n# scale_sigma 0.01\n# up 0.0 -1.0 0.0\n")
+    studio = http.get(f"{url}/trajectory?format=nerfstudio&step=50").json()
+    assert studio["scale"] == {"unit": "scene", "metres_per_unit": 2.0, "scale_sigma": 0.01, "up": [0, 0, -1]}
     assert http.delete(f"{url}/scale").json()["metres_per_unit"] is None
 
 

@@ -16,6 +16,7 @@ from spiked_service.api.trajectories import Range, TrajectoryFormat, open_poses,
 from spiked_service.base.limits import ConcurrencyLimit, OverloadedError
 from spiked_service.results.published import Published
 
+from spiked.frame_of_reference import KnownScale
 from spiked.poses import PoseAppender, PoseFile, Records
 from spiked.sensor import Intrinsics, Sensor
 from spiked.trajectory import Trajectory
@@ -79,7 +80,7 @@ class Client:
                     gone.set()
 
             scope = {"type": "http", "method": "GET", "path": "/", "headers": [], "query_string": b""}
-            answer = trajectory_response(Request(scope), poses, 1, SENSOR, kind, part, self.concurrency)
+            answer = trajectory_response(Request(scope), poses, 1, SENSOR, kind, part, self.concurrency, KnownScale())
             await answer(scope, receive, send)
 
         asyncio.run(go())
@@ -116,7 +117,7 @@ def test_the_exports_read_what_is_asked_for(poses: Counted, kind: TrajectoryForm
         case TrajectoryFormat.KITTI:
             assert written.decode() == part.kitti()
         case TrajectoryFormat.NERFSTUDIO:
-            assert json.loads(written) == json.loads(part.nerfstudio(SENSOR))
+            assert json.loads(written) == {**json.loads(part.nerfstudio(SENSOR)), "scale": {"unit": "scene"}}
             assert len(json.loads(written)["frames"]) == len(part)
         case TrajectoryFormat.COLMAP:
             with zipfile.ZipFile(io.BytesIO(written)) as archive:

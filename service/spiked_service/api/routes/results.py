@@ -67,7 +67,17 @@ PosedFrame = Annotated[
 ]
 
 _TEXT: dict[str, Any] = {"schema": {"type": "string"}}
-_VERSION: dict[str, Any] = {"X-Scene-Version": {"description": "Its version.", "schema": {"type": "integer"}}}
+_VERSION: dict[str, Any] = {
+    "X-Scene-Version": {"description": "Its version.", "schema": {"type": "integer"}},
+    "X-Metres-Per-Unit": {
+        "description": "Metres for the unit of its lengths, where known.",
+        "schema": {"type": "number"},
+    },
+    "X-Scale-Sigma": {
+        "description": "Relative standard deviation of that, where known.",
+        "schema": {"type": "number"},
+    },
+}
 _TRAJECTORY: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "The trajectory.",

@@ -149,4 +149,7 @@ class PointOut(Out):
         None, description="Along the camera's axis, in the scene's unit of length; null below an opacity of 0.5."
     )
     depth_m: float | None = Field(None, description="The same in metres; null while the scale is not known.")
+    depth_m_sigma: float | None = Field(
+        None, description="Standard deviation of depth_m by that of the scale alone; null: not known."
+    )
     position: list[float] | None = Field(None, description="Of the surface, in the axes of the scene; null as depth.")

@@ -12,6 +12,7 @@ from spiked.whole_files import whole_folder
 from spiked_service.cli import outputs
 from spiked_service.cli.console import output
 from spiked_service.cli.maps import read_map
+from spiked_service.results.map_folder import MapFolder
 from spiked_service.results.scene_scale import METRIC, SCALE, ScaleSource, SceneScale, read_scale, write_scale
 
 
@@ -65,13 +66,21 @@ def scale(
         frame = FrameOfReference(by_tags.metres_per_unit, kept)
         sigma, source = by_tags.sigma, ScaleSource.TAG
     made = SceneScale(metres_per_unit=frame.metres_per_unit, sigma=sigma, source=source, up=frame.direction)
-    with outputs.writing("OUT", map_folder):
-        with whole_folder(map_folder / METRIC) as metric:
-            frame.scene(found.scene).write_ply(metric / "scene.ply")
-            frame.trajectory(found.trajectory).write_tum(metric / "trajectory.tum")
-            (map_folder / SCALE).unlink(missing_ok=True)  # a kill between the two leaves no scale, not another one
-        write_scale(map_folder, made)
+    _write(map_folder, found, made)
     sure = "" if made.sigma is None else f" (+- {made.sigma:.2%})"
     output.print(
         f"{map_folder}: a unit is {frame.metres_per_unit:.6g} m{sure}; {map_folder / METRIC} is in metres", markup=False
     )
+
+
+def _write(map_folder: Path, found: MapFolder, made: SceneScale) -> None:
+    """Write scale.json, and the folder metric."""
+    frame = made.frame
+    assert frame is not None, "a scale was found"
+    notes = made.known.in_metres.notes
+    with outputs.writing("OUT", map_folder):
+        with whole_folder(map_folder / METRIC) as metric:
+            frame.scene(found.scene).write_ply(metric / "scene.ply", notes=notes)
+            frame.trajectory(found.trajectory).write_tum(metric / "trajectory.tum", notes)
+            (map_folder / SCALE).unlink(missing_ok=True)  # a kill between the two leaves no scale, not another one
+        write_scale(map_folder, made)

@@ -21,6 +21,7 @@ from spiked_service.results.map_folder import EVALUATION, PATHS
 from spiked_service.results.map_reports import LOCALISATION, REPORT, recorded_geometry
 from spiked_service.results.report.figures import Figures
 from spiked_service.results.report.source import Pieces, Render, ReportSource, pairs, thinned, without_folders
+from spiked_service.results.scene_scale import read_scale
 from spiked_service.results.view_renderer import Pose
 
 
@@ -89,6 +90,7 @@ class FolderReport:
             scene=Scene.read_ply(scene) if scene.is_file() else None,
             recording=recording,
             name=self.folder.resolve().name,
+            scale=read_scale(self.folder).known,
         )
 
     def _document(self) -> dict[str, Any]:

@@ -53,10 +53,12 @@ def source_of(command: ExportCommand) -> ExportSource:
         first_frame=command.first_frame,
         name=command.name,
         title=command.title,
+        scale=command.scale,
     )
-    if command.metres_per_unit is None:
+    if not command.metric:
         return source
-    return source.in_frame(FrameOfReference(command.metres_per_unit, command.up))
+    assert command.scale.metres_per_unit is not None, "the scale of a metric export is known"
+    return source.in_frame(FrameOfReference(command.scale.metres_per_unit, command.scale.up))
 
 
 def _zip(folder: Path, out: Path) -> None:

@@ -44,8 +44,8 @@ VIEWS = 48
 """Views along the path in which tags are looked for."""
 LEAST_VIEWS = 4
 """Views that have to show a tag."""
-RENDERED_PX = 1200
-"""Width of the rendered pictures, at least: the corners of small tags are found more surely in large ones."""
+ENLARGED_PX = 1200
+"""Width of the pictures, at least: the corners of small tags are found more surely in large ones."""
 MOST_ERROR_PX = 2.0
 """Largest distance of a corner from its projection, in pixels of the picture, before its view is left out."""
 LEAST_TURN_DEG = 2.0
@@ -122,16 +122,26 @@ def sightings(
     """All tags in pictures of the scene, rendered without distortion along the path. Raises ConfigurationError."""
     if family not in TAG_FAMILIES:
         raise ConfigurationError(f"no family of AprilTags {family!r}: choose one of {', '.join(TAG_FAMILIES)}")
-    larger = max(1, -(-RENDERED_PX // camera.width))
-    optics = camera.intrinsics.pinhole.scaled(larger)
-    rasteriser = Rasteriser(Camera(optics, camera.width * larger, camera.height * larger))
+    larger = max(1, -(-ENLARGED_PX // camera.width))
+    pinhole = camera.intrinsics.pinhole
+    # Of the camera's own size, then enlarged: the renderer widens splats by a share of a pixel, as when the scene was
+    # fitted. In a larger picture all are thinner, and a black square on white is 1 % larger.
+    rasteriser = Rasteriser(Camera(pinhole, camera.width, camera.height))
     found = []
     for row in evenly(len(path), views):
         rotation, centre = path.rotations[row], path.centres[row]
         image = rasteriser.forward(scene, rotation[None], centre[None]).values
         grey = image if image.ndim == 2 else image.mean(axis=2)
-        found += tags_in(grey / max(scene.colour_of_white, 1e-12), optics, rotation, centre, family)
+        picture = enlarged(grey / max(scene.colour_of_white, 1e-12), larger)
+        found += tags_in(picture, pinhole.scaled(larger), rotation, centre, family)
     return found
+
+
+def enlarged(picture: NDArray[np.float32], times: int) -> NDArray[np.float32]:
+    """A picture [H, W] with `times` as many rows and columns, interpolated."""
+    if times == 1:
+        return picture
+    return np.asarray(cv2.resize(picture, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC), np.float32)
 
 
 def tags_in(

@@ -53,6 +53,27 @@ def _table(x: float, y: float, yaw_deg: float) -> list[_Block]:
     return blocks
 
 
+_CARD = (3.2, 1.5, 1.47)
+"""Centre of a card: 0.75 m in front of the start."""
+_CARD_THICK_M = 0.006
+"""Of its board."""
+
+
+@dataclass(frozen=True)
+class Card:
+    """A printed card, upright in front of the camera: tags and boards of known size."""
+
+    picture: NDArray[np.float32]
+    """Albedo, 0 to 1, [rows, columns], the top row first."""
+    width_m: float
+
+    @property
+    def size(self) -> tuple[float, float, float]:
+        """Width, thickness and height, metres."""
+        rows, columns = self.picture.shape
+        return self.width_m, _CARD_THICK_M, self.width_m * rows / columns
+
+
 _FURNITURE = [
     *_table(3.4, 2.75, 18.0),
     _Block((3.15, 2.7, 0.84), (0.28, 0.2, 0.18), Material.CLOTH, _RED, 40.0),
@@ -89,11 +110,13 @@ _SHELL_COLOURS = (_WHITE, _GREEN, _WHITE, _RED, _OAK, _WHITE)
 class Room:
     """The room as a scene. The seed changes the textures, not the furniture."""
 
-    def __init__(self, colour: bool = False, seed: int = 0, texel_m: float = 0.006, threads: int = 1) -> None:
+    def __init__(
+        self, colour: bool = False, seed: int = 0, texel_m: float = 0.006, threads: int = 1, card: Card | None = None
+    ) -> None:
         """colour: three channels instead of one. texel_m: edge of a texture's finest cell in metres."""
         self._threads = threads
         self._channels = 3 if colour else 1
-        self._native = _build(seed, self._channels, texel_m)
+        self._native = _build(seed, self._channels, texel_m, card)
 
     def stage(self, intrinsics: Intrinsics, flow_px: float = 0.12, parallax: float = 0.1) -> Stage:
         """A good place to start from: facing the far wall over the table."""
@@ -132,9 +155,10 @@ class _Atlas:
     texel_m: float
     entries: list[tuple[int, int, int, int]]
     texels: list[NDArray[np.uint16]]
+    texels_a_metre: list[float]
     used: int = 0
 
-    def add(self, radiance: NDArray[np.float32]) -> int:
+    def add(self, radiance: NDArray[np.float32], texel_m: float | None = None) -> int:
         """Store a picture [height, width, 3] with its halved versions; returns its number."""
         level = radiance if self.channels == 3 else radiance @ LUMINANCE[:, None]
         height, width = level.shape[:2]
@@ -149,13 +173,14 @@ class _Atlas:
             half = (max(level.shape[1] // 2, 1), max(level.shape[0] // 2, 1))
             level = cv2.resize(level, half, interpolation=cv2.INTER_AREA)
         self.entries.append((offset, width, height, levels))
+        self.texels_a_metre.append(1 / (texel_m or self.texel_m))
         return len(self.entries) - 1
 
 
-def _build(seed: int, channels: int, texel_m: float) -> _simulate.Room:
+def _build(seed: int, channels: int, texel_m: float, card: Card | None) -> _simulate.Room:
     rng = np.random.default_rng(np.random.SeedSequence([seed, 0x2002]))
     size = np.array(_SIZE)
-    atlas = _Atlas(channels, texel_m, [], [])
+    atlas = _Atlas(channels, texel_m, [], [], [])
     boxes = [np.concatenate([size / 2, np.eye(3).ravel(), size / 2])]
     faces = [[_face(atlas, boxes[0], f, _SHELL[f], _SHELL_COLOURS[f], rng=rng, outward=-1.0) for f in range(6)]]
     for block in _FURNITURE:
@@ -165,12 +190,16 @@ def _build(seed: int, channels: int, texel_m: float) -> _simulate.Room:
         materials = [block.front if f == 2 and block.front else block.material for f in range(6)]
         faces.append([_face(atlas, box, f, materials[f], block.colour, rng=rng, outward=1.0) for f in range(6)])
         boxes.append(box)
+    if card is not None:
+        boxes.append(np.concatenate([_CARD, np.eye(3).ravel(), np.array(card.size) / 2]))
+        faces.append([_face(atlas, boxes[-1], f, Material.PLASTER, _WHITE, rng=rng, outward=1.0) for f in range(6)])
+        faces[-1][2] = _printed(atlas, boxes[-1], card)
     return _simulate.make_room(
         channels,
         np.array(boxes, np.float32),
         np.array(faces, np.int32),
         np.array(atlas.entries, np.int64),
-        np.full(len(atlas.entries), 1 / texel_m, np.float32),
+        np.array(atlas.texels_a_metre, np.float32),
         np.concatenate(atlas.texels),
     )
 
@@ -202,6 +231,13 @@ def _face(
     )
     light = _light(points, normal * outward).astype(np.float32)
     return atlas.add(albedo * cv2.resize(light, (width, height), interpolation=cv2.INTER_LINEAR)[..., None])
+
+
+def _printed(atlas: _Atlas, box: NDArray[np.float64], card: Card) -> int:
+    """The face to -y of a card; the axes of its texture are z, upwards, and x."""
+    light = float(_light(box[None, :3], np.array([0.0, -1.0, 0.0]))[0])
+    albedo = np.repeat(card.picture[::-1].T[..., None], 3, axis=2)
+    return atlas.add(np.ascontiguousarray(light * albedo, np.float32), card.width_m / card.picture.shape[1])
 
 
 def _light(points: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -5,6 +5,7 @@ is needed. The square that fits all sightings of a tag best has the size of the 
 """
 
 from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -122,19 +123,31 @@ def sightings(
     """All tags in pictures of the scene, rendered without distortion along the path. Raises ConfigurationError."""
     if family not in TAG_FAMILIES:
         raise ConfigurationError(f"no family of AprilTags {family!r}: choose one of {', '.join(TAG_FAMILIES)}")
+    found = []
+    for picture, optics, rotation, centre in pictures_along(scene, path, camera, views):
+        found += tags_in(picture, optics, rotation, centre, family)
+    return found
+
+
+def pictures_along(
+    scene: Scene, path: Trajectory, camera: Camera, views: int
+) -> Iterator[tuple[NDArray[np.float32], Intrinsics, Array, Array]]:
+    """Grey pictures of the scene along the path, white is 1, without distortion, with their optics and poses."""
     larger = max(1, -(-ENLARGED_PX // camera.width))
     pinhole = camera.intrinsics.pinhole
     # Of the camera's own size, then enlarged: the renderer widens splats by a share of a pixel, as when the scene was
     # fitted. In a larger picture all are thinner, and a black square on white is 1 % larger.
     rasteriser = Rasteriser(Camera(pinhole, camera.width, camera.height))
-    found = []
     for row in evenly(len(path), views):
         rotation, centre = path.rotations[row], path.centres[row]
         image = rasteriser.forward(scene, rotation[None], centre[None]).values
         grey = image if image.ndim == 2 else image.mean(axis=2)
-        picture = enlarged(grey / max(scene.colour_of_white, 1e-12), larger)
-        found += tags_in(picture, pinhole.scaled(larger), rotation, centre, family)
-    return found
+        yield (
+            enlarged(grey / max(scene.colour_of_white, 1e-12), larger),
+            pinhole.scaled(larger),
+            rotation,
+            centre,
+        )
 
 
 def enlarged(picture: NDArray[np.float32], times: int) -> NDArray[np.float32]:
@@ -218,11 +231,11 @@ def _fit(number: int, views: list[Sighting]) -> FoundTag | None:
     """The square that all sightings of a tag agree with best; None if too few agree, or all from one side."""
     if len(views) < LEAST_VIEWS:
         return None
-    start = _square(np.stack([_crossing(views, corner) for corner in range(4)]))
+    start = _square(np.stack([crossing([(one.centre, one.rotation @ one.rays[k]) for one in views]) for k in range(4)]))
     fit = least_squares(_errors, start, args=(views,), loss="soft_l1")
     worst = np.abs(_errors(fit.x, views)).reshape(len(views), -1).max(axis=1)
     views = [one for one, error in zip(views, worst, strict=True) if error < MOST_ERROR_PX]
-    if len(views) < LEAST_VIEWS or _turn_deg(views, fit.x[3:6]) < LEAST_TURN_DEG:
+    if len(views) < LEAST_VIEWS or turn_deg([one.centre for one in views], fit.x[3:6]) < LEAST_TURN_DEG:
         return None
     fit = least_squares(_errors, fit.x, args=(views,))
     errors = _errors(fit.x, views)
@@ -241,15 +254,14 @@ def _fit(number: int, views: list[Sighting]) -> FoundTag | None:
     )
 
 
-def _crossing(views: list[Sighting], corner: int) -> Array:
-    """The point nearest to the lines of sight to a corner."""
+def crossing(lines: Sequence[tuple[Array, Array]]) -> Array:
+    """The point nearest to lines of sight, each a point and a direction."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
-    for one in views:
-        along = one.rotation @ one.rays[corner]
-        along /= np.linalg.norm(along)
-        across = np.eye(3) - np.outer(along, along)
+    for centre, along in lines:
+        unit = along / np.linalg.norm(along)
+        across = np.eye(3) - np.outer(unit, unit)
         normal += across
-        right += across @ one.centre
+        right += across @ centre
     return np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0], np.float64)
 
 
@@ -280,8 +292,8 @@ def _errors(square: Array, views: list[Sighting]) -> Array:
     return np.concatenate(found).ravel()
 
 
-def _turn_deg(views: list[Sighting], point: Array) -> float:
+def turn_deg(centres: Sequence[Array], point: Array) -> float:
     """Largest angle between the directions from which a point is seen."""
-    towards = np.stack([point - one.centre for one in views])
+    towards = np.stack([point - centre for centre in centres])
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     return float(np.degrees(np.arccos(np.clip(towards @ towards.T, -1, 1)).max()))

@@ -4,14 +4,12 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tag_card import SIDE_M, TAG, tag_card
+from tag_card import SIDE_M, TAG, card_scene, tag_card
 
 from spiked.errors import ConfigurationError, SceneError
 from spiked.render import Camera
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics
-from spiked.simulate import Room
-from spiked.simulate.motion import hand_shake
 from spiked.tag_scale import TAG_FAMILIES, Sighting, scale_by_sightings, scale_by_tags, tags_in
 from spiked.trajectory import Trajectory
 
@@ -67,25 +65,7 @@ def test_a_tag_of_10_cm_gives_metres_within_half_a_percent() -> None:
 
 
 def test_a_tag_in_a_scene_of_splats_has_its_size() -> None:
-    optics, size = Intrinsics.from_fov(400, 248, 60.0), (400, 248)
-    room = Room(seed=3, card=tag_card())
-    frames = np.arange(0.0, 2000.0, 20.0)
-    rotations, centres = hand_shake(room.stage(optics, flow_px=0.06, parallax=0.06), 3).poses(frames)
-    rotation, centre = rotations[50], centres[50]
-    view = room.render(optics, *size, rotation, centre)
-    x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
-    depth = view.depth.reshape(-1, 1)
-    means = centre + (optics.unproject(np.stack([x, y], -1).reshape(-1, 2)) * depth) @ rotation.T
-    scene = Scene(
-        means.astype(np.float32),
-        np.tile(np.array([1, 0, 0, 0], np.float32), (len(means), 1)),
-        np.log(np.repeat(0.3 * depth / optics.fx, 3, axis=1)).astype(np.float32),
-        np.full(len(means), 4, np.float32),
-        np.ascontiguousarray(view.intensity.reshape(-1, 1), np.float32),
-        white=1.0,
-    )
-    path = Trajectory(frames / 20_000, rotations, centres)
-    found = scale_by_tags(scene, path, Camera(optics, *size), SIDE_M)
+    found = scale_by_tags(*card_scene(tag_card()), SIDE_M)
     assert [tag.tag for tag in found.tags] == [TAG]
     assert found.metres_per_unit == pytest.approx(1.0, abs=2e-3)  # the room is in metres
 

@@ -1,5 +1,6 @@
 """`spiked scale`, and what is stored of a scale."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from spiked.trajectory import Trajectory
 from ..room_map import room_map
 
 
-def run(*arguments: str | Path) -> Result:
+def run(*arguments: str | float | Path) -> Result:
     return CliRunner().invoke(app, ["scale", *map(str, arguments)])
 
 
@@ -44,6 +45,41 @@ def test_a_known_length_makes_metres(tmp_path: Path) -> None:
     stored = read_scale(out)
     assert (stored.revision, stored.metres_per_unit, stored.source) == (1, 2.0, ScaleSource.LENGTH)
     assert stored.up == (0, 0, 1)
+
+
+def test_up_is_found_by_the_floor_gravity_and_points(tmp_path: Path) -> None:
+    out = room_map(2, (0.0, 0.4)).write(tmp_path / "out")
+    done = run(out, "--floor")
+    assert done.exit_code == 0, done.output
+    assert "its scale is not known; up is" in done.output and not (out / "metric").exists()
+    assert read_scale(out).up is not None and np.degrees(np.arccos(np.array(read_scale(out).up)[2])) < 1
+    assert run(out, "--length", "3.0", "1.5", "--floor-points", "0,0,0 1,0,0 0,1,0").exit_code == 0
+    assert read_scale(out).up == (0, 0, 1) and (out / "metric" / "scene.ply").exists()
+    rotation = Trajectory.read_tum(out / "trajectory.tum").rotations[0]
+    x, y, z = rotation.T @ [0, 0, -9.81]
+    assert run(out, "--gravity", x, y, z).exit_code == 0
+    stored = read_scale(out)
+    assert stored.metres_per_unit == 2.0 and stored.up is not None
+    assert np.allclose(stored.up, [0, 0, 1], atol=1e-6)
+    assert "write three points" in str(run(out, "--floor-points", "a,b,c").exception)
+    assert "one of each" in str(run(out, "--floor", "--up", "0", "0", "1").exception)
+
+
+def test_a_map_of_two_cameras_gets_metres_by_their_distance(tmp_path: Path) -> None:
+    out = room_map(2, (0.0, 0.4)).write(tmp_path / "out")
+    assert "the paths of two cameras, and this one has 1" in str(run(out, "--baseline", "0.12").exception)
+    path = Trajectory.read_tum(out / "trajectory.tum")
+    second = Trajectory(path.times_s, path.rotations, path.centres + path.rotations @ [0.4, 0, 0])
+    (out / "paths").mkdir()
+    path.write_tum(out / "paths" / "left.tum")
+    second.write_tum(out / "paths" / "right.tum")
+    report = json.loads((out / "report.json").read_text())
+    report["paths"] = [{"name": "left"}, {"name": "right"}]
+    (out / "report.json").write_text(json.dumps(report))
+    done = run(out, "--baseline", "0.12")
+    assert done.exit_code == 0, done.output + str(done.exception)
+    stored = read_scale(out)
+    assert stored.source is ScaleSource.BASELINE and stored.metres_per_unit == pytest.approx(0.3, rel=1e-4)
 
 
 def test_what_is_missing_is_said(tmp_path: Path) -> None:

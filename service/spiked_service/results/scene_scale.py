@@ -29,6 +29,10 @@ class ScaleSource(StrEnum):
     """A known length."""
     TAG = "tag"
     """AprilTags of known size."""
+    BOARD = "board"
+    """A ChArUco board of known size."""
+    BASELINE = "baseline"
+    """Two cameras at a known distance."""
 
 
 class SceneScale(BaseModel):

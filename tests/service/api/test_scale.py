@@ -45,6 +45,37 @@ def test_a_scale_is_stored_once_and_answers_are_in_metres(service: Any, done: Ca
     assert http.delete(f"{url}/scale").json()["metres_per_unit"] is None
 
 
+def test_up_by_gravity_points_or_the_floor(service: Any, done: CaptureOut, job: str) -> None:
+    http, url = service.http, f"reconstructions/{job}"
+    path = http.get(f"{url}/trajectory?step=50").json()
+    revision = http.get(f"{url}/scale").json()["revision"]
+    w, x, y, z = path["quaternions_wxyz"][1]
+    down = [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]  # the camera's y axis
+    body = {"revision": revision, "gravity": [0, 9.81, 0], "frame": path["frames"][1]}
+    found = http.post(f"{url}/scale:up", json=body)
+    assert found.status_code == 200, found.text
+    np.testing.assert_allclose(found.json()["up"], [-part for part in down], atol=1e-6)
+    points = [[0, 100, 0], [1, 100, 0], [0, 100, 1]]
+    by_points = http.post(f"{url}/scale:up", json={"revision": revision + 1, "points": points}).json()
+    np.testing.assert_allclose(by_points["up"], [0, -1, 0], atol=1e-9)
+    line = [[0, 1, 0], [1, 1, 0], [2, 1, 0]]
+    assert "on a line" in http.post(f"{url}/scale:up", json={"revision": revision + 2, "points": line}).json()["detail"]
+    both = {"revision": revision + 2, "points": points, "gravity": [0, 1, 0]}
+    assert http.post(f"{url}/scale:up", json=both).status_code == 422
+    floor = http.post(f"{url}/scale:up", json={"revision": revision + 2})
+    assert floor.status_code in (200, 422) and (floor.status_code == 200 or "floor" in floor.json()["detail"])
+    assert http.delete(f"{url}/scale").json()["up"] is None
+
+
+def test_a_scene_without_the_board_says_so(service: Any, job: str) -> None:
+    revision = service.http.get(f"reconstructions/{job}/scale").json()["revision"]
+    body = {"revision": revision, "board": "9x6", "square_m": 0.03}
+    answer = service.http.post(f"reconstructions/{job}/scale:board", json=body)
+    assert answer.status_code == 422 and "the board is in 0 of the pictures" in answer.json()["detail"]
+    answer = service.http.post(f"reconstructions/{job}/scale:board", json=body | {"board": "big"})
+    assert answer.status_code == 422 and "COLUMNSxROWS" in answer.json()["detail"]
+
+
 @pytest.mark.parametrize("body", [{"revision": 2, "up": [0, 0, 0]}, {"revision": 2, "metres_per_unit": -1.0}])
 def test_what_is_no_scale_is_refused(service: Any, job: str, body: dict[str, Any]) -> None:
     assert service.http.put(f"reconstructions/{job}/scale", json=body).status_code == 422

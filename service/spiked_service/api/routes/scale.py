@@ -1,16 +1,30 @@
 """`reconstructions/ID/scale`: metres for a scene, and which way is up."""
 
+import numpy as np
 from fastapi import APIRouter
 from fastapi.routing import APIRoute
 
+from spiked.board import Board
+from spiked.board_scale import scale_by_board
 from spiked.errors import ConfigurationError
 from spiked.frame_of_reference import FrameOfReference
+from spiked.render import Camera
 from spiked.scene import Scene
 from spiked.tag_scale import VIEWS, scale_by_tags
+from spiked.upright import find_floor, up_by_gravity, up_by_points
 from spiked_service.api.idempotency import IdempotencyKey
 from spiked_service.api.problems import problems
-from spiked_service.api.results import Results
-from spiked_service.api.schemas.scale import FoundTagOut, ScaleOut, ScaleRequest, TagScaleOut, TagScaleRequest
+from spiked_service.api.results import Result, Results
+from spiked_service.api.schemas.scale import (
+    BoardScaleOut,
+    BoardScaleRequest,
+    FoundTagOut,
+    ScaleOut,
+    ScaleRequest,
+    TagScaleOut,
+    TagScaleRequest,
+    UpRequest,
+)
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.results.scene_scale import ScaleSource, SceneScale, read_scale, write_scale
 
@@ -29,20 +43,25 @@ def scale_routes(rows: ReconstructionRepository, results: Results, route_class: 
     @router.put("", responses=problems(404, 409, 507))
     def set_scale(reconstruction_id: str, body: ScaleRequest) -> ScaleOut:
         """Store what was measured, unless somebody stored something else meanwhile."""
-        folder = rows.folder(reconstruction_id)
-        version = results.of(rows.get(reconstruction_id)).published.version
-        scale = read_scale(folder).model_copy(update={"version": version})
+        result = results.of(rows.get(reconstruction_id))
+        changes: dict[str, object] = {}
         if body.metres_per_unit is not None:
-            length = {"metres_per_unit": body.metres_per_unit, "sigma": body.sigma, "source": ScaleSource.LENGTH}
-            scale = scale.model_copy(update=length)
+            changes = _known(body.metres_per_unit, body.sigma, ScaleSource.LENGTH)
         if body.up is not None:
-            scale = scale.model_copy(update={"up": FrameOfReference(up=body.up).direction})
-        return ScaleOut.of(write_scale(folder, scale, body.revision))
+            changes["up"] = FrameOfReference(up=body.up).direction
+        return _stored(result, body.revision, changes)
 
     @router.delete("", responses=problems(404, 507))
     def remove_scale(reconstruction_id: str) -> ScaleOut:
         """Forget the scale and the direction of up."""
         return ScaleOut.of(write_scale(rows.folder(reconstruction_id), SceneScale()))
+
+    _add_measures(router, rows, results)
+    return router
+
+
+def _add_measures(router: APIRouter, rows: ReconstructionRepository, results: Results) -> None:
+    """What finds scale or up in the scene."""
 
     @router.post(":tag", responses=problems(404, 409, 507))
     def scale_by_tag(
@@ -50,25 +69,66 @@ def scale_routes(rows: ReconstructionRepository, results: Results, route_class: 
     ) -> TagScaleOut:
         """Find AprilTags of known size in the scene, and store the scale that they give."""
         result = results.of(rows.get(reconstruction_id))
-        camera = result.camera
-        if camera is None:
-            raise ConfigurationError("the optics of this capture are not known; give a known length instead")
-        path = result.path(4 * VIEWS)
+        camera, path = _camera(result), result.path(4 * VIEWS)
         with results.downloads():
             found = scale_by_tags(Scene.read_ply(result.scene), path, camera, body.side_m, body.family)
-        folder = rows.folder(reconstruction_id)
-        scale = read_scale(folder).model_copy(
-            update={
-                "metres_per_unit": found.metres_per_unit,
-                "sigma": found.sigma,
-                "source": ScaleSource.TAG,
-                "version": result.published.version,
-            }
-        )
         tags = [
             FoundTagOut(tag=one.tag, views=one.views, side=one.side, sigma=one.sigma, corners=one.corners.tolist())
             for one in found.tags
         ]
-        return TagScaleOut(scale=ScaleOut.of(write_scale(folder, scale, body.revision)), tags=tags)
+        changes = _known(found.metres_per_unit, found.sigma, ScaleSource.TAG)
+        return TagScaleOut(scale=_stored(result, body.revision, changes), tags=tags)
 
-    return router
+    @router.post(":board", responses=problems(404, 409, 507))
+    def scale_by_a_board(
+        reconstruction_id: str, body: BoardScaleRequest, idempotency_key: IdempotencyKey = None
+    ) -> BoardScaleOut:
+        """Find a ChArUco board of known size in the scene, and store the scale that it gives."""
+        result = results.of(rows.get(reconstruction_id))
+        camera, path, board = _camera(result), result.path(4 * VIEWS), Board.parse(body.board, body.dictionary)
+        with results.downloads():
+            found = scale_by_board(Scene.read_ply(result.scene), path, camera, board, body.square_m)
+        changes = _known(found.metres_per_unit, found.sigma, ScaleSource.BOARD)
+        return BoardScaleOut(
+            scale=_stored(result, body.revision, changes),
+            square=found.square,
+            views=found.views,
+            corners=found.corners,
+            error_px=found.error_px,
+        )
+
+    @router.post(":up", responses=problems(404, 409, 507))
+    def find_up(reconstruction_id: str, body: UpRequest, idempotency_key: IdempotencyKey = None) -> ScaleOut:
+        """Store which way is up: by gravity at a frame, by points of the floor, or by the floor, which is found."""
+        result = results.of(rows.get(reconstruction_id))
+        with results.downloads():
+            x, y, z = _up(result, body).tolist()
+        return _stored(result, body.revision, {"up": (x, y, z)})
+
+
+def _camera(result: Result) -> Camera:
+    """Raises ConfigurationError if the optics are not known."""
+    if result.camera is None:
+        raise ConfigurationError("the optics of this capture are not known; give a known length instead")
+    return result.camera
+
+
+def _known(metres_per_unit: float, sigma: float | None, source: ScaleSource) -> dict[str, object]:
+    return {"metres_per_unit": metres_per_unit, "sigma": sigma, "source": source}
+
+
+def _stored(result: Result, revision: int, changes: dict[str, object]) -> ScaleOut:
+    """Store changes of the scale that was of a revision. Raises BusyError if it is not of that any more."""
+    scale = read_scale(result.folder).model_copy(update={**changes, "version": result.published.version})
+    return ScaleOut.of(write_scale(result.folder, scale, revision))
+
+
+def _up(result: Result, body: UpRequest) -> np.ndarray:
+    """Raises SceneError if no floor is found, and ConfigurationError."""
+    path = result.path(4 * VIEWS)
+    if body.points is not None:
+        return up_by_points(np.array(body.points), path.centres)
+    if body.gravity is None:
+        return find_floor(Scene.read_ply(result.scene), path).up
+    at_s = path.times_s[0] if body.frame is None else (body.frame + 0.5) / result.frame_rate_hz
+    return up_by_gravity(body.gravity, path.rotations[int(np.abs(path.times_s - at_s).argmin())])

@@ -19,6 +19,7 @@ from spiked.pose import exp_so3
 from spiked.scene import Scene
 from spiked.trajectory import Trajectory
 
+from .room_map import room_map
 from .test_spz import random_scene
 
 DEGREES = (1, 2, 3)
@@ -116,3 +117,27 @@ def test_a_file_of_splats_is_exported_and_what_is_lost_is_said(tmp_path: Path) -
     assert "without their view-dependent colour of degree 3" in said["sog"]
     assert "recording of scene.ply" in said["colmap"]
     assert spz.decode((tmp_path / "x-spz").read_bytes()).degree == 3
+
+
+def test_a_foreign_scene_of_degree_3_is_cropped_and_written_bit_by_bit(tmp_path: Path) -> None:
+    """Read, cleaned to a box and exported: each coefficient of each splat that is left is the one that was read."""
+    out = room_map(3, (0.0,)).write(tmp_path / "out")
+    scene = shiny(3, 4000)
+    scene.write_ply(out / "scene.ply")
+    given = PlyData.read(str(out / "scene.ply"))["vertex"].data
+    box = ("-2", "-9", "-9", "9", "9", "2")
+    for command in (
+        ["clean", str(out), "-o", str(tmp_path / "cropped"), "--no-floaters", "--box", *box],
+        ["export", str(tmp_path / "cropped"), "ply", "-o", str(tmp_path / "again.ply")],
+    ):
+        done = CliRunner().invoke(app, command)
+        assert done.exit_code == 0, done.output + str(done.exception)
+    found = PlyData.read(str(tmp_path / "again.ply"))["vertex"].data
+    low, high = np.array(box[:3], float), np.array(box[3:], float)
+    centres = np.stack([given[axis] for axis in "xyz"], axis=1)
+    left = given[((centres >= low) & (centres <= high)).all(axis=1)]
+    assert 100 < len(left) < len(given) and len(found) == len(left)
+    names = [name for name in given.dtype.names if name.startswith("f_rest_")]
+    assert len(names) == 45 and names == [name for name in found.dtype.names if name.startswith("f_rest_")]
+    for name in ("x", "y", "z", "opacity", *names):
+        np.testing.assert_allclose(found[name], left[name], rtol=1e-6, atol=1e-7, err_msg=name)

@@ -37,7 +37,8 @@ class RoomMap:
         folder.mkdir()
         self.scene.write_ply(folder / "scene.ply", GAIN)
         self.path.write_tum(folder / "trajectory.tum")
-        camera = {"sensor": {"width": SENSOR.width, "height": SENSOR.height}, "focal_px": [OPTICS.fx, OPTICS.fy]}
+        sensor = {"width": SENSOR.width, "height": SENSOR.height, "frame_rate_hz": SENSOR.frame_rate_hz}
+        camera = {"sensor": sensor, "focal_px": [OPTICS.fx, OPTICS.fy]}
         (folder / "report.json").write_text(json.dumps({"outcome": "complete", **camera}))
         return folder
 

@@ -4,9 +4,14 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from spiked.errors import ConfigurationError, SceneError
 from spiked.frame_of_reference import FrameOfReference, KnownScale
+from spiked.pose import exp_so3, log_so3
 from spiked.recon.statistics import evenly
+from spiked.recon.view_tracking import BRIDGED_S
 from spiked.recording import Recording
 from spiked.render import Camera
 from spiked.scene import Scene
@@ -15,6 +20,9 @@ from spiked.trajectory import Trajectory
 
 __all__ = ["ExportOptions", "ExportSource"]
 
+Array = NDArray[np.float64]
+SAME_S = 1e-7
+"""Times closer than this are the same: files have nanoseconds."""
 KEY_VIEWS = 40
 """Views of an export unless their number is chosen: neighbours overlap by more than half on a path across a room."""
 
@@ -36,6 +44,20 @@ class ExportOptions:
     through: tuple[tuple[float, ...], ...] = ()
     """Poses that a video goes through, in the scene's own unit: centre x, y, z and rotation w, x, y, z of each. None:
     it goes along the recorded path, smoothed."""
+    frames: tuple[int, ...] = ()
+    """Frames of the capture that the key views are of, in place of `views`; between poses the path is interpolated."""
+
+
+@dataclass(frozen=True)
+class KeyPose:
+    """Where a key view is taken from."""
+
+    row: int
+    """Of the path: the pose, or the one nearest in time."""
+    time_s: float
+    rotation: Array
+    """Camera to world, [3, 3]."""
+    centre: Array
 
 
 @dataclass(frozen=True)
@@ -110,6 +132,32 @@ class ExportSource:
     def key_rows(self, options: ExportOptions) -> list[int]:
         """Rows of the path that the views are taken at."""
         return evenly(len(self.need_path()), options.views)
+
+    def key_poses(self, options: ExportOptions) -> list[KeyPose]:
+        """The poses of the key views. Raises SceneError for a frame without one, and ConfigurationError."""
+        path = self.need_path()
+        if not options.frames:
+            rows = self.key_rows(options)
+            return [KeyPose(row, float(path.times_s[row]), path.rotations[row], path.centres[row]) for row in rows]
+        rate = self.need_sensor().frame_rate_hz
+        return [self._pose_at(frame, (frame + 0.5) / rate) for frame in options.frames]
+
+    def _pose_at(self, frame: int, time_s: float) -> KeyPose:
+        path = self.path
+        row = int(np.abs(path.times_s - time_s).argmin())
+        if abs(path.times_s[row] - time_s) < SAME_S:
+            return KeyPose(row, float(path.times_s[row]), path.rotations[row], path.centres[row])
+        after = int(np.searchsorted(path.times_s, time_s))
+        if not 0 < after < len(path) or path.times_s[after] - path.times_s[after - 1] > BRIDGED_S:
+            first, last = (time * self.need_sensor().frame_rate_hz - 0.5 for time in path.times_s[[0, -1]])
+            known = f"there are poses from {first:.0f} to {last:.0f}"
+            raise SceneError(f"frame {frame} of {self.name} has no pose; {known}")
+        begin, end = path.times_s[after - 1 : after + 1]
+        share = (time_s - begin) / (end - begin)
+        before = path.rotations[after - 1]
+        turn = exp_so3(share * log_so3(before.T @ path.rotations[after]))
+        centre = (1 - share) * path.centres[after - 1] + share * path.centres[after]
+        return KeyPose(row, time_s, before @ turn, centre)
 
     @cached_property
     def white(self) -> float:

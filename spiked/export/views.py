@@ -38,7 +38,7 @@ class RenderedView:
     """What the scene shows from a pose of the path; [H, W] images of a camera."""
 
     row: int
-    """Of the path."""
+    """Of the path: of its pose, or of the one nearest in time."""
     time_s: float
     camera: Camera
     rotation: Doubles
@@ -88,12 +88,11 @@ def pixel_rays(camera: Camera) -> Doubles:
 
 def rendered_views(source: ExportSource, options: ExportOptions) -> Iterator[RenderedView]:
     """The key views of a reconstruction, one after the other. Raises SceneError and ConfigurationError."""
-    scene, path, camera = source.need_scene(), source.need_path(), camera_of(source.seen_by(options))
+    scene, camera = source.need_scene(), camera_of(source.seen_by(options))
     rasteriser = rasteriser_for(camera)
-    for row in source.key_rows(options):
-        rotation, centre = path.rotations[row], path.centres[row]
-        colour, depth = rendered(rasteriser, scene, rotation, centre, options.depth)
-        yield RenderedView(row, float(path.times_s[row]), camera, rotation, centre, colour, depth)
+    for pose in source.key_poses(options):
+        colour, depth = rendered(rasteriser, scene, pose.rotation, pose.centre, options.depth)
+        yield RenderedView(pose.row, pose.time_s, camera, pose.rotation, pose.centre, colour, depth)
 
 
 def rendered(

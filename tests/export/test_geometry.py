@@ -10,8 +10,10 @@ import pytest
 import trimesh
 from plyfile import PlyData
 
+from spiked.errors import SceneError
 from spiked.export import ExportOptions, ExportSource, find_kind
 from spiked.simulate import Room
+from spiked.simulate.motion import hand_shake
 
 from ..room_map import OPTICS, SENSOR
 
@@ -43,6 +45,38 @@ def test_depth_maps_have_the_depth_and_the_normals_of_the_room(source: ExportSou
         np.testing.assert_allclose(lengths[some], 1, atol=1e-5)
         rays = OPTICS.unproject(np.stack(np.meshgrid(np.arange(240) + 0.5, np.arange(160) + 0.5), -1))
         assert ((normals * rays).sum(-1)[some] < 0).mean() > 0.999  # towards the camera
+
+
+def test_depth_of_any_frame_is_that_of_the_room_also_between_poses(source: ExportSource, tmp_path: Path) -> None:
+    """Poses are those of every fourth frame; the truth is the camera's own path."""
+    frames = (40, 41, 203)
+    find_kind("depth").write(source, tmp_path, ExportOptions(frames=frames))
+    index = json.loads((tmp_path / "depth.json").read_text())
+    motion = hand_shake(Room(seed=3).stage(OPTICS, flow_px=0.15), 3)
+    for frame, given in zip(frames, index["frames"], strict=True):
+        assert given["time_s"] == pytest.approx((frame + 0.5) / SENSOR.frame_rate_hz, abs=1e-9)
+        (rotation,), (centre,) = motion.poses(np.array([frame + 0.5]))
+        pose = np.array(given["camera_to_world"])
+        np.testing.assert_allclose(pose[:3, :3], rotation, atol=2e-5)
+        np.testing.assert_allclose(pose[:3, 3], centre, atol=2e-5)
+        truth = Room(seed=3).render(OPTICS, SENSOR.width, SENSOR.height, rotation, centre).depth
+        depth = oiio.ImageBuf(str(tmp_path / given["depth_exr"])).get_pixels(oiio.FLOAT)[..., 0]
+        known = depth > 0
+        assert known.mean() > 0.4 and np.median(np.abs(depth / truth - 1)[known]) < 0.005
+        normals = oiio.ImageBuf(str(tmp_path / given["normal_exr"])).get_pixels(oiio.FLOAT) @ rotation.T
+        floor = (np.linalg.norm(normals, axis=2) > 0) & (np.abs(height_of(truth, rotation, centre)) < 1e-3)
+        assert floor.sum() > 200 and np.median(normals[floor][:, 2]) > 0.99  # straight up
+
+
+def height_of(depth: np.ndarray, rotation: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """z of what the pixels see, [H, W]."""
+    rays = OPTICS.unproject(np.stack(np.meshgrid(np.arange(240) + 0.5, np.arange(160) + 0.5), -1))
+    return np.asarray(((rays * depth[..., None]) @ rotation.T + centre)[..., 2])
+
+
+def test_a_frame_without_a_pose_is_refused(source: ExportSource, tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match="frame 999 of room has no pose; there are poses from 0 to 396"):
+        find_kind("depth").write(source, tmp_path / "out", ExportOptions(frames=(999,)))
 
 
 def test_points_lie_on_the_walls_and_look_inwards(source: ExportSource, tmp_path: Path) -> None:

@@ -33,6 +33,13 @@ def test_a_file_lies_in_the_result_or_where_it_was_asked_for(room: Path, tmp_pat
     assert len(list((tmp_path / "maps" / "depth").iterdir())) == 2
 
 
+def test_depth_of_chosen_frames(room: Path, tmp_path: Path) -> None:
+    done = run(room, "depth", "--frame", "7", "--frame", "30", "-o", tmp_path / "maps")
+    assert done.exit_code == 0, done.output + str(done.exception)
+    times = sorted(float(file.stem) for file in (tmp_path / "maps" / "depth").glob("*.exr"))
+    assert times == pytest.approx([7.5 / 20_000, 30.5 / 20_000], abs=1e-9)
+
+
 def test_metres_are_those_of_the_scale(room: Path, tmp_path: Path) -> None:
     unknown = run(room, "ply", "--metric")
     assert "spiked scale" in str(unknown.exception)

@@ -1,6 +1,7 @@
 """Results in the formats of other programs over HTTP."""
 
 import io
+import json
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,19 @@ def test_a_folder_is_sent_as_zip_with_the_pictures_of_the_recording(service: Any
     assert sum(name.endswith(".exr") for name in names) == 4 and any(name.endswith("depth.json") for name in names)
     bag = service.http.get(f"reconstructions/{job}/exports/nexus?views=2&expected_depth=true", timeout=120)
     assert bag.status_code == 200 and bag.content.startswith(b"\x89HDF")
+
+
+def test_depth_of_chosen_frames(service: Any, job: str) -> None:
+    poses = service.http.get(f"reconstructions/{job}/trajectory").json()
+    frames = poses["frames"][3], poses["frames"][-4]
+    url = f"reconstructions/{job}/exports/depth?expected_depth=true&frame="
+    answer = service.http.get(f"{url}{frames[0]}&frame={frames[1]}", timeout=120)
+    assert answer.status_code == 200, answer.text
+    archive = zipfile.ZipFile(io.BytesIO(answer.content))
+    (name,) = (name for name in archive.namelist() if name.endswith("depth.json"))
+    times = [frame["time_s"] for frame in json.loads(archive.read(name))["frames"]]
+    assert times == pytest.approx([poses["times_s"][3], poses["times_s"][-4]], abs=1e-9)
+    assert "has no pose" in service.http.get(f"{url}99999999", timeout=120).json()["detail"]
 
 
 @pytest.mark.parametrize("form", ["mesh-glb", "ply", "sog", "video"])

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi import Path as PathParameter
 from fastapi.routing import APIRoute
+from pydantic import Field
 
 from spiked.export import KINDS, ExportOptions, find_kind
 from spiked.export.source import KEY_VIEWS
@@ -13,7 +14,7 @@ from spiked_service.api.exports import Exports
 from spiked_service.api.problems import problems
 from spiked_service.api.results import Results
 from spiked_service.api.routes.parameters import BINARY, ETAG, NOT_MODIFIED, Version
-from spiked_service.api.schemas.base import IN_DIGITS
+from spiked_service.api.schemas.base import IN_DIGITS, LARGEST_INTEGER
 from spiked_service.api.schemas.exports import ExportFormatOut, ExportFormatsOut
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.store.rows import ReconstructionRow
@@ -29,6 +30,10 @@ Views = Annotated[
     int,
     Query(ge=1, le=1000, description="Key views: poses of pictures, depth maps and points, evenly along the path."),
     IN_DIGITS,
+]
+Frames = Annotated[
+    list[Annotated[int, Field(ge=0, le=LARGEST_INTEGER)]] | None,
+    Query(max_length=100, description="Frames that key views are of, in place of `views`; may be given again."),
 ]
 Undistorted = Annotated[bool, Query(description="Pictures, depth maps and cameras without the lens's distortion.")]
 ExpectedDepth = Annotated[bool, Query(description="Mean depth of what a pixel shows; less exact than the median.")]
@@ -114,8 +119,9 @@ def _add(router: APIRouter, prefix: str, name: str, find: Callable[..., Reconstr
         seconds: Seconds = 10.0,
         through: Through = None,
         metric: Metric = False,
+        frame: Frames = None,
     ) -> Response:
         depth: Literal["median", "expected"] = "expected" if expected_depth else "median"
         poses = () if through is None else tuple(tuple(map(float, one.split(","))) for one in through.split(";"))
-        options = ExportOptions(views, undistorted, depth, resolution, seconds, poses)
+        options = ExportOptions(views, undistorted, depth, resolution, seconds, poses, tuple(frame or ()))
         return exports.response(request, row, find_kind(format), options, version=version, metric=metric)

@@ -2,7 +2,7 @@
 
 import inspect
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -30,6 +30,27 @@ def _kind(name: str) -> ExportKind:
 _Kind = Annotated[ExportKind, typer.Argument(metavar="FORMAT", help="One of those above.", parser=_kind)]
 
 
+_Recording = Annotated[
+    Path | None, typer.Option(help="The recording, if it is not where the run found it: for pictures and frames.")
+]
+_Views = Annotated[int, typer.Option(help="Key views: poses of pictures, depth maps and points.", min=1, max=100_000)]
+_Frames = Annotated[
+    list[int] | None,
+    typer.Option(help="A frame that a key view is of, in place of --views; may be given again.", min=0),
+]
+_Undistorted = Annotated[
+    bool, typer.Option("--undistorted", help="Pictures, depth maps and cameras without the lens's distortion.")
+]
+_Expected = Annotated[
+    bool,
+    typer.Option("--expected-depth", help="Mean depth of what a pixel shows; less exact than the median."),
+]
+_Resolution = Annotated[
+    int, typer.Option(help="Voxels of a mesh along the longest side of the scene.", min=16, max=1024)
+]
+_Metric = Annotated[bool, typer.Option("--metric", help="In metres, with up along -y, by the scale of `spiked scale`.")]
+
+
 def export(
     result: Annotated[
         Path,
@@ -40,26 +61,14 @@ def export(
         Path | None,
         typer.Option("--out", "-o", help="File or folder to write. Default: OUT/export/FORMAT with the usual ending."),
     ] = None,
-    recording: Annotated[
-        Path | None, typer.Option(help="The recording, if it is not where the run found it: for pictures and frames.")
-    ] = None,
-    views: Annotated[
-        int, typer.Option(help="Key views: poses of pictures, depth maps and points.", min=1, max=100_000)
-    ] = KEY_VIEWS,
-    undistorted: Annotated[
-        bool, typer.Option("--undistorted", help="Pictures, depth maps and cameras without the lens's distortion.")
-    ] = False,
-    expected: Annotated[
-        bool,
-        typer.Option("--expected-depth", help="Mean depth of what a pixel shows; less exact than the median."),
-    ] = False,
-    resolution: Annotated[
-        int, typer.Option(help="Voxels of a mesh along the longest side of the scene.", min=16, max=1024)
-    ] = 256,
+    recording: _Recording = None,
+    views: _Views = KEY_VIEWS,
+    frame: _Frames = None,
+    undistorted: _Undistorted = False,
+    expected: _Expected = False,
+    resolution: _Resolution = 256,
     seconds: Annotated[float, typer.Option(help="Length of a video.", min=0.1, max=3600)] = 10.0,
-    metric: Annotated[
-        bool, typer.Option("--metric", help="In metres, with up along -y, by the scale of `spiked scale`.")
-    ] = False,
+    metric: _Metric = False,
 ) -> None:
     """Write a result in the format of another program.
 
@@ -79,6 +88,8 @@ def export(
 
     - `spiked export garden.ply spz -o garden.spz`
 
+    - `spiked export out depth --frame 640 -o depth640`
+
     - `spiked scale out --length 3.0 1.42 && spiked export out mesh-glb --metric --resolution 384`
     """
     with holding():
@@ -86,7 +97,8 @@ def export(
     place = out or _place(result, f"{kind.name}{'-metric' if metric else ''}{kind.suffix}")
     (outputs.try_folder if kind.folder else outputs.try_file)("--out", place)
     source = _source(result, recording, metric)
-    options = ExportOptions(views, undistorted, "expected" if expected else "median", resolution, seconds)
+    depth: Literal["median", "expected"] = "expected" if expected else "median"
+    options = ExportOptions(views, undistorted, depth, resolution, seconds, frames=tuple(frame or ()))
     with outputs.writing("--out", place):
         said = kind.write(source, place, options)
     output.print(f"{place}: {said}", markup=False)

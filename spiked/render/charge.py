@@ -105,6 +105,8 @@ class ChargeLoss:
         planes = np.ascontiguousarray(image, np.float32)
         planes = planes[..., None] if planes.ndim == 2 else planes
         slope = np.empty_like(planes)
+        if frames.dtype != np.uint8:
+            raise ConfigurationError(f"frames are bytes as they are stored, not {frames.dtype}")
         try:
             loss, pixels, chi2, intervals, expected, counted = self._native.run(
                 **self._layout,

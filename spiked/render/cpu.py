@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -153,13 +154,8 @@ class Rasteriser:
             raise ConfigurationError("a sub-pose is not finite: the trajectory that it comes from is broken")
         size = (self.camera.height, self.camera.width)
         if channels is not None:
-            channels = np.ascontiguousarray(channels, np.uint8)
-            if channels.shape != size or colours != 3 or (channels > 2).any():
-                raise ConfigurationError(
-                    f"a mosaic needs channels 0 to 2 of shape {size} and splats of three colours, "
-                    f"not shape {channels.shape} and {colours} colour(s)"
-                )
-        backgrounds = np.array(np.broadcast_to(np.asarray(background, np.float32), 3))
+            channels = _checked_channels(channels, size, colours)
+        backgrounds = _checked_background(background)
         values = np.empty(size if colours == 1 or channels is not None else (*size, 3), np.float32)
         alpha = np.empty(size, np.float32)
         depth = np.empty(size, np.float32)
@@ -193,6 +189,26 @@ class Rasteriser:
         )
         self._native.backward(d_values, *out.arrays(), out.rotation, out.centre, out.contribution, out.radius_px)
         return out
+
+
+def _checked_channels(channels: NDArray[Any], size: tuple[int, int], colours: int) -> NDArray[np.uint8]:
+    """As bytes. Raises ConfigurationError for other values than 0, 1 and 2: a cast would wrap or cut them."""
+    given = np.asarray(channels)
+    fits = given.shape == size and colours == 3 and np.issubdtype(given.dtype, np.integer)
+    if not fits or ((given < 0) | (given > 2)).any():
+        raise ConfigurationError(
+            f"a mosaic needs whole channels 0 to 2 of shape {size} and splats of three colours, "
+            f"not {given.dtype} of shape {given.shape} and {colours} colour(s)"
+        )
+    return np.ascontiguousarray(given, np.uint8)
+
+
+def _checked_background(background: float | Sequence[float]) -> Floats:
+    """Three values. Raises ConfigurationError."""
+    given = np.asarray(background, np.float32)
+    if given.shape not in ((), (1,), (3,)):
+        raise ConfigurationError(f"a background is a number or red, green and blue, not of shape {given.shape}")
+    return np.array(np.broadcast_to(given, 3))
 
 
 def _checked_splats(splats: Scene) -> tuple[Floats, Floats, Floats, Floats, Floats]:

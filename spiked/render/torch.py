@@ -328,7 +328,7 @@ class _Kept:
         means, quats, log_scales, opacity_logits, colours = (_array(tensor) for tensor in given[:5])
         scene = Scene(means, quats, log_scales, opacity_logits, colours)
         poses = given.rotations.detach().numpy(), given.centres.detach().numpy()
-        channels = None if given.channels is None else given.channels.numpy().astype(np.uint8, copy=False)
+        channels = None if given.channels is None else given.channels.numpy()
         self.last = None
         ground = tuple(background)
         if given.windows is not None:

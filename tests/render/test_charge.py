@@ -199,6 +199,7 @@ def test_instruction_sets_agree(level: str, tmp_path: Path) -> None:
     ("change", "words"),
     [
         ({"frames": np.zeros((FRAMES, 3), np.uint8)}, "frames are"),
+        ({"frames": np.zeros((FRAMES, WIDTH * HEIGHT // 8), np.float32)}, "not float32"),
         ({"frames": np.zeros((65, WIDTH * HEIGHT // 8), np.uint8)}, "at most 64"),
         ({"displacements": np.zeros((FRAMES, 2, 2, 2), np.float32)}, "cover the sensor"),
         ({"gain": np.ones((3, 3), np.float32)}, "sensor's size"),

@@ -331,6 +331,12 @@ def test_mistakes_are_told() -> None:
         rasteriser.forward(splats, [np.eye(3)], [np.zeros(3)], weights=np.ones((1, 2, 3), np.float32))
     with pytest.raises(ConfigurationError, match="three colours"):
         rasteriser.forward(splats, [np.eye(3)], [np.zeros(3)], channels=Mosaic.RGGB.channels(35, 45))
+    colour, size = scenes.splats(5, 3, 0), (camera.height, camera.width)
+    for channels in (np.full(size, 256), np.full(size, -1), np.full(size, 1.7)):  # bytes of them would be 0, 255 and 1
+        with pytest.raises(ConfigurationError, match="whole channels 0 to 2"):
+            rasteriser.forward(colour, [np.eye(3)], [np.zeros(3)], channels=channels)
+    with pytest.raises(ConfigurationError, match="a background is"):
+        rasteriser.forward(colour, [np.eye(3)], [np.zeros(3)], background=(0.0, 1.0))
     with pytest.raises(ConfigurationError, match="not finite"):
         rasteriser.forward(splats, [np.full((3, 3), np.nan)], [np.zeros(3)])
     rasteriser.forward(splats, [np.eye(3)], [np.zeros(3)])

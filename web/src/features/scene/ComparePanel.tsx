@@ -102,7 +102,12 @@ function Choice({
           onChange={(event) => {
             const [against = "", version = ""] = event.target.value.split(".");
             if (against === "") stopComparing();
-            else adjust({ against, againstVersion: version === "" ? null : Number(version), ride: false });
+            else
+              adjust({
+                against,
+                againstVersion: version === "" ? null : Number(version),
+                ...(comparison === null ? { ride: false, how: "" } : {}),
+              });
           }}
         >
           <option value="">nothing</option>

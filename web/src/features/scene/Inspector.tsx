@@ -74,6 +74,7 @@ export interface InspectorProps {
   comparison: Comparison | null;
   onHome: () => void;
   onScreenshot: (size: Size | null) => void;
+  onCopyLink: () => void;
   currentView: () => { camera: number[]; frame: number | null };
   onView: (camera: number[], frame: number | null) => void;
 }
@@ -86,6 +87,17 @@ export function Inspector(props: InspectorProps): JSX.Element {
       <header>
         <strong>{nameOf(capture)}</strong>
         <JobBadge job={job} />
+        <button
+          type="button"
+          title={
+            isEnded(job)
+              ? `A link to what is seen: this version, moment and view`
+              : "A link to this moment and view; the scene still grows, and the link shows its newest version then"
+          }
+          onClick={props.onCopyLink}
+        >
+          <Icon name="link" /> Copy link
+        </button>
       </header>
       <JobReason job={job} />
       <Warnings texts={job.warnings} />

@@ -13,6 +13,9 @@ const CHOICES = [
   { value: "rendered", label: "Rendered" },
   { value: "observed", label: "Observed" },
 ] as const;
+/** The one that the address names; a wipe if it names none. */
+export const comparisonOf = (how: string): Comparison => CHOICES.find(({ value }) => value === how)?.value ?? "wipe";
+
 const LOOK_MS = 60;
 /** Gain of the difference image; `.brightened` in the style sheet applies it. */
 const DIFFERENCE_GAIN = 4;

@@ -3,17 +3,19 @@
 import { type JSX, useCallback, useEffect, useRef, useState } from "react";
 
 import type { Capture, Reconstruction, Version } from "../../shared/api/types";
+import { attempt } from "../../shared/state/attempt";
 import { calledOf, nameOf } from "../../shared/state/capture";
 import { count } from "../../shared/state/format";
-import { adjust, go, route, useRoute } from "../../shared/state/route";
-import { isEnded, newestCapture, newestReconstruction, useService, errorText } from "../../shared/state/store";
+import { copy } from "../../shared/state/clipboard";
+import { adjust, go, linkTo, nameFound, route, useRoute } from "../../shared/state/route";
+import { isEnded, newestCapture, newestReconstruction, useService } from "../../shared/state/store";
 import { toast } from "../../shared/state/toasts";
 import { useWanted } from "../../shared/state/useWanted";
 import { Empty, ErrorMessage, JobReason, Loading, trackingHint } from "../../shared/ui/parts";
 import { CompareStage, type Names } from "./CompareStage";
 import { Inspector } from "./Inspector";
 import { type Colouring, rowAt } from "./path";
-import { type Comparison, RideAlong } from "./RideAlong";
+import { comparisonOf, RideAlong } from "./RideAlong";
 import { Scrubber } from "./Scrubber";
 import { type Comparison as Compared, useComparison } from "./useComparison";
 import { usePath } from "./usePath";
@@ -77,11 +79,16 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   const [colouring, setColouring] = useState<Colouring>("state");
   const [steering, setSteering] = useState<Steering>("orbit");
   const [full, setFull] = useState(false);
-  const [comparison, setComparison] = useState<Comparison>("wipe");
+  const comparison = comparisonOf(at.how);
   const mode = VIEW_MODES.find((one) => one === at.show) ?? "colour";
   const sensor = capture.sensor;
   const versions = useVersions(job);
   const pinned = versions.find((one) => one.version === at.version) ?? null;
+  const gone = versions.length > 0 && pinned === null && at.version !== job?.version ? at.version : null;
+  useEffect(() => {
+    nameFound(capture.id, jobId);
+    return () => nameFound(null, null);
+  }, [capture.id, jobId]);
   const path = usePath(job, pinned);
   const { shown, loading, problem } = useScene(viewer, job, full, pinned);
 
@@ -143,6 +150,12 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   }, [viewer, linked]);
 
   if (job === null) return null;
+  const leave = riding ? { ride: false, how: "" } : {};
+  const copyLink = async (): Promise<void> => {
+    const version = isEnded(job) ? (pinned?.version ?? (job.version > 0 ? job.version : null)) : at.version;
+    await copy(linkTo({ version, camera: viewer?.view() ?? null }));
+    toast("Copied the link to this view");
+  };
   const screenshot = async (size: Size | null): Promise<void> => {
     if (viewer === null) return;
     const link = document.createElement("a");
@@ -176,10 +189,15 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
               sensor={sensor}
               frame={path?.frames[row] ?? null}
               comparison={comparison}
-              onComparison={setComparison}
+              onComparison={(how) => adjust({ how: how === "wipe" ? "" : how })}
             />
           )}
         </div>
+        {gone !== null && (
+          <p className="stage-note" role="status">
+            Version {gone} is not kept any more: this is the newest.
+          </p>
+        )}
         {fault !== null && <ErrorMessage text={fault} />}
         {shown === null && fault === null && (
           <div className="veil">
@@ -225,29 +243,29 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
         onSteering={setSteering}
         ride={riding}
         comparison={compared}
-        onRide={(ride) => adjust(ride ? { ride, against: null, againstVersion: null, how: "" } : { ride })}
+        onRide={(ride) => adjust({ ride, how: "", ...(ride ? { against: null, againstVersion: null } : {}) })}
         shows={riding && comparison === "difference" ? "error" : mode}
-        onShows={(shows) => {
-          setComparison(shows === "error" ? "difference" : "wipe");
+        onShows={(shows) =>
           adjust(
-            shows === "error" ? { ride: true, against: null } : { ride: false, show: shows === "colour" ? "" : shows },
-          );
-        }}
+            shows === "error"
+              ? { ride: true, how: "difference", against: null, againstVersion: null }
+              : { ...leave, show: shows === "colour" ? "" : shows },
+          )
+        }
         fov={Math.round(at.camera?.[6] ?? viewer?.view()[6] ?? 0)}
         onFov={(fov) => viewer?.setFov(fov)}
         onPreset={(preset) => {
-          adjust({ ride: false });
+          adjust(leave);
           viewer?.look(preset);
         }}
         onHome={() => {
           viewer?.home();
           adjust({ camera: null });
         }}
-        onScreenshot={(size) =>
-          void screenshot(size).catch((error: unknown) => toast(errorText(error), { tone: "problem" }))
-        }
+        onScreenshot={(size) => void attempt(() => screenshot(size))}
+        onCopyLink={() => void attempt(copyLink)}
         currentView={() => ({ camera: viewer?.view() ?? [], frame: route().frame })}
-        onView={(camera, frame) => adjust({ camera, frame, ride: false })}
+        onView={(camera, frame) => adjust({ camera, frame, ...leave })}
       />
       <Scrubber
         path={path}

@@ -1,8 +1,11 @@
 import { beforeEach, expect, it, vi } from "vitest";
 
-import { adjust, dropToken, formatRoute, go, HOME, parseRoute, route } from "./route";
+import { adjust, dropToken, formatRoute, go, HOME, linkTo, nameFound, parseRoute, route } from "./route";
 
-beforeEach(() => go(HOME));
+beforeEach(() => {
+  nameFound(null, null);
+  go(HOME);
+});
 
 it("keeps everything that is looked at in the URL", () => {
   const there = {
@@ -53,6 +56,31 @@ it("lets go of a version when the capture changes without a new entry, too", () 
   expect(route()).toMatchObject({ capture: "y", reconstruction: "b", frame: 7 });
   adjust({ capture: "y", frame: 8 });
   expect(route().reconstruction).toBe("b");
+});
+
+it("names what the Scene page shows in the address, and goes on following the newest", () => {
+  go({ page: "scene", frame: 7 });
+  nameFound("x", "a");
+  expect(window.location.search).toBe("?page=scene&capture=x&reconstruction=a&frame=7");
+  expect(route()).toMatchObject({ capture: null, reconstruction: null, frame: 7 });
+  nameFound("y", "b");
+  expect(window.location.search).toContain("capture=y&reconstruction=b");
+  expect(linkTo({ version: 3 })).toBe("http://localhost:3000/?page=scene&capture=y&reconstruction=b&version=3&frame=7");
+  go({ page: "live" });
+  expect(window.location.search).toBe("?frame=7");
+  expect(linkTo({})).not.toContain("capture");
+});
+
+it("follows after a reload and a step back what it followed, but not where a link is opened", async () => {
+  go({ page: "scene" });
+  nameFound("x", "a");
+  vi.resetModules();
+  const reloaded = await import("./route");
+  expect(reloaded.route()).toMatchObject({ page: "scene", capture: null, reconstruction: null });
+  window.history.replaceState(null, "", window.location.href);
+  vi.resetModules();
+  const opened = await import("./route");
+  expect(opened.route()).toMatchObject({ page: "scene", capture: "x", reconstruction: "a" });
 });
 
 it("plays through more frames than a browser allows changes of the address", () => {

@@ -25,7 +25,7 @@ export interface Route {
   against: string | null;
   /** Its version; null follows the newest. */
   againstVersion: number | null;
-  /** How they are compared. */
+  /** How they are compared, or, along the ride, the picture of the camera with the scene. */
   how: string;
   /** Search text of the captures table. */
   search: string;
@@ -92,7 +92,32 @@ export function formatRoute(route: Route): string {
   return text === "" ? "./" : `./?${text}`;
 }
 
-let current = parseRoute(window.location.search);
+/** The capture and the reconstruction, as chosen: of an entry of the history whose address names what was found instead. */
+type Chosen = Pick<Route, "capture" | "reconstruction">;
+
+/** The state of an address: of an own entry of the history, reloads included, it follows what it followed. */
+function restored(): Route {
+  const route = parseRoute(window.location.search);
+  const state = window.history.state as { chosen?: Partial<Chosen> } | null;
+  if (state?.chosen === undefined) return route;
+  const { capture, reconstruction } = state.chosen;
+  return { ...route, capture: identifier(capture ?? null), reconstruction: identifier(reconstruction ?? null) };
+}
+
+/** What the Scene page has found where nothing is chosen. */
+let found: Chosen = { capture: null, reconstruction: null };
+
+/** The route with what is seen where it follows the newest: for addresses, which others shall see the same by. */
+const named = (route: Route): Route =>
+  route.page === "scene"
+    ? {
+        ...route,
+        capture: route.capture ?? found.capture,
+        reconstruction: route.reconstruction ?? found.reconstruction,
+      }
+    : route;
+
+let current = restored();
 const listeners = new Set<() => void>();
 const subscribe = (listener: () => void): (() => void) => {
   listeners.add(listener);
@@ -119,7 +144,8 @@ function writeAddress(how: "pushState" | "replaceState" = "replaceState"): void 
   pending = undefined;
   writtenMs = performance.now();
   try {
-    window.history[how](null, "", formatRoute(current));
+    const { capture, reconstruction } = current;
+    window.history[how]({ chosen: { capture, reconstruction } }, "", formatRoute(named(current)));
   } catch {
     pending = setTimeout(writeAddress, 10 * ADDRESS_MS); // refused: the limit counts other parts of the page, too
   }
@@ -133,7 +159,7 @@ window.addEventListener("pagehide", flush);
 window.addEventListener("popstate", () => {
   clearTimeout(pending);
   pending = undefined;
-  current = parseRoute(window.location.search);
+  current = restored();
   for (const listener of listeners) listener();
 });
 
@@ -162,8 +188,22 @@ export const adjust = (change: Partial<Route>): void => set(changed(change), fal
 export const route = (): Route => current;
 export const useRoute = (): Route => useSyncExternalStore(subscribe, route);
 
+/**
+ * Name in the address what the Scene page has found, so that a copied one shows it later, too. Nothing is chosen by that:
+ * this page goes on following the newest, and so does the Live page.
+ */
+export function nameFound(capture: string | null, reconstruction: string | null): void {
+  if (found.capture === capture && found.reconstruction === reconstruction) return;
+  found = { capture, reconstruction };
+  if (current.page === "scene" && capture !== null) writeAddress();
+}
+
+/** The whole address of what is seen, for others; `fixed` is as it is given. */
+export const linkTo = (fixed: Partial<Route>): string =>
+  new URL(formatRoute({ ...named(current), ...fixed }), document.baseURI).href;
+
 /** Remove the token from the address, so that it is not in screenshots and bookmarks; the service has set its cookie. */
 export function dropToken(): void {
   if (new URLSearchParams(window.location.search).has("token"))
-    window.history.replaceState(null, "", formatRoute(current));
+    window.history.replaceState(window.history.state, "", formatRoute(named(current)));
 }

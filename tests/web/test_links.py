@@ -1,0 +1,88 @@
+"""Links to the Scene page: they show what was seen, also when there is something newer."""
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from browsing import DESKTOP, PHONE, Studied, address, choose, picture, psnr_db, shown_version, still, until, violations
+
+
+def newer(studied: Studied, name: str) -> str:
+    """Make a capture that is newer than the studied one; return its id."""
+    plan = {"source": "sim:?width=64&height=48", "frames": 64, "name": name, "reconstruct": False}
+    one: str = studied.http.post("captures", json=plan).json()["id"]
+    until(lambda: studied.http.get(f"captures/{one}").json()["state"] == "complete", name)
+    return one
+
+
+@pytest.mark.parametrize(("viewport", "touch"), [(DESKTOP, False), (PHONE, True)])
+def test_a_copied_link_shows_the_same_view_later(
+    studied: Studied, visit: Callable[..., Any], viewport: dict[str, int], touch: bool
+) -> None:
+    page = visit(f"{studied.address}?page=scene", viewport=viewport, touch=touch)
+    until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+    page.get_by_role("button", name="Top", exact=True).click()
+    until(lambda: "camera=" in address(page), "the view is in the address")
+    seen = still(page)
+    page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    page.get_by_role("button", name="Copy link").click()
+    page.get_by_text("Copied the link to this view").wait_for()
+    assert violations(page) == []
+    link = page.evaluate("() => navigator.clipboard.readText()")
+    for part in (f"capture={studied.capture_id}", f"reconstruction={studied.reconstruction_id}", "version=", "camera="):
+        assert part in link
+    bar = address(page)
+    assert f"capture={studied.capture_id}&reconstruction={studied.reconstruction_id}" in bar
+    late = newer(studied, "newer than the link")
+    try:
+        for one in (link, bar):
+            other = visit(one, viewport=viewport, touch=touch)
+            until(lambda: shown_version(other) > 0, "the scene of the link")  # noqa: B023
+            until(lambda: psnr_db(picture(other), seen) > 30, "the same view", 20)  # noqa: B023
+        page.get_by_text("This capture has no reconstruction").wait_for()  # the page that follows shows the newest
+        page.reload()
+        page.get_by_text("This capture has no reconstruction").wait_for()
+        page.keyboard.press("1")
+        page.get_by_role("heading", name="Live").wait_for(state="attached")
+        assert "capture=" not in address(page)
+    finally:
+        studied.http.delete(f"captures/{late}")
+
+
+def test_a_link_is_copied_without_a_secure_context(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit("about:blank")
+    page.add_init_script("Object.defineProperty(navigator, 'clipboard', { value: undefined })")
+    page.goto(f"{studied.address}?page=scene")
+    until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+    page.get_by_role("button", name="Copy link").click()
+    page.get_by_text("Copied the link to this view").wait_for()
+    page.evaluate(
+        "() => { const a = document.createElement('textarea'); a.id = 'pasted'; document.body.append(a); a.focus(); }"
+    )
+    page.keyboard.press("Control+v")
+    assert f"capture={studied.capture_id}" in page.locator("#pasted").input_value()
+
+
+def test_the_error_against_the_views_is_in_the_address(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit(f"{studied.address}?page=scene&capture={studied.capture_id}&frame=320")
+    until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+    page.get_by_label("Show", exact=True).select_option(label="Error against the views")
+    page.get_by_text("observed − rendered").wait_for()
+    until(lambda: "how=difference" in address(page), "it is in the address")
+    other = visit(address(page))
+    other.get_by_text("observed − rendered").wait_for()
+    assert other.get_by_label("Show", exact=True).input_value() == "error"
+    choose(other, "Observed")
+    until(lambda: "how=observed" in address(other), "so are the others")
+    other.get_by_role("button", name="Ride along").click()
+    until(lambda: "how=" not in address(other) and "ride=" not in address(other), "and gone with the ride")
+
+
+def test_a_version_that_is_gone_is_told(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit(f"{studied.address}?page=scene&capture={studied.capture_id}&version=999")
+    page.get_by_role("status").filter(has_text="Version 999 is not kept").wait_for()
+    until(lambda: shown_version(page) == studied.reconstruction()["version"], "the newest is shown")
+    page.get_by_role("combobox", name="Version").select_option(index=1)
+    page.get_by_text("Version 999 is not kept").wait_for(state="detached")

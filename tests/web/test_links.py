@@ -86,3 +86,27 @@ def test_a_version_that_is_gone_is_told(studied: Studied, visit: Callable[..., A
     until(lambda: shown_version(page) == studied.reconstruction()["version"], "the newest is shown")
     page.get_by_role("combobox", name="Version").select_option(index=1)
     page.get_by_text("Version 999 is not kept").wait_for(state="detached")
+
+
+def test_a_scene_that_cannot_be_fetched_is_asked_for_less_and_less_often(
+    studied: Studied, visit: Callable[..., Any]
+) -> None:
+    page = visit("about:blank")
+    asked: list[str] = []
+    failing = True
+
+    def answer(route: Any) -> None:
+        asked.append(route.request.url)
+        if failing:
+            route.fulfill(status=503, json={"title": "busy", "detail": "the disk is slow"})
+        else:
+            route.continue_()
+
+    page.route(re.compile(r"/scene/changes"), answer)
+    page.goto(f"{studied.address}?page=scene&capture={studied.capture_id}")
+    page.get_by_text("The disk is slow").wait_for()
+    page.wait_for_timeout(5000)
+    assert 2 < len(asked) < 9, "five a second would be 25"
+    failing = False
+    until(lambda: shown_version(page) > 0, "it is fetched when the service answers again", 20)
+    assert np.ptp(picture(page)) > 0

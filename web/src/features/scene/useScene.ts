@@ -12,6 +12,8 @@ import type { Viewer } from "./Viewer";
 const MOST_SPLATS = 250_000;
 /** Scenes of more splats are shown coarsely first. */
 const COARSE_FIRST = 30_000;
+/** Wait after a request that failed; doubled with each, ms. */
+const [FIRST_WAIT_MS, LONGEST_WAIT_MS] = [200, 10_000];
 /** Levels of detail: a sixteenth of the splats, a quarter, all. */
 const [COARSE, QUARTER, ALL] = [0, 1, 2];
 
@@ -53,12 +55,15 @@ export function useScene(
     let shown: (Shown & { level: number }) | null = null;
     let since: string | null = null;
     let busy = false;
+    let waitMs = FIRST_WAIT_MS;
+    let nextMs = 0;
     // A version takes the place of another of its reconstruction, and the view stays.
     if (cleared.current?.viewer !== viewer || cleared.current.id !== id) viewer.clear();
     cleared.current = { viewer, id };
     const step = async (): Promise<void> => {
       const want = wanted.current;
       const finest = want.full || want.total <= MOST_SPLATS ? ALL : QUARTER;
+      if (performance.now() < nextMs) return;
       if (busy || want.version === 0 || (shown !== null && shown.version >= want.version && shown.level >= finest))
         return;
       busy = true;
@@ -75,7 +80,10 @@ export function useScene(
           shown = { version, splats: viewer.splats, whole: level === ALL, level };
           setState({ job: id, only, shown, problem: null });
         }
+        waitMs = FIRST_WAIT_MS;
       } catch (error) {
+        nextMs = performance.now() + waitMs;
+        waitMs = Math.min(2 * waitMs, LONGEST_WAIT_MS);
         if (!ended.signal.aborted) setState({ job: id, only, shown, problem: errorText(error) });
       }
       busy = false;

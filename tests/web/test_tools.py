@@ -1,5 +1,6 @@
 """Tools of the Scene page: what the splats show, from where, and help."""
 
+import json
 import re
 import zipfile
 from collections.abc import Callable
@@ -107,6 +108,29 @@ def test_a_known_length_gives_metres(studied: Studied, scene: Callable[..., Any]
     assert studied.http.get(url).json()["up"] is not None
     assert violations(page) == []
     studied.http.delete(url)
+
+
+def test_a_version_of_an_earlier_run_takes_no_scale(studied: Studied, scene: Callable[..., Any]) -> None:
+    items = studied.http.get(f"reconstructions/{studied.reconstruction_id}/versions").json()["items"]
+    first, last = items[0]["version"], items[-1]["version"]
+    (folder,) = Path(studied.http.get("system").json()["data_folder"]).glob(f"**/{studied.reconstruction_id}")
+    (folder / "scale.json").write_text(json.dumps({"revision": 7, "since": first, "metres_per_unit": 2.0}))
+    page = scene(f"&version={first}")
+    page.get_by_text("Measure", exact=True).click()
+    page.get_by_text("of an earlier run").wait_for()
+    assert page.get_by_text("A unit is").count() == 0
+    page.get_by_role("combobox", name="Version").select_option("")
+    until(lambda: shown_version(page) == last, "the newest version")
+    page.get_by_text("A unit is 2").wait_for()
+    with page.expect_request(re.compile(r"/scale$")) as sent:
+        box = page.locator(".stage canvas").bounding_box()
+        for across in (0.45, 0.62):
+            page.mouse.click(box["x"] + across * box["width"], box["y"] + 0.45 * box["height"])
+        page.get_by_label("Known length in metres").fill("3")
+        page.get_by_role("button", name="Set the scale").click()
+    assert sent.value.post_data_json["version"] == last
+    assert violations(page) == []
+    (folder / "scale.json").unlink()
 
 
 def test_a_scene_is_cleaned_and_brought_back(studied: Studied, scene: Callable[..., Any]) -> None:

@@ -1,5 +1,7 @@
 """The scale of a scene over HTTP."""
 
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,7 @@ def test_a_scale_is_stored_once_and_answers_are_in_metres(service: Any, done: Ca
     stored = http.put(f"{url}/scale", json={"revision": 0, "metres_per_unit": 2.0, "sigma": 0.01})
     assert stored.status_code == 200, stored.text
     assert stored.json() | {"version": 0} == {
-        "revision": 1, "metres_per_unit": 2.0, "sigma": 0.01, "source": "length", "up": None, "version": 0,
+        "revision": 1, "metres_per_unit": 2.0, "sigma": 0.01, "source": "length", "up": None, "version": 0, "since": 0,
     }  # fmt: skip
     assert http.put(f"{url}/scale", json={"revision": 0, "metres_per_unit": 3.0}).status_code == 409
     metric = http.get(f"{url}/trajectory?step=50&metric=true").json()
@@ -74,6 +76,21 @@ def test_a_scene_without_the_board_says_so(service: Any, job: str) -> None:
     assert answer.status_code == 422 and "the board is in 0 of the pictures" in answer.json()["detail"]
     answer = service.http.post(f"reconstructions/{job}/scale:board", json=body | {"board": "big"})
     assert answer.status_code == 422 and "COLUMNSxROWS" in answer.json()["detail"]
+
+
+def test_a_length_in_a_version_of_an_earlier_run_is_refused(service: Any, done: CaptureOut, job: str) -> None:
+    http, url = service.http, f"reconstructions/{job}"
+    first, last = (http.get(f"{url}/versions").json()["items"][at]["version"] for at in (0, -1))
+    (folder,) = Path(http.get("system").json()["data_folder"]).glob(f"reconstructions/{job}")
+    (folder / "scale.json").write_text(json.dumps({"revision": 5, "since": first}))
+    assert http.get(f"{url}/scale").json()["since"] == first
+    body = {"revision": 5, "metres_per_unit": 2.0}
+    refused = http.put(f"{url}/scale", json=body | {"version": first})
+    assert refused.status_code == 409 and "an earlier run" in refused.json()["detail"], refused.text
+    assert http.get(f"{url}/scale").json()["metres_per_unit"] is None
+    assert http.put(f"{url}/scale", json=body | {"version": last}).json()["version"] == last
+    assert http.put(f"{url}/scale", json=body | {"version": 999}).status_code == 404
+    (folder / "scale.json").unlink()
 
 
 @pytest.mark.parametrize("body", [{"revision": 2, "up": [0, 0, 0]}, {"revision": 2, "metres_per_unit": -1.0}])

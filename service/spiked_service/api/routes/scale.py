@@ -13,7 +13,7 @@ from spiked.scene import Scene
 from spiked.tag_scale import VIEWS, scale_by_tags
 from spiked.upright import find_floor, up_by_gravity, up_by_points
 from spiked_service.api.idempotency import IdempotencyKey
-from spiked_service.api.problems import problems
+from spiked_service.api.problems import ConflictError, problems
 from spiked_service.api.results import Result, Results
 from spiked_service.api.schemas.scale import (
     BoardScaleOut,
@@ -43,7 +43,7 @@ def scale_routes(rows: ReconstructionRepository, results: Results, route_class: 
     @router.put("", responses=problems(404, 409, 507))
     def set_scale(reconstruction_id: str, body: ScaleRequest) -> ScaleOut:
         """Store what was measured, unless somebody stored something else meanwhile."""
-        result = results.of(rows.get(reconstruction_id))
+        result = results.of(rows.get(reconstruction_id), body.version)
         changes: dict[str, object] = {}
         if body.metres_per_unit is not None:
             changes = _known(body.metres_per_unit, body.sigma, ScaleSource.LENGTH)
@@ -118,9 +118,17 @@ def _known(metres_per_unit: float, sigma: float | None, source: ScaleSource) -> 
 
 
 def _stored(result: Result, revision: int, changes: dict[str, object]) -> ScaleOut:
-    """Store changes of the scale that was of a revision. Raises BusyError if it is not of that any more."""
-    scale = read_scale(result.folder).model_copy(update={**changes, "version": result.published.version})
-    return ScaleOut.of(write_scale(result.folder, scale, revision))
+    """Store changes of the scale that was of a revision.
+
+    Raises BusyError if it is not of that any more, and ConflictError for a version of an earlier run.
+    """
+    version, scale = result.published.version, read_scale(result.folder)
+    if version <= scale.since:
+        raise ConflictError(
+            f"version {version} is of an earlier run, whose unit of length is another one: measure in a version "
+            f"after {scale.since}"
+        )
+    return ScaleOut.of(write_scale(result.folder, scale.model_copy(update={**changes, "version": version}), revision))
 
 
 def _up(result: Result, body: UpRequest) -> np.ndarray:

@@ -19,22 +19,32 @@ class ScaleOut(Out):
     )
     up: list[float] | None = Field(description="Direction in the scene, of length 1; null: -y is taken for up.")
     version: int | None = Field(description="Version of the scene that it was measured in.")
+    since: int = Field(
+        description="Versions up to this one are of an earlier run, whose unit of length is another one: the scale is "
+        "not theirs, and cannot be measured in them."
+    )
 
     @classmethod
     def of(cls, scale: SceneScale) -> "ScaleOut":
         """As it is shown."""
-        return cls(**{**scale.model_dump(exclude={"since"}), "up": None if scale.up is None else list(scale.up)})
+        return cls(**{**scale.model_dump(), "up": None if scale.up is None else list(scale.up)})
 
 
 class ScaleRequest(In):
     """What is measured; what is left out stays as it is."""
 
     model_config = examples(
-        {"revision": 0, "metres_per_unit": 2.11, "sigma": 0.004},
+        {"revision": 0, "version": 12, "metres_per_unit": 2.11, "sigma": 0.004},
         {"revision": 1, "up": [0.0, -1.0, 0.0]},
     )
 
     revision: StrictInt = Field(ge=0, le=LARGEST_INTEGER, description="The one that this replaces; 409 if it is not.")
+    version: StrictInt | None = Field(
+        None,
+        ge=1,
+        le=LARGEST_INTEGER,
+        description="Version that it was measured in; 409 for one of an earlier run. Default: the newest.",
+    )
     metres_per_unit: StrictFloat | None = Field(None, gt=1e-9, lt=1e9)
     sigma: StrictFloat | None = Field(None, ge=0, le=10, description="Relative standard deviation, if known.")
     up: Vector | None = Field(None, description="Of any length but zero.")

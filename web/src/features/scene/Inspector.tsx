@@ -155,7 +155,7 @@ export function Inspector(props: InspectorProps): JSX.Element {
       </div>
       <Legend colouring={props.colouring} />
       <Loops closures={props.closures} onTime={props.onTime} />
-      <MeasurePanel viewer={props.viewer} jobId={job.id} />
+      <MeasurePanel viewer={props.viewer} jobId={job.id} version={shown?.version ?? 0} />
       <CleanPanel
         viewer={props.viewer}
         job={job}

@@ -16,20 +16,29 @@ import type { Viewer } from "./Viewer";
 
 const CHOICES = TOOLS.map(({ value, label }) => ({ value, label }));
 
-export function MeasurePanel({ viewer, jobId }: { viewer: Viewer | null; jobId: string }): JSX.Element {
+interface MeasureProps {
+  viewer: Viewer;
+  jobId: string;
+  /** The version that is measured in; 0 before one is shown. */
+  version: number;
+}
+
+export function MeasurePanel({ viewer, ...of }: Omit<MeasureProps, "viewer"> & { viewer: Viewer | null }): JSX.Element {
   const [open, setOpen] = useState(false);
   return (
     <details className="tool" onToggle={(event) => setOpen(event.currentTarget.open)}>
       <summary>Measure</summary>
-      {open && viewer !== null && <Measuring viewer={viewer} jobId={jobId} />}
+      {open && viewer !== null && <Measuring viewer={viewer} {...of} />}
     </details>
   );
 }
 
-function Measuring({ viewer, jobId }: { viewer: Viewer; jobId: string }): JSX.Element {
+function Measuring({ viewer, jobId, version }: MeasureProps): JSX.Element {
   const [tool, setTool] = useState<Tool>("distance");
   const [points, setPoints] = useState<readonly Vector3[]>([]);
-  const { value: scale, again } = useFetch(jobId, () => calls.scale(jobId));
+  const { value: known, again } = useFetch(jobId, () => calls.scale(jobId));
+  const earlier = known !== null && version > 0 && version <= known.since;
+  const scale = earlier ? null : known;
   const full = points.length >= pointsOf(tool);
   usePicking(viewer, (point) => setPoints(full ? [point] : [...points, point]));
   useEffect(() => {
@@ -41,7 +50,7 @@ function Measuring({ viewer, jobId }: { viewer: Viewer; jobId: string }): JSX.El
     await attempt(() => calls.setScale(jobId, change));
     again();
   };
-  const revision = scale?.revision ?? 0;
+  const revision = known?.revision ?? 0;
   const up = tool === "up" ? upOf(points, viewer.eye) : null;
   return (
     <>
@@ -61,14 +70,16 @@ function Measuring({ viewer, jobId }: { viewer: Viewer; jobId: string }): JSX.El
       <output className="measured" aria-live="polite">
         {resultText(tool, points, scale)}
       </output>
-      {tool === "distance" && full && (
+      {!earlier && tool === "distance" && full && (
         <KnownLength
           units={distance(points) ?? 0}
           error={viewer.pixel(points)}
-          onLength={(metres_per_unit, sigma) => store({ revision, metres_per_unit, sigma })}
+          onLength={(metres_per_unit, sigma) => store({ revision, version, metres_per_unit, sigma })}
         />
       )}
-      {up !== null && <ActionButton onClick={() => void store({ revision, up })}>This is the floor</ActionButton>}
+      {!earlier && up !== null && (
+        <ActionButton onClick={() => void store({ revision, version, up })}>This is the floor</ActionButton>
+      )}
       <TagForm
         onTag={async (side_m) => {
           await attempt(async () => {
@@ -78,7 +89,14 @@ function Measuring({ viewer, jobId }: { viewer: Viewer; jobId: string }): JSX.El
           again();
         }}
       />
-      <ScaleText scale={scale} />
+      {earlier ? (
+        <p className="dim hint">
+          Version {version} is of an earlier run, in another unit of length: its scale cannot be set. Choose a version
+          after {known.since}.
+        </p>
+      ) : (
+        <ScaleText scale={scale} />
+      )}
     </>
   );
 }

@@ -133,6 +133,29 @@ def test_a_version_of_an_earlier_run_takes_no_scale(studied: Studied, scene: Cal
     (folder / "scale.json").unlink()
 
 
+def test_the_ride_has_the_optics_of_the_version(studied: Studied, scene: Callable[..., Any]) -> None:
+    page = scene("&ride=1&how=rendered&frame=320")
+    own = still(page)
+
+    def retold(route: Any) -> None:
+        answer = route.fetch()
+        items = answer.json()["items"]
+        for one in items:
+            one["intrinsics"] |= {"fx": one["intrinsics"]["fx"] / 2, "fy": one["intrinsics"]["fy"] / 2}
+        route.fulfill(response=answer, json={"items": items})
+
+    page.route(re.compile(r"/versions$"), retold)
+    page.reload()
+    until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+    until(lambda: unlike(page, own), "twice the field of view")
+    middle = own[::2, ::2]
+    wide = still(page)
+    height, width = middle.shape[:2]
+    top, left = (wide.shape[0] - height) // 2, (wide.shape[1] - width) // 2
+    found = wide[top : top + height, left : left + width]
+    assert np.abs(found - middle).mean() < 0.5 * np.abs(wide - own).mean(), "what was all is now the middle"
+
+
 def test_a_scene_is_cleaned_and_brought_back(studied: Studied, scene: Callable[..., Any]) -> None:
     page = scene()
     before = studied.reconstruction()

@@ -204,6 +204,10 @@ class Results:
             raise NothingError(f"capture {capture_id} has no reconstruction; POST reconstructions starts one")
         return next((row for row in reversed(rows) if row.version), rows[-1])
 
+    def row(self, reconstruction_id: str) -> ReconstructionRow:
+        """A reconstruction. Raises UnknownIdError."""
+        return self._rows.get(reconstruction_id)
+
     def of(self, row: ReconstructionRow, version: int | None = None) -> Result:
         """A version of a reconstruction, the newest if None. Raises NotReadyError, NothingError, GoneError."""
         folder = self._rows.folder(row.id)

@@ -10,7 +10,7 @@ from spiked.blocks import Window, aligned_window
 from spiked.errors import RecordingError
 from spiked.recon.frontend.demosaic import fill_mosaic
 from spiked.recording import Recording
-from spiked.sensor import Sensor
+from spiked.sensor import Intrinsics, Sensor
 from spiked.undistortion import Undistortion
 from spiked_service.results.image_encoding import display_white
 from spiked_service.results.rate_statistics import RateStatistics, Region, statistics_of
@@ -110,10 +110,10 @@ def frame_window_at(recording: Recording, frame: int | None, first_frame: int = 
     return FrameWindow(recording, row, first_frame)
 
 
-def picture(window: FrameWindow, kind: PictureKind, white: float | None, undistorted: bool = False) -> Picture:
+def picture(window: FrameWindow, kind: PictureKind, white: float | None, lens: Intrinsics | None = None) -> Picture:
     """An image of recorded frames; `white` is the 99.5th percentile if None.
 
-    `undistorted`: resampled to a camera of the same focal length without distortion; black where nothing was seen.
+    With a `lens`: resampled to a camera of its focal length without its distortion; black where nothing was seen.
     """
     sensor = window.sensor
     if kind is PictureKind.INTERVAL:
@@ -122,9 +122,8 @@ def picture(window: FrameWindow, kind: PictureKind, white: float | None, undisto
         plane = _rate(window.aligned(_COUNTED_FRAMES if kind is PictureKind.RATE else _ACCUMULATED_FRAMES))
     channels = sensor.mosaic.channels(sensor.height, sensor.width) if sensor.mosaic else None
     image = fill_mosaic(plane, channels)
-    k = sensor.intrinsics
-    if undistorted and k is not None and k.distortion is not None:
-        image = Undistortion.of(k, sensor.width, sensor.height).straighten(image)
+    if lens is not None and lens.distortion is not None:
+        image = Undistortion.of(lens, sensor.width, sensor.height).straighten(image)
     return Picture(image, white or display_white(image), window.frame)
 
 

@@ -5,6 +5,7 @@ import json
 import re
 import time
 import zipfile
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -92,6 +93,26 @@ def test_spz_and_a_sample_are_the_scene(service: Any, job: str, tmp_path: Any) -
     np.testing.assert_array_equal(Scene.read_ply(tmp_path / "s.ply").means, scene.sample(100).means)
     part = service.http.get(f"reconstructions/{job}/scene", headers={"Range": "bytes=0-2"})
     assert (part.status_code, part.content) == (206, b"ply")
+
+
+def test_versions_tell_the_optics_that_they_were_made_with(service: Any, done: CaptureOut, job: str) -> None:
+    """Of a camera that was calibrated by the reconstruction these are not those of the sensor."""
+    sensor = service.http.get(f"captures/{done.id}").json()["sensor"]
+    assert service.client.versions(job)[-1].intrinsics.fx == pytest.approx(sensor["intrinsics"]["fx"])
+    (index,) = Path(service.http.get("system").json()["data_folder"]).glob(f"reconstructions/{job}/**/published.json")
+    before = index.read_bytes()
+    content = json.loads(before)
+    content["versions"][-1] |= {"intrinsics": [123.0, 124.0, 80.0, 50.0], "distortion": {"model": "opencv", "k1": -0.1}}
+    index.write_text(json.dumps(content))
+    found = service.http.get(f"reconstructions/{job}/versions").json()["items"][-1]["intrinsics"]
+    assert (found["fx"], found["distortion"]["k1"]) == (123.0, -0.1)
+    preview = f"captures/{done.id}/preview?frame=100&undistorted=true"
+    plain, straight = (service.http.get(preview + more).content for more in ("", f"&optics_of={job}"))
+    assert (decoded(plain) != decoded(straight)).any(), "the lens is the one that the reconstruction found"
+    content["versions"][-1] |= {"intrinsics": None, "distortion": None}
+    index.write_text(json.dumps(content))
+    assert service.http.get(f"reconstructions/{job}/versions").json()["items"][-1]["intrinsics"] is None
+    index.write_bytes(before)
 
 
 def test_changes_since_a_state(service: Any, job: str, tmp_path: Any) -> None:

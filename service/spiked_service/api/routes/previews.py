@@ -49,6 +49,15 @@ White = Annotated[
 Undistorted = Annotated[
     bool, Query(description="Without the distortion of the lens: of a recorded frame, or of the scene.")
 ]
+OpticsOf = Annotated[
+    str | None,
+    Query(
+        min_length=1,
+        max_length=64,
+        description="Reconstruction by the optics of whose newest version a recorded image is undistorted. Default: "
+        "those of the capture.",
+    ),
+]
 Frames = Annotated[int, Query(ge=1, le=8192, description="Recorded frames to look at, around `frame`."), IN_DIGITS]
 Side = Annotated[
     int | None, Query(ge=1, le=LARGEST_INTEGER, description="Of the region, pixels. Default: to the edge."), IN_DIGITS
@@ -79,6 +88,7 @@ def preview_routes(
         gain: Gain = 1.0,
         white: White = None,
         undistorted: Undistorted = False,
+        optics_of: OpticsOf = None,
         format: WishedImage = None,
         accept: Annotated[str, Header(include_in_schema=False)] = "",
     ) -> Response:
@@ -96,7 +106,10 @@ def preview_routes(
                 raise ConfigurationError("the newest frames are shown as the lens images them; give a recorded frame")
             return _live_preview(captures, capture_id, PreviewKind(kind))
         window = _frame_window(captures, folder, capture_id, frame)
-        return _recorded_preview(picture(window, kind, white, undistorted), gain, requested)
+        lens = window.sensor.intrinsics if undistorted else None
+        if undistorted and optics_of is not None:
+            lens = results.of(results.row(optics_of)).published.camera or lens
+        return _recorded_preview(picture(window, kind, white, lens), gain, requested)
 
     @router.get("/thumbnail", responses=_THUMBNAIL, response_class=Response)
     def get_thumbnail(capture_id: str, request: Request) -> Response:

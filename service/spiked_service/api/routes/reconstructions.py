@@ -27,6 +27,7 @@ from spiked_service.api.schemas.reconstructions import (
 from spiked_service.reconstructions.queue import Reconstructions
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.results.timeline import STATES, Timeline, Timelines, known
+from spiked_service.results.versions import versions
 from spiked_service.store.rows import JobState, ReconstructionRow, Task
 
 Points = Annotated[
@@ -123,7 +124,9 @@ def reconstruction_record_routes(rows: ReconstructionRepository, route_class: ty
     @router.get("/versions", responses=problems(404))
     def list_versions(reconstruction_id: str) -> VersionsOut:
         """Available versions, oldest first."""
-        return VersionsOut(items=[VersionOut.of(row) for row in rows.versions(reconstruction_id)])
+        cameras = {one.version: one.camera for one in versions(rows.folder(reconstruction_id))}
+        found = rows.versions(reconstruction_id)
+        return VersionsOut(items=[VersionOut.of(row, cameras.get(row.version)) for row in found])
 
     @router.get("/timeline", responses=problems(404))
     def get_timeline(

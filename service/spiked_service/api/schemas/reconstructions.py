@@ -6,6 +6,7 @@ from typing import Annotated
 from pydantic import Field, StrictBool, StrictInt
 
 from spiked.recon import State
+from spiked.sensor import Intrinsics
 from spiked_service.api.schemas.base import (
     ID_EXAMPLE,
     LARGEST_INTEGER,
@@ -178,11 +179,15 @@ class VersionOut(Out):
     white: float
     scene_bytes: int = Field(description="Size of the PLY file.")
     psnr_db: float | None
+    intrinsics: IntrinsicsModel | None = Field(
+        description="Of the camera, as it was given or as the reconstruction found it, with its lens; null: not known."
+    )
 
     @classmethod
-    def of(cls, row: VersionRow) -> "VersionOut":
+    def of(cls, row: VersionRow, intrinsics: Intrinsics | None) -> "VersionOut":
         """A row as it is shown."""
-        return cls.model_validate({name: getattr(row, name) for name in cls.model_fields})
+        fields = {name: getattr(row, name) for name in cls.model_fields if name != "intrinsics"}
+        return cls(**fields, intrinsics=IntrinsicsModel.of(intrinsics))
 
 
 class VersionsOut(Out):

@@ -22,6 +22,7 @@ const DIFFERENCE_GAIN = 4;
 
 export function RideAlong({
   capture,
+  jobId,
   white,
   sensor,
   frame,
@@ -29,6 +30,8 @@ export function RideAlong({
   onComparison,
 }: {
   capture: Capture;
+  /** The reconstruction, whose optics the picture has to have, too. */
+  jobId: string;
   /** Radiance of white in the scene. */
   white: number | undefined;
   sensor: Sensor;
@@ -38,7 +41,7 @@ export function RideAlong({
 }): JSX.Element {
   const [share, setShare] = useState(0.5);
   const image = useRef<HTMLImageElement>(null);
-  const observed = useObserved(capture.id, white, frame);
+  const observed = useObserved(capture.id, jobId, white, frame);
   const bar = useRef<HTMLDivElement>(null);
   useAspectFit(bar, sensor.width / sensor.height);
 
@@ -130,6 +133,7 @@ function useAspectFit(inside: { readonly current: HTMLElement | null }, aspect: 
  */
 function useObserved(
   captureId: string,
+  jobId: string,
   white: number | undefined,
   frame: number | null,
 ): { url: string | null; missing: boolean } {
@@ -154,7 +158,12 @@ function useObserved(
       busy = true;
       shown = requested;
       try {
-        const picture = address.preview(captureId, "interval", { frame: requested, white, undistorted: true });
+        const picture = address.preview(captureId, "interval", {
+          frame: requested,
+          white,
+          undistorted: true,
+          optics_of: jobId,
+        });
         show(URL.createObjectURL(await (await fetched(picture, ended.signal)).blob()));
         setMissing(false);
       } catch {
@@ -170,6 +179,6 @@ function useObserved(
       ended.abort();
       clearInterval(timer);
     };
-  }, [captureId, white]);
+  }, [captureId, jobId, white]);
   return { url, missing };
 }

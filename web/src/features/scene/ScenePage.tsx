@@ -1,8 +1,8 @@
 /** The Scene page: splats, path, timeline, and the view of the capture camera. */
 
-import { type JSX, useCallback, useEffect, useRef, useState } from "react";
+import { type JSX, useCallback, useEffect, useMemo, useRef, useState } from "react";
 
-import type { Capture, Reconstruction, Version } from "../../shared/api/types";
+import type { Capture, Intrinsics, Reconstruction, Sensor, Version } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
 import { calledOf, nameOf } from "../../shared/state/capture";
 import { count } from "../../shared/state/format";
@@ -81,9 +81,9 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   const [full, setFull] = useState(false);
   const comparison = comparisonOf(at.how);
   const mode = VIEW_MODES.find((one) => one === at.show) ?? "colour";
-  const sensor = capture.sensor;
   const versions = useVersions(job);
   const pinned = versions.find((one) => one.version === at.version) ?? null;
+  const sensor = useSensor(capture, pinned ?? versions.at(-1));
   const gone = versions.length > 0 && pinned === null && at.version !== job?.version ? at.version : null;
   useEffect(() => {
     nameFound(capture.id, jobId);
@@ -185,6 +185,7 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
           {riding && sensor !== null && (
             <RideAlong
               capture={capture}
+              jobId={job.id}
               white={(pinned ?? job).white ?? undefined}
               sensor={sensor}
               frame={path?.frames[row] ?? null}
@@ -276,6 +277,17 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
         version={shown?.version ?? 0}
       />
     </div>
+  );
+}
+
+/** The sensor with the optics that a version was made with: the reconstruction may have found them. */
+function useSensor({ sensor }: Capture, version: Version | undefined): Sensor | null {
+  const intrinsics = version?.intrinsics ?? sensor?.intrinsics ?? null;
+  // The same object for the same numbers, however often the versions are fetched.
+  const optics = JSON.stringify(intrinsics);
+  return useMemo(
+    () => (sensor === null ? null : { ...sensor, intrinsics: JSON.parse(optics) as Intrinsics | null }),
+    [sensor, optics],
   );
 }
 

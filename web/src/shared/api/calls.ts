@@ -267,6 +267,7 @@ export const address = {
       frame?: number | undefined;
       white?: number | undefined;
       undistorted?: boolean;
+      optics_of?: string;
     } = {},
   ): string => `${API}/captures/${id}/preview${query({ kind, ...extra })}`,
   /** A picture of what is known of each pixel; `file` makes it another one after a new calibration. */

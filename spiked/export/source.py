@@ -41,9 +41,17 @@ class ExportOptions:
     """Voxels along the longest side of the volume that a mesh is made in; points are at least half a voxel apart."""
     seconds: float = 10.0
     """Length of a video."""
+    pictures_a_second: float = 30.0
+    """Of a video."""
+    width: int | None = None
+    """Of a video, pixels; None: that of the sensor."""
+    height: int | None = None
+    """Of a video, pixels; None: by the width, in the shape of the sensor."""
+    along: Literal["smooth", "recorded"] = "smooth"
+    """Whether a video goes along the recorded path without its tremor, or as it is."""
     through: tuple[tuple[float, ...], ...] = ()
     """Poses that a video goes through, in the scene's own unit: centre x, y, z and rotation w, x, y, z of each. None:
-    it goes along the recorded path, smoothed."""
+    it goes `along` the recorded path."""
     frames: tuple[int, ...] = ()
     """Frames of the capture that the key views are of, in place of `views`; between poses the path is interpolated."""
 

@@ -1,4 +1,4 @@
-"""An MP4 along the recorded path without its tremor, or through poses that are chosen."""
+"""An MP4 along the recorded path, without its tremor if wanted, or through poses that are chosen."""
 
 from pathlib import Path
 
@@ -9,20 +9,25 @@ from spiked.export.kind import ExportKind
 from spiked.export.source import ExportOptions, ExportSource
 from spiked.pose import rotation_of
 from spiked.trajectory import Trajectory
-from spiked.video import CameraPath, Mp4Writer, calm_path, scene_pictures, video_camera, waypoint_path
+from spiked.video import CameraPath, Mp4Writer, calm_path, recorded_path, scene_pictures, video_camera, waypoint_path
 
 __all__ = ["KIND"]
 
-PICTURES_A_SECOND = 30
-"""Of the video."""
+MOST_PICTURES = 36_000
+"""Of a video: twenty minutes at 30 a second. An export of a service is made while others wait for it."""
 
 
 def write(source: ExportSource, file: Path, options: ExportOptions) -> str:
     """Write the file. Raises SceneError, ConfigurationError and OSError."""
-    scene, camera = source.need_scene(), video_camera(source.need_sensor())
+    scene, camera = source.need_scene(), video_camera(source.need_sensor(), options.width, options.height)
     path = _path(source, options)
-    count = max(1, round(options.seconds * PICTURES_A_SECOND))
-    with Mp4Writer(file, PICTURES_A_SECOND) as video:
+    count = max(1, round(options.seconds * options.pictures_a_second))
+    if count > MOST_PICTURES:
+        raise ConfigurationError(
+            f"{options.seconds:g} s with {options.pictures_a_second:g} pictures a second are {count:,} pictures, more "
+            f"than {MOST_PICTURES:,}: make the video shorter, or give it fewer a second"
+        )
+    with Mp4Writer(file, options.pictures_a_second) as video:
         for picture in scene_pictures(scene, path, camera, count, source.white):
             video.write(picture)
     return f"{count} pictures of {camera.width} x {camera.height}, {options.seconds:g} s"
@@ -30,7 +35,8 @@ def write(source: ExportSource, file: Path, options: ExportOptions) -> str:
 
 def _path(source: ExportSource, options: ExportOptions) -> CameraPath:
     if not options.through:
-        return calm_path(source.need_path())
+        recorded = source.need_path()
+        return recorded_path(recorded) if options.along == "recorded" else calm_path(recorded)
     if source.unit != "scene":
         raise ConfigurationError("poses to go through are in the unit of the scene: leave metres out")
     poses = np.array(options.through, float)
@@ -42,7 +48,7 @@ def _path(source: ExportSource, options: ExportOptions) -> CameraPath:
 
 KIND = ExportKind(
     name="video",
-    title="MP4 along the recorded path, smoothed, or through chosen poses",
+    title="MP4 along the recorded path, as it is or smoothed, or through chosen poses",
     readers="browsers, players, slides",
     loses="everything but what the camera would have seen",
     suffix=".mp4",

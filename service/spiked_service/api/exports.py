@@ -1,4 +1,7 @@
-"""Published versions in the formats of other programs, made in a worker process and kept for further requests."""
+"""Published versions in the formats of other programs, and videos of recordings.
+
+They are made in a worker process, and kept for further requests.
+"""
 
 import shutil
 import threading
@@ -10,14 +13,14 @@ from fastapi import Request, Response
 from spiked.errors import ConfigurationError, SpikedError
 from spiked.export import ExportKind, ExportOptions
 from spiked_service.api import files
-from spiked_service.api.problems import NothingError
+from spiked_service.api.problems import NothingError, NotReadyError
 from spiked_service.api.results import Result, Results
 from spiked_service.base.limits import OverloadedError
 from spiked_service.captures.captures import Captures
 from spiked_service.store.disk_space import DiskFullError
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import CaptureRow, ReconstructionRow
-from spiked_service.workers.messages import ExportCommand, WorkerError, WorkerEvent
+from spiked_service.workers.messages import ExportCommand, VideoCommand, WorkerError, WorkerEvent
 from spiked_service.workers.process import WorkerProcess
 
 KEPT = 4
@@ -78,6 +81,44 @@ class Exports:
             request, made, name, kind.sent_as, **{"X-Scene-Version": str(number)}, **result.scale_headers
         )
 
+    def video(
+        self,
+        request: Request,
+        capture_id: str,
+        *,
+        slower: float | None,
+        fps: float,
+        window: int,
+        compensated: bool,
+        begin_s: float,
+        end_s: float | None,
+    ) -> Response:
+        """The recording of a capture in slow motion; made now if it is not kept.
+
+        Raises UnknownIdError, NotReadyError without a closed recording, and as `response` does.
+        """
+        row = self._captures.get(capture_id).row
+        recording = self._folder.recording(capture_id)
+        if row.state.acquiring or not recording.exists():
+            raise NotReadyError(f"capture {capture_id} has no closed recording")
+        asked = (slower, fps, window, compensated, begin_s, end_s)
+        made = self._place / f"{capture_id}-{zlib.crc32(repr((files.stamp(recording), asked)).encode()):08x}"
+        if not made.exists():
+            self._make(
+                VideoCommand(
+                    capture_id=capture_id,
+                    recording=recording,
+                    out=made,
+                    slower=slower,
+                    pictures_a_second=fps,
+                    window=window,
+                    compensated=compensated,
+                    begin_s=begin_s,
+                    end_s=end_s,
+                )
+            )
+        return files.ranged(request, made, f"{capture_id}-slow.mp4", "video/mp4")
+
     def _command(
         self,
         row: ReconstructionRow,
@@ -107,7 +148,7 @@ class Exports:
             metric=result.frame is not None,
         )
 
-    def _make(self, command: ExportCommand) -> None:
+    def _make(self, command: ExportCommand | VideoCommand) -> None:
         """Run the worker to its end. Raises OverloadedError, DiskFullError and ConfigurationError."""
         if not self._making.acquire(blocking=False):
             raise OverloadedError("another export is being made; try again when it is ready")
@@ -123,7 +164,7 @@ class Exports:
         finally:
             self._making.release()
 
-    def _run(self, command: ExportCommand) -> None:
+    def _run(self, command: ExportCommand | VideoCommand) -> None:
         errors: list[SpikedError] = []
         ended = threading.Event()
 

@@ -32,6 +32,7 @@ class Role(StrEnum):
     LOCALISATION = "localisation"
     MERGE = "merge"
     EXPORT = "export"
+    VIDEO = "video"
 
 
 class _Command(BaseModel):
@@ -197,6 +198,24 @@ class ExportCommand(_Command):
     """Whether to write it in metres, by that scale, which is then known."""
 
 
+class VideoCommand(_Command):
+    """Write a recording in slow motion as an MP4."""
+
+    role: Literal[Role.VIDEO] = Role.VIDEO
+    recording: Path
+    out: Path
+    slower: float | None
+    """Seconds of video for a second of recording; None: a video of ten seconds."""
+    pictures_a_second: float
+    window: int
+    """Frames of a picture."""
+    compensated: bool
+    """Whether neighbouring pictures are moved onto each and averaged with it."""
+    begin_s: float
+    end_s: float | None
+    """Part of the recording, times of the capture; None: to its end."""
+
+
 Command = Annotated[
     AcquisitionCommand
     | RecorderCommand
@@ -205,7 +224,8 @@ Command = Annotated[
     | MergeCommand
     | PreviewCommand
     | UploadCommand
-    | ExportCommand,
+    | ExportCommand
+    | VideoCommand,
     Field(discriminator="role"),
 ]
 JobCommand = ReconstructionCommand | LocalisationCommand | MergeCommand

@@ -6,11 +6,14 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+import av
 import pytest
 from plyfile import PlyData
 
 from spiked.client import CaptureOut
 from spiked.export import KINDS, find_kind
+
+from .conftest import FRAMES, SIZE
 
 
 def test_formats_are_listed_with_what_they_lose(service: Any) -> None:
@@ -72,3 +75,34 @@ def test_what_cannot_be_made_is_said(service: Any, done: CaptureOut, job: str) -
     for one in service.client.versions(job):  # the first may have been published before there were splats
         answer = service.http.get(f"reconstructions/{job}/exports/depth?views=2&version={one.version}", timeout=120)
         assert (answer.status_code, "has no splats" in answer.text) == ((200, False) if one.splats else (404, True))
+
+
+def pictures_of(content: bytes) -> tuple[int, int, int, float]:
+    """Width, height and number of the pictures of an MP4, and how many a second."""
+    with av.open(io.BytesIO(content)) as file:
+        shapes = [(frame.width, frame.height) for frame in file.decode(video=0)]
+        assert len(set(shapes)) == 1
+        return *shapes[0], len(shapes), float(file.streams.video[0].average_rate or 0)
+
+
+def test_a_video_has_the_wanted_size_rate_and_path(service: Any, job: str) -> None:
+    url = f"reconstructions/{job}/exports/video?seconds=0.5&width=120&height=90&fps=20"
+    made = [service.http.get(f"{url}&along={along}", timeout=120) for along in ("smooth", "recorded")]
+    assert [pictures_of(one.content) for one in made] == [(120, 90, 10, 20.0)] * 2
+    assert made[0].content != made[1].content
+    long = service.http.get(f"reconstructions/{job}/exports/video?seconds=1200&fps=240", timeout=120)
+    assert long.status_code == 422 and "make the video shorter" in long.json()["detail"]
+
+
+def test_a_recording_is_sent_in_slow_motion(service: Any, done: CaptureOut) -> None:
+    url = f"captures/{done.id}/recording/video"
+    answer = service.http.get(f"{url}?slower=40&fps=25&window=8", timeout=120)
+    assert answer.status_code == 200 and answer.headers["content-type"] == "video/mp4", answer.text
+    assert pictures_of(answer.content) == (*SIZE, int(FRAMES / 20_000 * 40 * 25), 25.0)
+    part = service.http.get(f"{url}?slower=400&fps=25&from_s=0.01&to_s=0.012&compensate=true", timeout=120)
+    assert pictures_of(part.content)[2] == 20
+    kept = service.http.get(f"{url}?slower=40&fps=25&window=8", headers={"range": "bytes=0-0"})
+    assert kept.status_code == 206 and len(kept.content) == 1
+    for wrong in ("slower=1e6", "from_s=99", "slower=0.01"):
+        refused = service.http.get(f"{url}?{wrong}", timeout=120)
+        assert refused.status_code == 422, refused.text

@@ -10,10 +10,11 @@ from pydantic import Field
 
 from spiked.export import KINDS, ExportOptions, find_kind
 from spiked.export.source import KEY_VIEWS
+from spiked.video.rate_pictures import WINDOW
 from spiked_service.api.exports import Exports
 from spiked_service.api.problems import problems
 from spiked_service.api.results import Results
-from spiked_service.api.routes.parameters import BINARY, ETAG, NOT_MODIFIED, Version
+from spiked_service.api.routes.parameters import BINARY, ETAG, NOT_MODIFIED, FromS, ToS, Version
 from spiked_service.api.schemas.base import IN_DIGITS, LARGEST_INTEGER
 from spiked_service.api.schemas.exports import ExportFormatOut, ExportFormatsOut
 from spiked_service.reconstructions.repository import ReconstructionRepository
@@ -40,7 +41,21 @@ ExpectedDepth = Annotated[bool, Query(description="Mean depth of what a pixel sh
 Resolution = Annotated[
     int, Query(ge=16, le=512, description="Voxels of a mesh along the longest side of the scene."), IN_DIGITS
 ]
-Seconds = Annotated[float, Query(ge=0.1, le=120, description="Length of a video.")]
+Seconds = Annotated[float, Query(ge=0.1, le=1200, description="Length of a video.")]
+Fps = Annotated[float, Query(ge=1, le=240, description="Pictures a second of a video.")]
+Side = Annotated[int | None, Query(ge=16, le=8192, description="Pixels of a video. Default: of the sensor."), IN_DIGITS]
+Along = Annotated[
+    Literal["smooth", "recorded"],
+    Query(description="A video follows the recorded path without its tremor, or as it is."),
+]
+Slower = Annotated[
+    float | None,
+    Query(ge=0.001, le=1e6, description="Seconds of video for a second of recording. Default: a video of 10 s."),
+]
+Window = Annotated[int, Query(ge=1, le=4096, description="Frames of a picture."), IN_DIGITS]
+Compensated = Annotated[
+    bool, Query(description="Add the pictures before and after to each, moved along the motion: less noise.")
+]
 _NUMBER = r"-?[0-9]+(\.[0-9]+)?"
 _POSE = rf"{_NUMBER}(,{_NUMBER}){{6}}"
 Through = Annotated[
@@ -64,6 +79,12 @@ _CONTENT: dict[str, Any] = {kind.sent_as: BINARY for kind in KINDS}
 _FILE: dict[int | str, dict[str, Any]] = {
     200: {"description": "The file, or a ZIP of the folder.", "headers": _HEADERS, "content": _CONTENT},
     206: {"description": "The requested range.", "content": _CONTENT},
+    **NOT_MODIFIED,
+    **problems(404, 416, 503, 507),
+}
+_VIDEO: dict[int | str, dict[str, Any]] = {
+    200: {"description": "The file.", "headers": ETAG, "content": {"video/mp4": BINARY}},
+    206: {"description": "The requested range.", "content": {"video/mp4": BINARY}},
     **NOT_MODIFIED,
     **problems(404, 416, 503, 507),
 }
@@ -92,6 +113,32 @@ def export_routes(
 
     _add(router, "/reconstructions/{reconstruction_id:id}", "get_reconstruction_export", named, exports)
     _add(router, "/captures/{capture_id:id}", "get_export", newest, exports)
+
+    @router.get(
+        "/captures/{capture_id:id}/recording/video", tags=["captures"], responses=_VIDEO, response_class=Response
+    )
+    def get_recording_video(
+        request: Request,
+        capture_id: str,
+        slower: Slower = None,
+        fps: Fps = 30.0,
+        window: Window = WINDOW,
+        compensate: Compensated = False,
+        from_s: FromS = None,
+        to_s: ToS = None,
+    ) -> Response:
+        """The recording in slow motion, an MP4; pictures whose frames were lost are black. Made in a worker process."""
+        return exports.video(
+            request,
+            capture_id,
+            slower=slower,
+            fps=fps,
+            window=window,
+            compensated=compensate,
+            begin_s=from_s or 0.0,
+            end_s=to_s,
+        )
+
     return router
 
 
@@ -117,11 +164,27 @@ def _add(router: APIRouter, prefix: str, name: str, find: Callable[..., Reconstr
         expected_depth: ExpectedDepth = False,
         resolution: Resolution = 256,
         seconds: Seconds = 10.0,
+        fps: Fps = 30.0,
+        width: Side = None,
+        height: Side = None,
+        along: Along = "smooth",
         through: Through = None,
         metric: Metric = False,
         frame: Frames = None,
     ) -> Response:
         depth: Literal["median", "expected"] = "expected" if expected_depth else "median"
         poses = () if through is None else tuple(tuple(map(float, one.split(","))) for one in through.split(";"))
-        options = ExportOptions(views, undistorted, depth, resolution, seconds, poses, tuple(frame or ()))
+        options = ExportOptions(
+            views=views,
+            undistorted=undistorted,
+            depth=depth,
+            resolution=resolution,
+            seconds=seconds,
+            pictures_a_second=fps,
+            width=width,
+            height=height,
+            along=along,
+            through=poses,
+            frames=tuple(frame or ()),
+        )
         return exports.response(request, row, find_kind(format), options, version=version, metric=metric)

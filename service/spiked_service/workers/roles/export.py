@@ -2,6 +2,8 @@
 
 import os
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,25 +19,31 @@ from spiked_service.store.disk_space import DiskFullError
 from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.messages import ExportCommand
 
-_NICE = 10
+NICE = 10
 """Niceness: live captures have priority."""
 
 
 def run_export(command: ExportCommand, channel: WorkerChannel) -> None:
     """Write the file whole or not at all. Raises DiskFullError, and SpikedError for what the user can correct."""
-    os.nice(_NICE)
+    os.nice(NICE)
     kind, source = find_kind(command.kind), source_of(command)
+    with disk_told(), whole_file(command.out) as part:
+        if kind.folder:
+            with TemporaryDirectory(dir=part.parent, prefix=".export-") as name:
+                folder = Path(name) / command.name
+                kind.write(source, folder, command.options)
+                _zip(folder, part)
+        else:
+            kind.fill(source, part, command.options)
+
+
+@contextmanager
+def disk_told() -> Iterator[None]:
+    """Around the writing of a file that somebody has asked for: raises DiskFullError and SceneError for OSError."""
     try:
-        with whole_file(command.out) as part:
-            if kind.folder:
-                with TemporaryDirectory(dir=part.parent, prefix=".export-") as name:
-                    folder = Path(name) / command.name
-                    kind.write(source, folder, command.options)
-                    _zip(folder, part)
-            else:
-                kind.fill(source, part, command.options)
+        yield
     except OSError as error:
-        why = f"the export cannot be written: {error.strerror or error}"
+        why = f"the file cannot be written: {error.strerror or error}"
         if error.errno in FULL:
             raise DiskFullError(f"{why}; free disk space in the data folder, or remove and purge captures") from error
         raise SceneError(f"{why}; see the state of the disk of the data folder") from error

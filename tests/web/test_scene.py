@@ -384,9 +384,6 @@ def test_views_are_bookmarked_and_linked(studied: Studied, visit: Callable[..., 
     page.get_by_role("button", name="Add").click()
     until(lambda: page.get_by_role("button", name="View 2", exact=True).count() == 1, "a second bookmark")
     keep(page, pictures_folder / "bookmarks.webp")
-    link = page.get_by_role("link", name="Video through them").get_attribute("href")
-    answer = studied.http.get(f"{studied.address}{link}", timeout=120)
-    assert answer.headers["content-type"] == "video/mp4" and len(answer.content) > 10_000, answer.text[:300]
 
 
 @pytest.mark.slow

@@ -5,8 +5,8 @@ import { type JSX, useState } from "react";
 import * as calls from "../../shared/api/calls";
 import type { Reconstruction } from "../../shared/api/types";
 import { useFetch } from "../../shared/state/useFetch";
+import { DownloadLink } from "../../shared/ui/DownloadLink";
 import { Fetched } from "../../shared/ui/Fetched";
-import { Icon } from "../../shared/ui/icons";
 
 export function ExportMenu({ job }: { job: Reconstruction }): JSX.Element {
   const [open, setOpen] = useState(false);
@@ -40,9 +40,9 @@ function Formats({ job }: { job: Reconstruction }): JSX.Element {
             {found.map((format) => (
               <li key={format.name}>
                 {format.missing === "" ? (
-                  <a className="button" href={calls.address.exported(job.id, format.name, metric && known)} download>
-                    <Icon name="download" /> {format.name}
-                  </a>
+                  <DownloadLink href={calls.address.exported(job.id, format.name, metric && known)}>
+                    {format.name}
+                  </DownloadLink>
                 ) : (
                   <span className="dim">{format.name}</span>
                 )}

@@ -3,7 +3,7 @@
 import type { JSX } from "react";
 
 import { revert } from "../../shared/api/calls";
-import type { Capture, Closure, Reconstruction, Version } from "../../shared/api/types";
+import type { Capture, Closure, Reconstruction, Sensor, Version } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
 import { nameOf, progressText } from "../../shared/state/capture";
 import { count, decibel, duration, percent } from "../../shared/state/format";
@@ -13,7 +13,7 @@ import { ActionButton } from "../../shared/ui/access";
 import { Icon } from "../../shared/ui/icons";
 import { JobBadge, JobReason, Meter, Segmented, Stat, trackingMeaning, Warnings } from "../../shared/ui/parts";
 import { BookmarksPanel } from "./BookmarksPanel";
-import type { Colouring } from "./path";
+import type { Colouring, Path } from "./path";
 import { MAX_WIDTH_PX, type LineStyle, SPEED_STYLES, STATE_STYLES, STATES } from "./stateStyles";
 import type { Closures } from "./useClosures";
 import type { Comparison } from "./useComparison";
@@ -73,6 +73,9 @@ export interface InspectorProps {
   onRide: (ride: boolean) => void;
   comparison: Comparison | null;
   onHome: () => void;
+  /** With the optics of the version that is shown. */
+  sensor: Sensor | null;
+  path: Path | null;
   onScreenshot: (size: Size | null) => void;
   onCopyLink: () => void;
   currentView: () => { camera: number[]; frame: number | null };
@@ -165,9 +168,11 @@ export function Inspector(props: InspectorProps): JSX.Element {
       />
       <BookmarksPanel
         key={capture.id}
-        captureId={capture.id}
+        capture={capture}
         job={job}
         version={pinned?.version ?? null}
+        sensor={props.sensor}
+        path={props.path}
         currentView={props.currentView}
         onView={props.onView}
       />

@@ -232,6 +232,8 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
         }}
         shown={shown}
         loading={loading}
+        sensor={sensor}
+        path={path}
         closures={closures}
         onTime={(time_s) => sensor !== null && adjust({ frame: Math.round(time_s * sensor.frame_rate_hz) })}
         full={full}

@@ -256,6 +256,8 @@ export const revert = (id: string, body: RevertRequest): Promise<Edited> =>
     }),
   );
 
+type Asked<Name extends string> = Record<Name, string | number | boolean | null>;
+
 /** URLs for elements that fetch by themselves. */
 export const address = {
   thumbnail: (id: string): string => `${API}/captures/${id}/thumbnail`,
@@ -281,15 +283,30 @@ export const address = {
   report: (id: string): string => `${API}/reconstructions/${id}/report`,
   exported: (id: string, format: string, metric: boolean): string =>
     `${API}/reconstructions/${id}/exports/${format}${query(metric ? { metric } : {})}`,
-  /** An MP4 through poses: x, y, z, qw, qx, qy, qz of each. */
-  video: (id: string, version: number | null, through: readonly (readonly number[])[], seconds: number): string =>
+  /** An MP4 along the path, or through poses if there are any: x, y, z, qw, qx, qy, qz of each. */
+  video: (
+    id: string,
+    {
+      through,
+      ...asked
+    }: Asked<"version" | "seconds" | "fps" | "width" | "height" | "along"> & {
+      through: readonly (readonly number[])[];
+    },
+  ): string =>
     `${API}/reconstructions/${id}/exports/video${query({
-      version,
-      seconds,
+      ...asked,
       through: through.map((pose) => pose.map((value) => value.toFixed(6)).join(",")).join(";"),
     })}`,
+  /** An MP4 of a recording in slow motion. */
+  slowMotion: (id: string, asked: Asked<"slower" | "fps" | "window" | "compensate">): string =>
+    `${API}/captures/${id}/recording/video${query(asked)}`,
   bundle: (id: string): string => `${API}/reconstructions/${id}/bundle`,
   trajectory: (id: string, format: string): string => `${API}/reconstructions/${id}/trajectory${query({ format })}`,
+};
+
+/** Have the service make a file, which it then keeps for a while: one byte of it is fetched. Throws ApiError. */
+export const made = async (url: string): Promise<void> => {
+  await (await request(url.slice(API.length + 1), { headers: { Range: "bytes=0-0" } })).arrayBuffer();
 };
 
 /** The bytes of a picture or a scene, aborted by `signal`. */

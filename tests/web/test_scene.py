@@ -447,6 +447,34 @@ def test_the_scene_on_a_phone(studied: Studied, visit: Callable[..., Any]) -> No
     page.locator("img.observed").wait_for()
 
 
+def test_many_visits_leave_no_contexts_behind(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit("about:blank")
+    said: list[str] = []
+    page.on("console", lambda message: said.append(message.text))
+    page.add_init_script(
+        """
+        window.contexts = [];
+        const { getContext } = HTMLCanvasElement.prototype;
+        HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+            const context = getContext.call(this, kind, ...more);
+            if (kind.startsWith('webgl') && !window.contexts.includes(context)) window.contexts.push(context);
+            return context;
+        };
+        """
+    )
+    page.goto(f"{studied.address}?page=scene&capture={studied.capture_id}")
+    for _ in range(20):
+        until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+        page.keyboard.press("1")
+        page.locator("h1").filter(has_text="Live").wait_for(state="attached")
+        page.keyboard.press("2")
+    until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+    open_now = "() => window.contexts.filter((one) => !one.isContextLost()).length"
+    until(lambda: page.evaluate(open_now) == 1, "one context is left")
+    assert page.evaluate("() => window.contexts.length") > 20
+    assert not [text for text in said if "Too many active WebGL contexts" in text or "CONTEXT_LOST" in text]
+
+
 def test_without_webgl_the_page_says_so(studied: Studied, visit: Callable[..., Any]) -> None:
     page = visit("about:blank")
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")

@@ -9,10 +9,13 @@ import {
   GridHelper,
   Group,
   type Matrix4,
+  type Mesh,
+  type Object3D,
   PerspectiveCamera,
   Quaternion,
   Raycaster,
   Scene,
+  SpriteMaterial,
   Vector2,
   Vector3,
   WebGLRenderer,
@@ -61,6 +64,10 @@ const LOOP_SIZE = 0.03;
 /** The same of the crosses at points that are measured. */
 const MARK_SIZE = 0.012;
 const SAMPLE = 20_000;
+/** How often it is looked whether a sorting has ended, ms. */
+const LOOK_MS = 30;
+/** Longest wait for a sorting that is under way, ms. */
+const LONGEST_SORT_MS = 5000;
 /** Room for splats that come later, so that a growing scene does not get new textures with every version. */
 const HEADROOM = 1.25;
 
@@ -78,6 +85,18 @@ interface Extent {
   depth: number;
   /** Height of the floor, y of three.js. */
   floor: number;
+}
+
+const moment = (): Promise<unknown> => new Promise((resolve) => setTimeout(resolve, LOOK_MS));
+
+/** Free what a drawn object has of its own. */
+function freeGraphics(one: Object3D): void {
+  const { geometry, material } = one as Partial<Mesh>;
+  geometry?.dispose();
+  for (const each of [material ?? []].flat()) {
+    if (each instanceof SpriteMaterial) each.map?.dispose();
+    each.dispose();
+  }
 }
 
 export class Viewer {
@@ -200,7 +219,22 @@ export class Viewer {
     this.canvas.removeEventListener("webglcontextlost", this.onLost);
     this.canvas.removeEventListener("webglcontextrestored", this.draw);
     this.canvas.removeEventListener("dblclick", this.onDoubleClick);
-    this.renderer.dispose();
+    this.loading += 1;
+    void this.release();
+  }
+
+  /** Give everything back to the graphics, when the sorting under way has ended: its worker still writes into it. */
+  private async release(): Promise<void> {
+    const { spark, renderer } = this;
+    spark.autoUpdate = spark.sortDirty = false;
+    const latestMs = performance.now() + LONGEST_SORT_MS;
+    await moment(); // the canvas is taken away after this
+    while (spark.sorting && performance.now() < latestMs) await moment();
+    this.world.traverse(freeGraphics);
+    spark.dispose();
+    renderer.dispose();
+    // A browser has some sixteen contexts, and takes away the oldest; one of a canvas that is used again is kept.
+    if (!this.canvas.isConnected) renderer.forceContextLoss();
   }
 
   /** Draw in the next animation frame, once for any number of calls. */

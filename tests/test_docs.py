@@ -408,7 +408,7 @@ CLAIMS: tuple[Claim, ...] = (
     (
         "page.md",
         "is {} times the absolute",
-        lambda: {"4": "four"}[web("features/scene/RideAlong.tsx", r"_GAIN = (\d+)")],
+        lambda: {"4": "four"}[web("features/scene/composing.ts", r"_GAIN = (\d+)")],
     ),
     ("page.md", "a contrast below {}", lambda: web("shared/styles/palette.test.ts", r"TEXT = ([\d.]+)")),
 )

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browsing import (
+    DESKTOP,
     PHONE,
     STEPS,
     Picture,
@@ -17,6 +18,7 @@ from browsing import (
     decoded,
     keep,
     picture,
+    psnr_db,
     shown_version,
     still,
     until,
@@ -222,3 +224,60 @@ def test_an_earlier_version_is_compared_and_brought_back(studied: Studied, compa
     until(lambda: studied.reconstruction()["splats"] == before["splats"], "all splats are back")
     page.get_by_text(f"The scene is as version {before['version']} was").wait_for()
     assert violations(page) == []
+
+
+def saved(page: Any) -> Picture:
+    """The picture that Screenshot saves."""
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Screenshot").click()
+    return decoded(Path(download.value.path()).read_bytes())
+
+
+def alike(file: Picture, seen: Picture) -> float:
+    """Likeness of a saved picture and of what is seen, without the names above and the notes below.
+
+    Of means of 8 by 8 pixels: the browser's own picture of a place that begins between two rows of pixels has both."""
+    assert np.abs(np.subtract(file.shape, seen.shape)).max() <= 1
+    high, wide = np.minimum(file.shape, seen.shape)[:2] // 8 * 8
+
+    def means(one: Picture) -> Picture:
+        return np.asarray(one[:high, :wide].reshape(high // 8, 8, wide // 8, 8, 3).mean((1, 3))[6:-8])
+
+    return psnr_db(means(file), means(seen))
+
+
+def test_a_screenshot_has_both_scenes(compared: Callable[..., Any]) -> None:
+    page = compared()
+    for how in ("Beside", "Wipe", "Difference"):
+        choose(page, how)
+        if how == "Wipe":
+            page.get_by_role("slider", name="on the left").fill("0.3")
+        still(page)
+        seen, file = stage(page), saved(page)
+        assert alike(file, seen) > 25, how
+    choose(page, "Beside")
+    size = page.get_by_label("Size of the screenshot")
+    size.select_option(label="other size")
+    page.get_by_label("Width", exact=True).fill("900")
+    page.get_by_label("Height", exact=True).fill("300")
+    wide = saved(page)
+    assert wide.shape == (300, 900, 3)
+    assert apart(wide[:, :448], wide[:, 452:]) < 0.08, "the same room twice"
+    assert min(np.ptp(wide[:, :448]), np.ptp(wide[:, 452:])) > 0.4
+
+
+@pytest.mark.parametrize("viewport", [DESKTOP, PHONE])
+def test_a_screenshot_of_the_ride_has_the_picture_of_the_camera(
+    studied: Studied, visit: Callable[..., Any], viewport: dict[str, int]
+) -> None:
+    page = visit(f"{studied.address}?page=scene&capture={studied.capture_id}&ride=1&frame=320", viewport=viewport)
+    page.locator("img.observed").wait_for()
+    for how in ("Wipe", "Difference", "Observed", "Rendered"):
+        choose(page, how)
+        if how == "Wipe":
+            page.locator("input.wipe").fill("0.25")
+        still(page)
+        seen, file = stage(page), saved(page)
+        assert alike(file, seen) > 25, how
+    page.get_by_label("Size of the screenshot").select_option(label="1920 × 1080")
+    assert saved(page).shape == (1200, 1920, 3), "the shape of the sensor"

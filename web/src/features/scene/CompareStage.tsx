@@ -1,22 +1,30 @@
 /** The second scene of a comparison: beside the first, or over it with a wipe or as a difference. */
 
-import { type JSX, useEffect, useRef, useState } from "react";
+import { type JSX, useEffect, useRef } from "react";
 
 import { count } from "../../shared/state/format";
 import { ErrorMessage, Loading } from "../../shared/ui/parts";
+import { DIFFERENCE_GAIN } from "./composing";
 import type { Comparison } from "./useComparison";
-
-/** Gain of the difference; `.brightened` in the style sheet applies it. */
-const DIFFERENCE_GAIN = 4;
 
 export interface Names {
   first: string;
   second: string;
 }
 
-export function CompareStage({ comparison, names }: { comparison: Comparison; names: Names }): JSX.Element {
+export function CompareStage({
+  comparison,
+  names,
+  share,
+  onShare,
+}: {
+  comparison: Comparison;
+  names: Names;
+  /** Where the line of a wipe is, a share of the width. */
+  share: number;
+  onShare: (share: number) => void;
+}): JSX.Element {
   const { how, mount, shown, problem } = comparison;
-  const [share, setShare] = useState(0.5);
   const box = useRef<HTMLDivElement>(null);
   useEffect(() => {
     if (box.current !== null) box.current.style.clipPath = how === "wipe" ? `inset(0 0 0 ${100 * share}%)` : "";
@@ -31,7 +39,7 @@ export function CompareStage({ comparison, names }: { comparison: Comparison; na
       >
         <canvas ref={mount} data-version={shown?.version ?? 0} />
       </div>
-      {how === "wipe" && <Divider share={share} onShare={setShare} names={names} />}
+      {how === "wipe" && <Divider share={share} onShare={onShare} names={names} />}
       {how === "difference" && <span className="brightened" aria-hidden="true" />}
       {how === "difference" && (
         <div className="compare">

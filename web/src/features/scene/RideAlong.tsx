@@ -5,6 +5,7 @@ import { type JSX, useEffect, useRef, useState } from "react";
 import { address, fetched } from "../../shared/api/calls";
 import type { Capture, Sensor } from "../../shared/api/types";
 import { Segmented } from "../../shared/ui/parts";
+import { DIFFERENCE_GAIN } from "./composing";
 
 export type Comparison = "wipe" | "difference" | "rendered" | "observed";
 const CHOICES = [
@@ -17,8 +18,6 @@ const CHOICES = [
 export const comparisonOf = (how: string): Comparison => CHOICES.find(({ value }) => value === how)?.value ?? "wipe";
 
 const LOOK_MS = 60;
-/** Gain of the difference image; `.brightened` in the style sheet applies it. */
-const DIFFERENCE_GAIN = 4;
 
 export function RideAlong({
   capture,
@@ -28,6 +27,8 @@ export function RideAlong({
   frame,
   comparison,
   onComparison,
+  share,
+  onShare,
 }: {
   capture: Capture;
   /** The reconstruction, whose optics the picture has to have, too. */
@@ -38,8 +39,10 @@ export function RideAlong({
   frame: number | null;
   comparison: Comparison;
   onComparison: (comparison: Comparison) => void;
+  /** Where the line of the wipe is, a share of the width. */
+  share: number;
+  onShare: (share: number) => void;
 }): JSX.Element {
-  const [share, setShare] = useState(0.5);
   const image = useRef<HTMLImageElement>(null);
   const observed = useObserved(capture.id, jobId, white, frame);
   const bar = useRef<HTMLDivElement>(null);
@@ -64,7 +67,7 @@ export function RideAlong({
           data-frame={frame ?? ""}
         />
       )}
-      {comparison === "wipe" && <Wipe share={share} onShare={setShare} />}
+      {comparison === "wipe" && <Wipe share={share} onShare={onShare} />}
       {comparison === "difference" && <span className="brightened" aria-hidden="true" />}
       <div className="compare" ref={bar}>
         <Segmented label="Comparison" value={comparison} choices={CHOICES} onChange={onComparison} />

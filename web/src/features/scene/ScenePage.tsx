@@ -15,7 +15,8 @@ import { Empty, ErrorMessage, JobReason, Loading, trackingHint } from "../../sha
 import { CompareStage, type Names } from "./CompareStage";
 import { Inspector } from "./Inspector";
 import { type Colouring, rowAt } from "./path";
-import { comparisonOf, RideAlong } from "./RideAlong";
+import { type Comparison as Ride, comparisonOf, RideAlong } from "./RideAlong";
+import { type Over, screenshot } from "./screenshot";
 import { Scrubber } from "./Scrubber";
 import { type Comparison as Compared, useComparison } from "./useComparison";
 import { usePath } from "./usePath";
@@ -80,6 +81,7 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   const [steering, setSteering] = useState<Steering>("orbit");
   const [full, setFull] = useState(false);
   const comparison = comparisonOf(at.how);
+  const [share, setShare] = useState(0.5);
   const mode = VIEW_MODES.find((one) => one === at.show) ?? "colour";
   const versions = useVersions(job);
   const pinned = versions.find((one) => one.version === at.version) ?? null;
@@ -156,13 +158,15 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
     await copy(linkTo({ version, camera: viewer?.view() ?? null }));
     toast("Copied the link to this view");
   };
-  const screenshot = async (size: Size | null): Promise<void> => {
+  const save = async (wanted: Size | null): Promise<void> => {
     if (viewer === null) return;
+    const over = overOf(viewer, riding ? comparison : null, compared);
+    const { file, size } = await screenshot(viewer, over, share, wanted);
     const link = document.createElement("a");
-    link.href = URL.createObjectURL(await viewer.picture(size));
-    const saved = size === null ? null : viewer.sizeOf(size);
-    const sized = saved === null ? "" : `-${saved.width}x${saved.height}`;
-    link.download = `spiked-${capture.id}-v${viewer.version}${sized}.png`;
+    link.href = URL.createObjectURL(file);
+    const sized = wanted === null ? "" : `-${size.width}x${size.height}`;
+    const how = over.kind === "nothing" ? "" : `-${over.how}`;
+    link.download = `spiked-${capture.id}-v${viewer.version}${how}${sized}.png`;
     link.click();
     URL.revokeObjectURL(link.href);
     toast(`Saved ${link.download}`);
@@ -180,7 +184,12 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
             data-splats={shown?.splats ?? 0}
           />
           {compared !== null && viewer !== null && (
-            <CompareStage comparison={compared} names={namesOf(job, pinned, compared)} />
+            <CompareStage
+              comparison={compared}
+              names={namesOf(job, pinned, compared)}
+              share={share}
+              onShare={setShare}
+            />
           )}
           {riding && sensor !== null && (
             <RideAlong
@@ -190,6 +199,8 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
               sensor={sensor}
               frame={path?.frames[row] ?? null}
               comparison={comparison}
+              share={share}
+              onShare={setShare}
               onComparison={(how) => adjust({ how: how === "wipe" ? "" : how })}
             />
           )}
@@ -265,7 +276,7 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
           viewer?.home();
           adjust({ camera: null });
         }}
-        onScreenshot={(size) => void attempt(() => screenshot(size))}
+        onScreenshot={(size) => void attempt(() => save(size))}
         onCopyLink={() => void attempt(copyLink)}
         currentView={() => ({ camera: viewer?.view() ?? [], frame: route().frame })}
         onView={(camera, frame) => adjust({ camera, frame, ...leave })}
@@ -280,6 +291,14 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
       />
     </div>
   );
+}
+
+/** What lies over the scene: the picture of the camera along the ride, or the other scene of a comparison. */
+function overOf(viewer: Viewer, ride: Ride | null, compared: Compared | null): Over {
+  if (ride !== null)
+    return { kind: "camera", how: ride, picture: viewer.canvas.parentElement?.querySelector("img.observed") ?? null };
+  if (compared?.viewer == null || compared.how === "paths") return { kind: "nothing" };
+  return { kind: "scene", viewer: compared.viewer, how: compared.how };
 }
 
 /** The sensor with the optics that a version was made with: the reconstruction may have found them. */

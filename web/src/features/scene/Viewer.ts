@@ -63,6 +63,8 @@ const FRUSTUM_PX = 1.6;
 const LOOP_SIZE = 0.03;
 /** The same of the crosses at points that are measured. */
 const MARK_SIZE = 0.012;
+/** More pixels for one of the style sheets are not seen. */
+const MOST_SHARPNESS = 2;
 const SAMPLE = 20_000;
 /** How often it is looked whether a sorting has ended, ms. */
 const LOOK_MS = 30;
@@ -153,7 +155,7 @@ export class Viewer {
     private readonly onMoved: () => void,
   ) {
     this.renderer = new WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
-    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
+    this.renderer.setPixelRatio(this.sharpness);
     this.spark = new SparkRenderer({
       renderer: this.renderer,
       onDirty: this.draw,
@@ -655,9 +657,8 @@ export class Viewer {
     this.draw();
   }
 
-  /** The canvas as a PNG file, or the same view in another size, see `sizeOf`. Throws for one that cannot be drawn. */
-  picture(size: Size | null = null): Promise<Blob> {
-    if (size === null) return this.drawn(this.canvas.clientHeight);
+  /** The view as a PNG file of a size, see `sizeOf`. Throws for one that cannot be drawn. */
+  picture(size: Size): Promise<Blob> {
     const { width, height } = this.sizeOf(size);
     const { maxPixelRadius } = this.spark;
     try {
@@ -672,9 +673,14 @@ export class Viewer {
       return this.drawn(height);
     } finally {
       this.spark.maxPixelRadius = maxPixelRadius;
-      this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
+      this.renderer.setPixelRatio(this.sharpness);
       this.resize();
     }
+  }
+
+  /** Pixels of the canvas for one of the style sheets. */
+  get sharpness(): number {
+    return Math.min(window.devicePixelRatio, MOST_SHARPNESS);
   }
 
   private drawn(height: number): Promise<Blob> {

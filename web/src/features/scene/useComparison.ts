@@ -33,6 +33,8 @@ export interface Comparison {
   job: Reconstruction | null;
   /** Its version; null: the newest. */
   version: number | null;
+  /** That of its canvas; null before there is one. */
+  viewer: Viewer | null;
   shown: Shown | null;
   path: Path | null;
   problem: string | null;
@@ -102,6 +104,7 @@ export function useComparison(first: FirstScene): Comparison | null {
     how,
     job,
     version: at.againstVersion,
+    viewer: second,
     shown,
     path,
     problem: unknown ?? missing ?? problem,

@@ -25,6 +25,8 @@ def test_a_copied_link_shows_the_same_view_later(
     until(lambda: shown_version(page) > 0, "a scene is on the canvas")
     page.get_by_role("button", name="Top", exact=True).click()
     until(lambda: "camera=" in address(page), "the view is in the address")
+    page.get_by_role("checkbox", name="Grid").uncheck()
+    page.get_by_role("radio", name="Speed").check()
     seen = still(page)
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     page.get_by_role("button", name="Copy link").click()
@@ -41,6 +43,8 @@ def test_a_copied_link_shows_the_same_view_later(
             other = visit(one, viewport=viewport, touch=touch)
             until(lambda: shown_version(other) > 0, "the scene of the link")  # noqa: B023
             until(lambda: psnr_db(picture(other), seen) > 30, "the same view", 20)  # noqa: B023
+            assert not other.get_by_role("checkbox", name="Grid").is_checked()
+            assert other.get_by_role("radio", name="Speed").is_checked()
         page.get_by_text("This capture has no reconstruction").wait_for()  # the page that follows shows the newest
         page.reload()
         page.get_by_text("This capture has no reconstruction").wait_for()

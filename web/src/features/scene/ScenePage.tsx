@@ -28,7 +28,15 @@ import { type Layers, type Size, type Steering, Viewer } from "./Viewer";
 import { VIEW_MODES } from "./viewModes";
 
 const LAYERS: Layers = { splats: true, path: true, loops: true, frustum: true, grid: true, axes: true };
+const LAYER_NAMES = Object.keys(LAYERS) as (keyof Layers)[];
 const URL_MS = 300;
+
+/** All layers but those that the address names. */
+function layersWithout(hidden: string): Layers {
+  const layers = { ...LAYERS };
+  for (const name of LAYER_NAMES) layers[name] = !hidden.split(",").includes(name);
+  return layers;
+}
 
 export function ScenePage(): JSX.Element {
   return (
@@ -76,8 +84,8 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   const job = useService((state) => state.reconstructions[jobId] ?? null);
   const [viewer, setViewer] = useState<Viewer | null>(null);
   const [fault, setFault] = useState<string | null>(null);
-  const [layers, setLayers] = useState(LAYERS);
-  const [colouring, setColouring] = useState<Colouring>("state");
+  const layers = useMemo(() => layersWithout(at.hide), [at.hide]);
+  const colouring: Colouring = at.by === "speed" ? "speed" : "state";
   const [steering, setSteering] = useState<Steering>("orbit");
   const [full, setFull] = useState(false);
   const comparison = comparisonOf(at.how);
@@ -250,9 +258,9 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
         full={full}
         onFull={() => setFull(true)}
         layers={layers}
-        onLayers={setLayers}
+        onLayers={(next) => adjust({ hide: LAYER_NAMES.filter((one) => !next[one]).join(",") })}
         colouring={colouring}
-        onColouring={setColouring}
+        onColouring={(by) => adjust({ by: by === "state" ? "" : by })}
         steering={steering}
         onSteering={setSteering}
         ride={riding}

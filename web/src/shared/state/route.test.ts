@@ -17,6 +17,8 @@ it("keeps everything that is looked at in the URL", () => {
     camera: [0.5, 1, -2, 0, 0, -1, 55],
     ride: true,
     show: "depth",
+    hide: "grid,axes",
+    by: "speed",
     against: "01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e12",
     againstVersion: 3,
     how: "wipe",
@@ -26,7 +28,7 @@ it("keeps everything that is looked at in the URL", () => {
 });
 
 it("does not believe what a link says", () => {
-  const odd = parseRoute("?page=attic&capture=../../etc&frame=-1&camera=1,2,x,4,5,6,7&reconstruction=a%2Fb");
+  const odd = parseRoute("?page=attic&hide=1,*&capture=../../etc&frame=-1&camera=1,2,x,4,5,6,7&reconstruction=a%2Fb");
   expect(odd).toEqual(HOME);
 });
 

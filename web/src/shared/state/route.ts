@@ -21,6 +21,10 @@ export interface Route {
   ride: boolean;
   /** What the splats show. */
   show: string;
+  /** Layers of the scene that are not drawn, separated by commas. */
+  hide: string;
+  /** What the path is coloured by; empty: the state of the tracking. */
+  by: string;
   /** Reconstruction that the scene is compared with; null: none. */
   against: string | null;
   /** Its version; null follows the newest. */
@@ -40,6 +44,8 @@ export const HOME: Route = {
   camera: null,
   ride: false,
   show: "",
+  hide: "",
+  by: "",
   against: null,
   againstVersion: null,
   how: "",
@@ -54,6 +60,8 @@ const counted = (text: string | null): number | null =>
 
 const word = (text: string | null): string => /^[a-z]{1,16}$/.exec(text ?? "")?.[0] ?? "";
 
+const words = (text: string | null): string => (text ?? "").split(",").map(word).filter(Boolean).join(",");
+
 export function parseRoute(search: string): Route {
   const query = new URLSearchParams(search);
   const page = PAGES.find((name) => name === query.get("page")) ?? "live";
@@ -67,6 +75,8 @@ export function parseRoute(search: string): Route {
     camera: camera?.length === 7 && camera.every(Number.isFinite) ? camera : null,
     ride: query.get("ride") === "1",
     show: word(query.get("show")),
+    hide: words(query.get("hide")),
+    by: word(query.get("by")),
     against: identifier(query.get("against")),
     againstVersion: counted(query.get("against-version")),
     how: word(query.get("how")),
@@ -84,6 +94,8 @@ export function formatRoute(route: Route): string {
   if (route.camera !== null) pairs.set("camera", route.camera.map((x) => Number(x.toPrecision(5))).join(","));
   if (route.ride) pairs.set("ride", "1");
   if (route.show !== "") pairs.set("show", route.show);
+  if (route.hide !== "") pairs.set("hide", route.hide);
+  if (route.by !== "") pairs.set("by", route.by);
   if (route.against !== null) pairs.set("against", route.against);
   if (route.againstVersion !== null) pairs.set("against-version", String(route.againstVersion));
   if (route.how !== "") pairs.set("how", route.how);

@@ -84,6 +84,8 @@ def visit(browser: Any) -> Iterator[Visit]:
     def go(address: str, *, theme: str = "dark", viewport: dict[str, int] = DESKTOP, touch: bool = False) -> Any:
         context = browser.new_context(viewport=viewport, color_scheme=theme, has_touch=touch, accept_downloads=True)
         opened.append(context)
+        # This browser draws without graphics hardware, where the page shows points unless splats are wanted.
+        context.add_init_script("try { localStorage.setItem('spiked.splats', 'always'); } catch {}")
         page = context.new_page()
         page.set_default_timeout(1000 * PATIENCE_S)
         page.on("pageerror", lambda error: faults.append(str(error)))

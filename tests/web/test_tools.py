@@ -67,6 +67,95 @@ def test_the_view_is_changed_by_presets_keys_and_a_double_click(scene: Callable[
     until(lambda: "show=depth" in address(page), "the next mode")
 
 
+def test_fingers_turn_move_and_zoom_the_scene(scene: Callable[..., Any]) -> None:
+    page = scene("&camera=0,0,1,0,0,-1,55", viewport=PHONE, touch=True)
+    box = page.locator(".stage canvas").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    views = [address(page)]
+    fingers = page.context.new_cdp_session(page)
+
+    def touched(kind: str, *points: tuple[float, float]) -> None:
+        places = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(points)]
+        fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": places})
+
+    def changed() -> bool:
+        views.append(address(page))
+        return views[-1] != views[-2]
+
+    touched("touchStart", (x, y))
+    touched("touchMove", (x + 60, y + 10))
+    touched("touchEnd")
+    until(changed, "one finger turns it")
+    touched("touchStart", (x - 40, y), (x + 40, y))
+    touched("touchMove", (x - 80, y), (x + 80, y))
+    touched("touchEnd")
+    until(changed, "two fingers zoom")
+    page.wait_for_timeout(500)
+    for _ in range(2):
+        page.touchscreen.tap(x + 20, y + 15)
+    until(changed, "a double tap turns to the point")
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
+
+
+def test_a_slow_machine_draws_fewer_pixels_while_the_view_moves(scene: Callable[..., Any]) -> None:
+    page = scene()
+    width = "() => document.querySelector('.stage canvas').width"
+    full = page.evaluate(width)
+    box = page.locator(".stage canvas").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.evaluate(
+        f"() => {{ window.widths = new Set(); const look = () => {{ window.widths.add(({width})());"
+        " requestAnimationFrame(look); }; look(); }"
+    )
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 50, y, steps=10)
+    page.mouse.up()
+    until(lambda: page.evaluate(width) == full, "all pixels at rest")
+    assert min(page.evaluate("() => [...window.widths]")) == full // 2
+
+
+def test_points_are_drawn_without_graphics_hardware(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit("about:blank")
+    page.add_init_script("if (!window.name) localStorage.removeItem('spiked.splats'); window.name = 'again';")
+    page.goto(f"{studied.address}?page=scene&capture={studied.capture_id}")
+    page.locator(".stage-notes").get_by_text("without graphics hardware").wait_for()
+    assert page.get_by_label("Show", exact=True).input_value() == "points"
+    assert violations(page) == []
+    points = still(page)
+    page.get_by_role("button", name="Draw splats").click()
+    until(lambda: unlike(page, points), "splats")
+    assert page.get_by_label("Show", exact=True).input_value() == "colour"
+    page.reload()
+    until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+    assert page.locator(".stage-notes").get_by_text("without graphics hardware").count() == 0
+
+
+def test_nothing_is_claimed_before_splats_are_drawn(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit("about:blank")
+    page.add_init_script(
+        """
+        const { postMessage } = Worker.prototype;
+        window.held = [];
+        Worker.prototype.postMessage = function (...all) {
+            if (JSON.stringify(all[0]?.name ?? '').includes('sort') && window.held !== null)
+                window.held.push(() => postMessage.apply(this, all));
+            else postMessage.apply(this, all);
+        };
+        """
+    )
+    page.goto(f"{studied.address}?page=scene&capture={studied.capture_id}")
+    page.get_by_text("Sorting the splats…").wait_for()
+    canvas = page.locator(".stage canvas")
+    assert canvas.get_attribute("data-splats") == "0" and "nothing drawn yet" in (
+        canvas.get_attribute("aria-label") or ""
+    )
+    assert page.locator(".inspector dl.stats dd").first.inner_text() == "–"
+    page.evaluate("() => { const held = window.held; window.held = null; held.forEach((send) => send()); }")
+    until(lambda: shown_version(page) > 0, "the splats are drawn")
+    assert np.ptp(picture(page)) > 0.4
+
+
 def test_help_is_one_key_away(scene: Callable[..., Any]) -> None:
     page = scene(viewport=PHONE)
     page.get_by_role("button", name="Keys and help").click()

@@ -10,6 +10,8 @@ const KEYS: readonly [string, string][] = [
   ["Tab", "To the next control; everything is reached"],
   ["Drag, right drag, wheel", "Scene, Orbit: turn, move, come closer"],
   ["Double click", "Scene: turn round the point that was clicked"],
+  ["One finger, two fingers", "Scene, Orbit: turn; move and come closer"],
+  ["Double tap", "Scene: turn round the point that was tapped"],
   ["Arrow keys", "Scene, Orbit: move sideways; on the time slider: other frames"],
   ["F, H, T", "Scene, Orbit: to the middle of the view; home; from the top"],
   ["M", "Scene: show another property of the splats"],
@@ -24,6 +26,10 @@ const SYMPTOMS: readonly [string, string][] = [
   ["It says lost", "Go back to what was seen before. The recording goes on; it can be reconstructed again later."],
   ["The scene is foggy", "Clean the scene (Scene, Clean), or re-run it with more steps; see whether the path is good."],
   ["The scene has the wrong size", "A camera alone knows no metres: give it a length (Scene, Measure)."],
+  [
+    "The view moves in jerks, or only points are drawn",
+    "This browser draws without graphics hardware: allow it in the settings of the browser, or keep the points.",
+  ],
   [
     "Frames are missing",
     "The table of missing frames names the cause: usb, ring or disk. Set-up, Doctor, checks each.",

@@ -35,7 +35,7 @@ export function CompareStage({
         className={`second ${how}`}
         ref={box}
         role="img"
-        aria-label={`${names.second}: ${count(shown?.splats ?? 0)} splats`}
+        aria-label={`${names.second}: ${shown === null ? "nothing drawn yet" : `${count(shown.splats)} splats`}`}
       >
         <canvas ref={mount} data-version={shown?.version ?? 0} />
       </div>

@@ -35,7 +35,11 @@ const LAYER_NAMES: Record<keyof Layers, string> = {
   axes: "Axes",
 };
 const STEERINGS = [
-  { value: "orbit", label: "Orbit", hint: "Drag: rotate; right drag or arrow keys: pan; wheel: zoom" },
+  {
+    value: "orbit",
+    label: "Orbit",
+    hint: "Drag: rotate; right drag or arrow keys: pan; wheel: zoom. By touch: one finger rotates, two pan and zoom, a double tap turns to a point",
+  },
   { value: "fly", label: "Fly", hint: "Click the scene; W A S D R F: move, Q E: roll, drag: look around" },
 ] as const;
 const COLOURINGS = [

@@ -19,6 +19,7 @@ import { type Comparison as Ride, comparisonOf, RideAlong } from "./RideAlong";
 import { type Over, screenshot } from "./screenshot";
 import { Scrubber } from "./Scrubber";
 import { type Comparison as Compared, useComparison } from "./useComparison";
+import { useSorting, useSplatsWanted } from "./useDrawing";
 import { usePath } from "./usePath";
 import { useClosures } from "./useClosures";
 import { useScene } from "./useScene";
@@ -90,7 +91,10 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   const [full, setFull] = useState(false);
   const comparison = comparisonOf(at.how);
   const [share, setShare] = useState(0.5);
-  const mode = VIEW_MODES.find((one) => one === at.show) ?? "colour";
+  const [splatsWanted, wantSplats] = useSplatsWanted();
+  const sorting = useSorting(viewer);
+  const asPoints = at.show === "" && viewer?.software === true && !splatsWanted;
+  const mode = asPoints ? "points" : (VIEW_MODES.find((one) => one === at.show) ?? "colour");
   const versions = useVersions(job);
   const pinned = versions.find((one) => one.version === at.version) ?? null;
   const sensor = useSensor(capture, pinned ?? versions.at(-1));
@@ -187,7 +191,7 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
             ref={mount}
             tabIndex={0}
             role="application"
-            aria-label={`Scene of ${nameOf(capture)}: ${count(shown?.splats ?? 0)} splats, version ${shown?.version ?? 0}`}
+            aria-label={`Scene of ${nameOf(capture)}: ${shown === null ? "nothing drawn yet" : `${count(shown.splats)} splats, version ${shown.version}`}`}
             data-version={shown?.version ?? 0}
             data-splats={shown?.splats ?? 0}
           />
@@ -213,11 +217,22 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
             />
           )}
         </div>
-        {gone !== null && (
-          <p className="stage-note" role="status">
-            Version {gone} is not kept any more: this is the newest.
-          </p>
-        )}
+        {shown !== null && sorting && <p className="sorting glass">Sorting the splats…</p>}
+        <div className="stage-notes">
+          {gone !== null && (
+            <p className="glass" role="status">
+              Version {gone} is not kept any more: this is the newest.
+            </p>
+          )}
+          {shown !== null && asPoints && !riding && (
+            <p className="glass" role="status">
+              This browser draws without graphics hardware: points are faster.{" "}
+              <button type="button" onClick={wantSplats}>
+                Draw splats
+              </button>
+            </p>
+          )}
+        </div>
         {fault !== null && <ErrorMessage text={fault} />}
         {shown === null && fault === null && (
           <div className="veil">
@@ -231,7 +246,12 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
                 <JobReason job={job} />
               </Empty>
             ) : (
-              <Empty icon="scene" title={loading ? "Loading the scene…" : "Waiting for the first version…"}>
+              <Empty
+                icon="scene"
+                title={
+                  sorting ? "Sorting the splats…" : loading ? "Loading the scene…" : "Waiting for the first version…"
+                }
+              >
                 {!loading && trackingHint(job)}
                 {!loading && <JobReason job={job} />}
               </Empty>
@@ -267,13 +287,14 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
         comparison={compared}
         onRide={(ride) => adjust({ ride, how: "", ...(ride ? { against: null, againstVersion: null } : {}) })}
         shows={riding && comparison === "difference" ? "error" : mode}
-        onShows={(shows) =>
+        onShows={(shows) => {
+          if (shows === "colour") wantSplats();
           adjust(
             shows === "error"
               ? { ride: true, how: "difference", against: null, againstVersion: null }
               : { ...leave, show: shows === "colour" ? "" : shows },
-          )
-        }
+          );
+        }}
         fov={Math.round(at.camera?.[6] ?? viewer?.view()[6] ?? 0)}
         onFov={(fov) => viewer?.setFov(fov)}
         onPreset={(preset) => {

@@ -66,7 +66,15 @@ const MARK_SIZE = 0.012;
 /** More pixels for one of the style sheets are not seen. */
 const MOST_SHARPNESS = 2;
 const SAMPLE = 20_000;
-/** How often it is looked whether a sorting has ended, ms. */
+/** Pixels that are drawn for one of the canvas, each way, while a slow machine draws a moving view. */
+const MOVING_SHARE = 0.5;
+/** A moving view has come to rest after this, ms. */
+const REST_MS = 150;
+/** A machine is slow that takes longer for each of so many pictures of a moving view, ms. */
+const [SLOW_MS, MOST_SLOW] = [33, 3];
+/** Two taps within this time and this way are one double tap, ms and px. */
+const [DOUBLE_TAP_MS, DOUBLE_TAP_PX] = [350, 30];
+/** How often it is looked whether splats are drawn, ms. */
 const LOOK_MS = 30;
 /** Longest wait for a sorting that is under way, ms. */
 const LONGEST_SORT_MS = 5000;
@@ -91,6 +99,13 @@ interface Extent {
 
 const moment = (): Promise<unknown> => new Promise((resolve) => setTimeout(resolve, LOOK_MS));
 
+/** Whether a context is drawn by the processor. */
+function drawsInSoftware(context: WebGLRenderingContext | WebGL2RenderingContext): boolean {
+  const names = context.getExtension("WEBGL_debug_renderer_info");
+  const name: unknown = context.getParameter(names?.UNMASKED_RENDERER_WEBGL ?? context.RENDERER);
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(String(name));
+}
+
 /** Free what a drawn object has of its own. */
 function freeGraphics(one: Object3D): void {
   const { geometry, material } = one as Partial<Mesh>;
@@ -105,6 +120,8 @@ export class Viewer {
   /** Version of the scene that is shown; 0 before the first. */
   version = 0;
   splats = 0;
+  /** Whether there is no graphics hardware behind the canvas. */
+  readonly software: boolean;
   private readonly renderer: WebGLRenderer;
   private readonly world = new Scene();
   /** Parent of objects in OpenCV axes. */
@@ -146,6 +163,16 @@ export class Viewer {
   private placed = false;
   private scheduled = 0;
   private lastMs = 0;
+  /** Whether fewer pixels are drawn: the view moves, and this machine is too slow for all of them. */
+  private coarse = false;
+  private slow: boolean;
+  /** Pictures of the moving view, one after the other, that took too long. */
+  private slowPictures = 0;
+  /** Whether the view is held and turned. */
+  private held = false;
+  /** Runs while the view moves. */
+  private resting: ReturnType<typeof setTimeout> | undefined;
+  private lastTap: { atMs: number; x: number; y: number } | null = null;
   private loading = 0;
   private readonly resizing: ResizeObserver;
 
@@ -156,6 +183,7 @@ export class Viewer {
   ) {
     this.renderer = new WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
     this.renderer.setPixelRatio(this.sharpness);
+    this.slow = this.software = drawsInSoftware(this.renderer.getContext());
     this.spark = new SparkRenderer({
       renderer: this.renderer,
       onDirty: this.draw,
@@ -189,9 +217,14 @@ export class Viewer {
     this.orbit = new OrbitControls(this.camera, canvas);
     this.orbit.addEventListener("change", () => {
       this.lead?.takeCamera(this);
+      if (this.held) this.moves();
       this.draw();
     });
+    this.orbit.addEventListener("start", () => {
+      this.held = true;
+    });
     this.orbit.addEventListener("end", () => {
+      this.held = false;
       this.placed = true;
       this.onMoved();
     });
@@ -203,6 +236,7 @@ export class Viewer {
     canvas.addEventListener("webglcontextlost", this.onLost);
     canvas.addEventListener("webglcontextrestored", this.draw);
     canvas.addEventListener("dblclick", this.onDoubleClick);
+    canvas.addEventListener("pointerup", this.onTap);
     this.resize();
   }
 
@@ -221,6 +255,8 @@ export class Viewer {
     this.canvas.removeEventListener("webglcontextlost", this.onLost);
     this.canvas.removeEventListener("webglcontextrestored", this.draw);
     this.canvas.removeEventListener("dblclick", this.onDoubleClick);
+    this.canvas.removeEventListener("pointerup", this.onTap);
+    clearTimeout(this.resting);
     this.loading += 1;
     void this.release();
   }
@@ -245,8 +281,42 @@ export class Viewer {
   };
 
   private readonly onDoubleClick = (event: MouseEvent): void => {
-    if (!this.riding && this.lead === null) this.focus(event.clientX, event.clientY);
+    const touched = (event as Partial<PointerEvent>).pointerType === "touch" || this.lastTap !== null;
+    if (!touched && !this.riding && this.lead === null) this.focus(event.clientX, event.clientY);
   };
+
+  /** Not every browser tells a double tap as a double click. */
+  private readonly onTap = (event: PointerEvent): void => {
+    const { timeStamp: atMs, clientX: x, clientY: y } = event;
+    const before = this.lastTap;
+    this.lastTap = event.pointerType === "touch" ? { atMs, x, y } : null;
+    if (before === null || this.lastTap === null || atMs - before.atMs > DOUBLE_TAP_MS) return;
+    if (Math.hypot(x - before.x, y - before.y) > DOUBLE_TAP_PX) return;
+    if (!this.riding && this.lead === null) this.focus(x, y);
+  };
+
+  /** The view moves: a slow machine draws fewer pixels until it rests. */
+  private moves(): void {
+    clearTimeout(this.resting);
+    this.resting = setTimeout(() => {
+      this.resting = undefined;
+      this.sharpen(false);
+    }, REST_MS);
+    if (this.slow) this.sharpen(true);
+    this.follower?.moves();
+  }
+
+  private sharpen(coarse: boolean): void {
+    if (coarse === this.coarse) return;
+    this.coarse = coarse;
+    this.renderer.setPixelRatio(this.sharpness * (coarse ? MOVING_SHARE : 1));
+    this.draw();
+  }
+
+  /** Whether splats are being sorted for a new view or version. */
+  get sorting(): boolean {
+    return this.spark.sorting;
+  }
 
   private readonly onLost = (event: Event): void => event.preventDefault();
 
@@ -258,10 +328,15 @@ export class Viewer {
       const before = this.camera.matrix.elements.slice();
       this.fly.update(elapsed);
       this.camera.updateMatrix();
-      if (this.camera.matrix.elements.some((value, i) => value !== before[i])) this.onMoved();
+      if (this.camera.matrix.elements.some((value, i) => value !== before[i])) {
+        this.moves();
+        this.onMoved();
+      }
       this.draw(); // keys are held between events
     }
     this.follower?.takeCamera(this);
+    this.slowPictures = this.resting !== undefined && elapsed > SLOW_MS / 1000 ? this.slowPictures + 1 : 0;
+    if (this.slowPictures >= MOST_SLOW) this.slow = true;
     this.path.dashFor(this.camera, this.canvas.clientHeight);
     this.renderer.render(this.world, this.riding ? this.rider : this.camera);
   };
@@ -295,7 +370,7 @@ export class Viewer {
 
   /**
    * Show another version. The one before stays until the new one is decoded and sorted, so the canvas does not flash; the view
-   * stays as it is. A call followed by a later one does nothing, and returns false.
+   * stays as it is. The first is waited for until it is drawn. A call followed by a later one does nothing, and returns false.
    */
   async change(changes: Changes): Promise<boolean> {
     const ticket = ++this.loading;
@@ -311,6 +386,10 @@ export class Viewer {
     this.splats = next.splats;
     if (this.extent === null && this.splats > 0) this.measure();
     this.show();
+    while (this.splats > 0 && this.layers.splats && this.spark.display.numSplats === 0) {
+      await moment();
+      if (ticket !== this.loading) return false;
+    }
     return true;
   }
 
@@ -648,6 +727,7 @@ export class Viewer {
     this.camera.far = camera.far;
     this.camera.updateProjectionMatrix();
     this.placed = true;
+    if (from.resting !== undefined && this.lead === null) this.moves();
     this.draw();
   }
 
@@ -673,6 +753,7 @@ export class Viewer {
       return this.drawn(height);
     } finally {
       this.spark.maxPixelRadius = maxPixelRadius;
+      this.coarse = false;
       this.renderer.setPixelRatio(this.sharpness);
       this.resize();
     }

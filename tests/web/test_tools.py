@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browsing import PHONE, Studied, address, keep, picture, shown_version, still, until, violations
+from browsing import DESKTOP, PHONE, Studied, address, keep, picture, shown_version, still, until, violations
 
 
 @pytest.fixture
@@ -154,6 +154,31 @@ def test_nothing_is_claimed_before_splats_are_drawn(studied: Studied, visit: Cal
     page.evaluate("() => { const held = window.held; window.held = null; held.forEach((send) => send()); }")
     until(lambda: shown_version(page) > 0, "the splats are drawn")
     assert np.ptp(picture(page)) > 0.4
+
+
+HEADSET = """
+Object.defineProperty(navigator, 'xr', { value: {
+    isSessionSupported: (mode) => Promise.resolve(mode === 'immersive-vr'),
+    requestSession: (mode) => { window.asked = mode; return Promise.reject(new Error('The headset is asleep.')); },
+    addEventListener() {}, removeEventListener() {},
+} });
+"""
+
+
+@pytest.mark.parametrize("viewport", [DESKTOP, PHONE])
+def test_a_headset_is_offered_where_there_is_one(
+    studied: Studied, scene: Callable[..., Any], visit: Callable[..., Any], viewport: dict[str, int]
+) -> None:
+    assert scene().get_by_role("button", name="Enter VR").count() == 0
+    page = visit("about:blank", viewport=viewport)
+    page.add_init_script(HEADSET)
+    page.goto(f"{studied.address}?page=scene&capture={studied.capture_id}")
+    until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+    before = still(page)
+    page.get_by_role("button", name="Enter VR").click()
+    page.get_by_text("The headset is asleep.").wait_for()
+    assert page.evaluate("() => window.asked") == "immersive-vr"
+    until(lambda: not unlike(page, before), "the page shows the scene as before")
 
 
 def test_help_is_one_key_away(scene: Callable[..., Any]) -> None:

@@ -1,6 +1,6 @@
 /** Settings of the scene view: version, camera control, layers, legend, bookmarks. */
 
-import type { JSX } from "react";
+import { type JSX, useEffect, useState } from "react";
 
 import { revert } from "../../shared/api/calls";
 import type { Capture, Closure, Reconstruction, Sensor, Version } from "../../shared/api/types";
@@ -25,6 +25,7 @@ import { ComparePanel } from "./ComparePanel";
 import { MeasurePanel } from "./MeasurePanel";
 import { ScreenshotTool } from "./ScreenshotTool";
 import type { Preset } from "./presets";
+import { headsetFound } from "./vr";
 
 const LAYER_NAMES: Record<keyof Layers, string> = {
   splats: "Splats",
@@ -139,6 +140,7 @@ export function Inspector(props: InspectorProps): JSX.Element {
       </div>
       <p className="dim hint">{STEERINGS.find((one) => one.value === props.steering)?.hint}</p>
       <ViewPanel {...props} />
+      <Headset viewer={props.viewer} />
       <button type="button" aria-pressed={props.ride} onClick={() => props.onRide(!props.ride)}>
         <Icon name="eye" /> Ride along
       </button>
@@ -182,6 +184,29 @@ export function Inspector(props: InspectorProps): JSX.Element {
       />
       <ScreenshotTool onScreenshot={props.onScreenshot} />
     </aside>
+  );
+}
+
+/** For those who have a headset. */
+function Headset({ viewer }: { viewer: Viewer | null }): JSX.Element | null {
+  const [found, setFound] = useState(false);
+  const [shown, setShown] = useState(false);
+  useEffect(() => {
+    void headsetFound().then(setFound);
+  }, []);
+  if (!found || viewer === null) return null;
+  return (
+    <button
+      type="button"
+      disabled={shown}
+      title="The scene around you, two metres deep, from where this view is taken"
+      onClick={() => {
+        setShown(true);
+        void attempt(() => viewer.enterVr()).finally(() => setShown(false));
+      }}
+    >
+      <Icon name="eye" /> Enter VR
+    </button>
   );
 }
 

@@ -39,6 +39,7 @@ import { MarkLines } from "./MarkLines";
 import { OVERLAY_ORDER, PathLines } from "./PathLines";
 import { distanceAlong } from "./picker";
 import { type Preset, presetDirection } from "./presets";
+import { showInHeadset } from "./vr";
 import { show as showMode, type ViewMode } from "./viewModes";
 
 export type Steering = "orbit" | "fly";
@@ -162,6 +163,8 @@ export class Viewer {
   private mode: ViewMode = "colour";
   private placed = false;
   private scheduled = 0;
+  /** Whether a headset draws. */
+  private presenting = false;
   private lastMs = 0;
   /** Whether fewer pixels are drawn: the view moves, and this machine is too slow for all of them. */
   private coarse = false;
@@ -322,6 +325,7 @@ export class Viewer {
 
   private readonly render = (nowMs: number): void => {
     this.scheduled = 0;
+    if (this.presenting) return;
     const elapsed = Math.min((nowMs - this.lastMs) / 1000, 0.1);
     this.lastMs = nowMs;
     if (this.fly !== null) {
@@ -576,6 +580,21 @@ export class Viewer {
     this.placed = this.placement !== null; // else once more when the path has come
     this.orbit.update();
     this.draw();
+  }
+
+  /** Show the scene in a headset until that is put away. */
+  async enterVr(): Promise<void> {
+    const { renderer, world, content, spark, depth } = this;
+    const ahead = this.camera.getWorldDirection(new Vector3());
+    this.presenting = true;
+    try {
+      await showInHeadset({ renderer, world, content, drawer: spark, eye: this.eye, ahead, depth });
+    } finally {
+      this.presenting = false;
+      this.renderer.setPixelRatio(this.sharpness);
+      this.resize();
+      this.show();
+    }
   }
 
   /** Look at the scene from one of its sides, from as far as now. */

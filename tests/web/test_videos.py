@@ -51,6 +51,10 @@ def test_videos_are_made_as_chosen(
     page.get_by_text("show it more slowly").wait_for()
     assert violations(page) == []
     assert page.evaluate("() => document.documentElement.scrollWidth") <= viewport["width"]
+    fits = (
+        "() => { const panel = document.querySelector('.inspector'); return panel.scrollWidth <= panel.clientWidth; }"
+    )
+    assert page.evaluate(fits), "nothing widens the panel"
     keep(page, pictures_folder / f"video-{viewport['width']}.webp")
 
 

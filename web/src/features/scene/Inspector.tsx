@@ -97,14 +97,16 @@ export function Inspector(props: InspectorProps): JSX.Element {
         <JobBadge job={job} />
         <button
           type="button"
+          className="bare"
+          aria-label="Copy link"
           title={
             isEnded(job)
-              ? `A link to what is seen: this version, moment and view`
-              : "A link to this moment and view; the scene still grows, and the link shows its newest version then"
+              ? "Copy a link to what is seen: this version, moment and view"
+              : "Copy a link to this moment and view; the scene still grows, and the link shows its newest version then"
           }
           onClick={props.onCopyLink}
         >
-          <Icon name="link" /> Copy link
+          <Icon name="link" />
         </button>
       </header>
       <JobReason job={job} />

@@ -5,6 +5,7 @@ accept text, as in `pcie:PATH?mosaic=BGGR&fov=50`; the models of requests that d
 """
 
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -25,7 +26,17 @@ from spiked.errors import ConfigurationError
 from spiked.lens import Lens, distortion_of, lens_of
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Response, Sensor
 
-__all__ = ["CameraFiles", "CameraOptions", "LocalPath", "Pinhole", "PinholeText", "Rate", "Side", "StoredCameraOptions"]
+__all__ = [
+    "CameraFiles",
+    "CameraOptions",
+    "LocalPath",
+    "MosaicChoice",
+    "Pinhole",
+    "PinholeText",
+    "Rate",
+    "Side",
+    "StoredCameraOptions",
+]
 
 MOST_HZ = 1e6
 """Upper bound of a frame rate: fifty times that of the first camera."""
@@ -91,6 +102,21 @@ PinholeText = Annotated[
     WithJsonSchema({"type": "string", "pattern": r"^[^,]+(,[^,]+){3,8}$"}),
 ]
 """Intrinsics that are written `fx,fy,cx,cy`, with the distortion after them if there is any, see `Distortion.parse`."""
+
+
+class MosaicChoice(StrEnum):
+    """A mosaic, or detection from the pixels."""
+
+    AUTO = "auto"
+    RGGB = "RGGB"
+    BGGR = "BGGR"
+    GRBG = "GRBG"
+    GBRG = "GBRG"
+
+    @property
+    def mosaic(self) -> Mosaic | None:
+        """The mosaic that is stated; None: to be detected."""
+        return None if self is MosaicChoice.AUTO else Mosaic(self)
 
 
 class CameraOptions(BaseModel):

@@ -121,7 +121,7 @@ def test_renamed_rerun_and_compared(studied: Studied, visit: Callable[..., Any])
         "the service knows the name",
     )
     page.get_by_role("button", name="Re-run with other options").click()
-    page.get_by_label("steps").fill("50")
+    page.get_by_label(re.compile("^steps")).fill("50")
     page.get_by_role("button", name="Reconstruct", exact=True).click()
     compared = page.locator("table.compared")
     compared.wait_for()
@@ -136,6 +136,40 @@ def test_renamed_rerun_and_compared(studied: Studied, visit: Callable[..., Any])
     until(lambda: compared.locator("tbody tr").first.inner_text().split("\t")[1].strip() != "0", "its poses are shown")
     legend = page.locator("figure.plot:has(figcaption:has-text('Loss')) .u-legend")
     until(lambda: "#1" in legend.inner_text() and "#2" in legend.inner_text(), "both are in one plot")
+
+
+def test_a_rerun_is_given_poses_optics_and_time(studied: Studied, visit: Callable[..., Any], tmp_path: Path) -> None:
+    page = visit(f"{studied.address}?page=captures&capture={studied.capture_id}")
+    page.get_by_role("button", name="Re-run with other options").click()
+    form = page.locator(".panel:has(h2:text-is('Options of the new reconstruction')) form")
+    form.wait_for()
+    for label in form.locator("label").all():
+        assert len(label.locator("small").inner_text()) > 10, f"help of {label.inner_text()}"
+    fields = studied.http.get("options").json()["properties"]
+    assert form.locator("label").count() == len(fields) + 2, "every option, poses and calibration"
+    form.get_by_label(re.compile("^steps")).fill("10")
+    form.get_by_label(re.compile("^seconds")).fill("300")
+    form.get_by_label(re.compile("^most splats")).fill("1500")
+    form.get_by_label(re.compile("^intrinsics")).fill("280,280,160,100,0.01")
+    form.get_by_label(re.compile("^mosaic")).select_option("auto")
+    form.get_by_label(re.compile("^poses")).select_option("file")
+    form.get_by_role("button", name="Reconstruct").click()
+    page.get_by_text("Choose the TUM file").wait_for()
+    path = studied.http.get(f"reconstructions/{studied.reconstruction_id}/trajectory", params={"format": "tum"})
+    (tmp_path / "path.tum").write_bytes(path.content)
+    form.get_by_label(re.compile("^file with poses")).set_input_files(tmp_path / "path.tum")
+    form.get_by_role("button", name="Reconstruct").click()
+    form.wait_for(state="detached")
+    (job, *_) = studied.http.get("reconstructions", params={"capture_id": studied.capture_id}).json()["items"]
+    assert job["poses_from"] == "file"
+    options = job["options"]
+    assert (options["seconds"], options["most_splats"], options["mosaic"]) == (300, 1500, "auto")
+    assert (options["intrinsics"]["fx"], options["intrinsics"]["distortion"]["k1"]) == (280, 0.01)
+    used = page.locator(".panel:has(h2:text-is('Options used'))")
+    until(lambda: "poses\nof a file" in used.inner_text(), "it says where the poses are from")
+    one = f"reconstructions/{job['id']}"
+    until(lambda: studied.http.get(one).json()["state"] in ("complete", "failed"), "it ends", 300)
+    studied.http.delete(f"reconstructions/{job['id']}")
 
 
 def test_deleted_and_brought_back(studied: Studied, visit: Callable[..., Any]) -> None:

@@ -73,6 +73,7 @@ def _api(services: Services) -> APIRouter:
     register_path_kinds()
     captures, reconstructions, folder = services.captures, services.reconstructions, services.folder
     results, views = services.results, services.views
+    profiles = CameraProfiles(folder.profiles)
     once = idempotent(services.idempotency_keys)
     api = APIRouter(prefix="/api/v1", dependencies=[Depends(authorise)])
     api.include_router(device_routes(captures, services.sources, folder, once))
@@ -81,7 +82,7 @@ def _api(services: Services) -> APIRouter:
     api.include_router(recording_routes(captures, folder, once))
     api.include_router(preview_routes(captures, folder, results, views, once))
     api.include_router(capture_result_routes(results, views, once))
-    api.include_router(reconstruction_routes(reconstructions, once))
+    api.include_router(reconstruction_routes(reconstructions, services.sources, profiles, once))
     api.include_router(map_routes(reconstructions, results, once))
     api.include_router(reconstruction_result_routes(reconstructions.rows, results, views, once))
     api.include_router(report_routes(reconstructions.rows, Reports(results, captures, folder, views), once))
@@ -91,9 +92,7 @@ def _api(services: Services) -> APIRouter:
     api.include_router(reconstruction_record_routes(reconstructions.rows, once))
     api.include_router(doctor_routes(folder.path))
     api.include_router(option_routes())
-    api.include_router(
-        upload_routes(services.uploads, captures, services.sources, CameraProfiles(folder.profiles), once)
-    )
+    api.include_router(upload_routes(services.uploads, captures, services.sources, profiles, once))
     api.include_router(event_routes(services.bus, services.event_clients))
     api.include_router(system_routes(services))
     api.include_router(configuration_routes(services.settings, services.tokens))

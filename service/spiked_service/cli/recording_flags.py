@@ -1,7 +1,6 @@
 """Options that describe a recording without a sidecar, for every command that opens one."""
 
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +9,7 @@ import typer
 from pydantic import BaseModel, ValidationError
 
 from spiked.calibration import Calibration
-from spiked.camera import CameraFiles, Pinhole, StoredCameraOptions
+from spiked.camera import CameraFiles, MosaicChoice, Pinhole, StoredCameraOptions
 from spiked.distortion import Distortion
 from spiked.errors import ConfigurationError
 from spiked.profile import CameraProfile
@@ -49,16 +48,6 @@ Bits = Annotated[BitOrder | None, _flag("bit_order", "--bit-order")]
 Flipped = Annotated[bool | None, _flag("flipped", "--flipped/--upright")]
 SensorResponse = Annotated[Response | None, _flag("response", "--response")]
 Colours = Annotated[Mosaic | None, _flag("mosaic", "--mosaic")]
-
-
-class MosaicChoice(StrEnum):
-    """A mosaic, or detection from the pixels."""
-
-    AUTO = "auto"
-    RGGB = "RGGB"
-    BGGR = "BGGR"
-    GRBG = "GRBG"
-    GBRG = "GBRG"
 
 
 ColoursOrAuto = Annotated[
@@ -138,8 +127,7 @@ class DetectableGeometryFlags(_LayoutFlags):
 
     def stated(self) -> RecordingGeometry:
         """What is given."""
-        mosaic = None if self.mosaic is None or self.detects else Mosaic(self.mosaic)
-        return _geometry(self, mosaic, self.response)
+        return _geometry(self, None if self.mosaic is None else self.mosaic.mosaic, self.response)
 
 
 def _geometry(of: _LayoutFlags, mosaic: Mosaic | None, response: Response | None) -> RecordingGeometry:

@@ -48,6 +48,8 @@ def _reconstruction(
         can_block=True,
         options=row.options,
         intrinsics=intrinsics_of(row.options, capture),
+        calibration=folder.given_calibration(row.id) if row.calibration_from else None,
+        poses=folder.given_poses(row.id) if row.poses_from else None,
         least_poses=least_poses,
         map=known,
     )

@@ -250,4 +250,6 @@ def begun_anew(row: ReconstructionRow, options: ReconstructionOptions) -> Recons
         part=row.part,
         name=row.name,
         notes=row.notes,
+        poses_from=row.poses_from,
+        calibration_from=row.calibration_from,
     )

@@ -10,6 +10,7 @@ from spiked.recording.geometry import orientation_questions
 from spiked_service.base.errors import BusyError
 from spiked_service.base.ids import new_id
 from spiked_service.reconstructions.admission import check, intrinsics_of
+from spiked_service.reconstructions.given import Given
 from spiked_service.reconstructions.interruption import after_crash, requeue_interrupted
 from spiked_service.reconstructions.job_commands import command_of
 from spiked_service.reconstructions.job_runner import JobRunner, begun_anew
@@ -117,13 +118,15 @@ class Reconstructions:
         task: Task = Task.RECONSTRUCT,
         map_ids: Sequence[str] = (),
         part: FrameRange | None = None,
+        given: Given | None = None,
     ) -> ReconstructionRow:
         """Queue a job of a capture; one that needs the recording waits while the capture runs.
 
         `map_ids` are the reconstructions whose newest versions the `task` uses, two of a merge; they lie in the folder
         of the job from now on, whatever becomes of them. `part` are the frames to localise.
+        `given` is copied there, too.
         Raises UnknownIdError, BusyError for a map that is not finished, StoreError, and ConfigurationError for a
-        capture without a recording, what is no map, and another camera whose lens is not known.
+        capture without a recording, what is no map, another camera whose lens is not known, poses that are no path.
         """
         row = ReconstructionRow(
             new_id(),
@@ -140,7 +143,7 @@ class Reconstructions:
         with self._lock:
             check(row, self._catalogue, self.rows)
             try:
-                added = self.rows.add(self.rows.pin_maps(row))
+                added = self.rows.add((given or Given()).put(self.rows.pin_maps(row), self._folder, self.rows))
             except BaseException:
                 self._folder.remove(self._folder.reconstruction(row.id))
                 raise

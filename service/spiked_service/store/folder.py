@@ -108,6 +108,14 @@ class DataFolder:
         """Folders of the maps that a job uses, linked; they exist until it has ended."""
         return [self.reconstruction(reconstruction_id) / f"map-{number}" for number in range(1, count + 1)]
 
+    def given_poses(self, reconstruction_id: str) -> Path:
+        """TUM file of the poses that a job was given; it may not exist."""
+        return self.reconstruction(reconstruction_id) / "given-poses.tum"
+
+    def given_calibration(self, reconstruction_id: str) -> Path:
+        """Calibration that a job was given; it may not exist."""
+        return self.reconstruction(reconstruction_id) / "given-calibration.npz"
+
     def upload(self, upload_id: str) -> Path:
         """Received bytes of an upload."""
         return self._uploads / f"{_checked(upload_id)}.part"

@@ -318,6 +318,10 @@ class ReconstructionRow:
     notes: str = ""
     held: bool = False
     """Stays in the queue until it is let go."""
+    poses_from: str = ""
+    """Where its poses are from, if they are given: a reconstruction's id, or `file`; they lie in its folder."""
+    calibration_from: str = ""
+    """Device whose calibration is used instead of that of the recording; it lies in its folder."""
     turn: str = ""
     """Its turn among queued ones of its priority; empty: its id."""
 

@@ -103,7 +103,9 @@ class ReconstructionCommand(_Command):
     options: ReconstructionOptions
     intrinsics: Intrinsics | None
     calibration: Path | None = None
-    """Of the frames of a ring; a recording names its own."""
+    """Of the frames of a ring, or instead of that which a recording names."""
+    poses: Path | None = None
+    """TUM file of poses that are not estimated."""
     questions: tuple[str, ...] = ()
     """What nothing states of the camera of a ring; a recording has its own."""
     first_frame: int = 0

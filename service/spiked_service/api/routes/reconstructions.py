@@ -1,6 +1,7 @@
 """Reconstructions: start, list, cancel, restart and remove them; their versions, timeline and log."""
 
 from http import HTTPStatus
+from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
@@ -24,10 +25,14 @@ from spiked_service.api.schemas.reconstructions import (
     VersionOut,
     VersionsOut,
 )
+from spiked_service.api.sources import Sources
+from spiked_service.captures.camera_profiles import CameraProfiles
+from spiked_service.reconstructions.given import Given
 from spiked_service.reconstructions.queue import Reconstructions
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.results.timeline import STATES, Timeline, Timelines, known
 from spiked_service.results.versions import versions
+from spiked_service.store.catalogue import UnknownIdError
 from spiked_service.store.rows import JobState, ReconstructionRow, Task
 
 Points = Annotated[
@@ -39,7 +44,9 @@ _LOG_BYTES = 1 << 20
 """The log is shown from this many bytes before its end."""
 
 
-def reconstruction_routes(reconstructions: Reconstructions, route_class: type[APIRoute]) -> APIRouter:
+def reconstruction_routes(
+    reconstructions: Reconstructions, sources: Sources, profiles: CameraProfiles, route_class: type[APIRoute]
+) -> APIRouter:
     """Routes below `reconstructions`."""
     rows = reconstructions.rows
     router = APIRouter(prefix="/reconstructions", tags=["reconstructions"], route_class=route_class)
@@ -50,7 +57,16 @@ def reconstruction_routes(reconstructions: Reconstructions, route_class: type[AP
     ) -> ReconstructionOut:
         """Queue a reconstruction of a recording; live captures precede the queue. With `map` it extends that map."""
         task, map_ids = (Task.RECONSTRUCT, ()) if body.map is None else (Task.EXTEND, (body.map,))
-        row = reconstructions.submit(body.capture_id, body.options, body.priority, task=task, map_ids=map_ids)
+        device = body.calibration_of
+        given = Given(
+            poses=body.poses,
+            poses_of=body.poses_of,
+            calibration_of=device or "",
+            calibration=None if device is None else calibration_of(device, sources, profiles),
+        )
+        row = reconstructions.submit(
+            body.capture_id, body.options, body.priority, task=task, map_ids=map_ids, given=given
+        )
         return accepted(row, request, response)
 
     @router.get("", responses=problems())
@@ -82,6 +98,15 @@ def reconstruction_routes(reconstructions: Reconstructions, route_class: type[AP
 
     _add_end_routes(router, reconstructions)
     return router
+
+
+def calibration_of(device_id: str, sources: Sources, profiles: CameraProfiles) -> Path:
+    """The calibration of a device. Raises UnknownIdError without one."""
+    device = next((one for one in sources.devices() if one.source == device_id), None)
+    path = None if device is None else profiles.calibration(device)
+    if path is None:
+        raise UnknownIdError(f"there is no device {device_id} with a calibration; POST profile:calibrate makes one")
+    return path
 
 
 def _add_end_routes(router: APIRouter, reconstructions: Reconstructions) -> None:

@@ -1,9 +1,9 @@
 """Reconstructions and what they publish."""
 
 from datetime import datetime
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field, StrictBool, StrictInt
+from pydantic import Field, StrictBool, StrictInt, model_validator
 
 from spiked.recon import State
 from spiked.sensor import Intrinsics
@@ -17,7 +17,9 @@ from spiked_service.api.schemas.base import (
     Notes,
     Out,
     PageOut,
+    at_most_one_of,
     example,
+    examples,
 )
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.rows import FrameRange, JobState, ReconstructionRow, Stage, Task, VersionRow
@@ -31,7 +33,10 @@ Threads = Annotated[StrictInt | None, Field(ge=1, le=256, description="All cores
 class ReconstructionRequest(In):
     """A recording to reconstruct."""
 
-    model_config = example(capture_id=ID_EXAMPLE, options={"steps": 2000, "seed": 1}, priority=0)
+    model_config = examples(
+        {"capture_id": ID_EXAMPLE, "options": {"steps": 2000, "seed": 1}, "priority": 0},
+        rules=at_most_one_of(poses="string", poses_of="string"),
+    )
 
     capture_id: str = Field(min_length=1, max_length=64)
     options: ReconstructionOptions = Field(default_factory=ReconstructionOptions)
@@ -43,6 +48,30 @@ class ReconstructionRequest(In):
         description="A finished reconstruction of the same place: its map is extended by the recording, and the result "
         "is in its frame of reference.",
     )
+    poses: str | None = Field(
+        None,
+        min_length=1,
+        description="Known camera-to-world poses as the text of a TUM file, in seconds since the start of the capture: "
+        "the map is fitted to them, and they are not changed. Poses between them are interpolated.",
+    )
+    poses_of: str | None = Field(
+        None,
+        min_length=1,
+        max_length=64,
+        description="Another reconstruction of the capture, whose newest path is taken as known poses.",
+    )
+    calibration_of: str | None = Field(
+        None,
+        min_length=1,
+        max_length=4096,
+        description="A device whose calibration corrects the rates, instead of that of the recording.",
+    )
+
+    @model_validator(mode="after")
+    def _one_path(self) -> Self:
+        if self.poses is not None and self.poses_of is not None:
+            raise ValueError("poses and poses_of both give the path; give one of them")
+        return self
 
 
 class MergeRequest(In):
@@ -143,6 +172,8 @@ class ReconstructionOut(Out):
     warnings: list[str] = Field(description="What it found out about the camera, or had to assume.")
     priority: int
     options: ReconstructionOptions
+    poses_from: str = Field(description="Given poses: the id of their reconstruction, or `file`; empty: estimated.")
+    calibration_from: str = Field(description="Device of its calibration; empty: that of the recording, if any.")
     created_at: datetime
     started_at: datetime | None
     ended_at: datetime | None

@@ -40,10 +40,6 @@ from spiked.recon import (
     Status,
     extend,
 )
-from spiked.recon.frontend.mosaic_check import detect
-from spiked.recon.frontend.windowing import Windows
-from spiked.recording import Recording
-from spiked.sensor import Mosaic, Sensor
 from spiked.trajectory import Trajectory
 from spiked_service.base.signals import handling
 from spiked_service.cli import outputs
@@ -53,6 +49,7 @@ from spiked_service.cli.flag_groups import with_groups
 from spiked_service.cli.maps import read_map
 from spiked_service.cli.reconstruction_run import RESULTS, ReconstructionRun, parameters_of
 from spiked_service.results.map_folder import MapFolder, file_name, joint_paths, replacing, write_map
+from spiked_service.results.mosaic_by_pixels import by_pixels
 from spiked_service.results.recording_feed import reconstruct_recording
 from spiked_service.settings.map_options import changed
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
@@ -96,6 +93,7 @@ class ReconstructionFlags:
     window_frames: Annotated[int | None, _option("window_frames")] = _DEFAULTS.window_frames
     threads: Annotated[int | None, _option("threads")] = _DEFAULTS.threads
     max_views: Annotated[int, _option("max_views")] = _DEFAULTS.max_views
+    most_splats: Annotated[int, _option("most_splats")] = _DEFAULTS.most_splats
     memory_mb: Annotated[int, _option("memory_mb")] = _DEFAULTS.memory_mb
     refine_poses: Annotated[bool, _option("refine_poses")] = _DEFAULTS.refine_poses
     method: Annotated[MethodName, _option("method")] = _DEFAULTS.method
@@ -197,8 +195,12 @@ def _begun(
     sensor = optics.of(recording.sensor)
     questions = list(recording.questions)
     if geometry.detects:
-        sensor, question = _by_pixels(recording, sensor)
-        questions += question
+        sensor, question = by_pixels(recording, sensor)
+        if question is None:
+            stated = "grey" if sensor.mosaic is None else sensor.mosaic
+            messages.print(f"the pixels agree with the stated mosaic: {stated}", markup=False)
+        else:
+            questions.append(question)
     known = None if given["poses"] is None else Trajectory.read_tum(given["poses"])
     first_depth = None if given["first_depth"] is None else _read_depth(given["first_depth"])
     measured = g.read_calibration(given["calibration"], described)
@@ -329,26 +331,6 @@ def _report(run: ReconstructionRun) -> None:
     output.print(f"{run.out}: {poses} poses for {read} frames, {outcome}", markup=False)
     if failure is not None:
         report_error(SpikedError(f"no path was found: {failure}"))
-
-
-def _by_pixels(recording: Recording, sensor: Sensor) -> tuple[Sensor, list[str]]:
-    """The sensor with the mosaic detected from the first 160 frames, and what the user is to be asked about it."""
-    frames = recording.read(0, min(recording.frames, 160))
-    windows = Windows(sensor, min(32, len(frames)))
-    view = next(iter([*windows.feed(0, frames), *windows.flush()]))
-    found = detect(view.rate, sensor.mosaic)
-    stated = "grey" if sensor.mosaic is None else sensor.mosaic
-    if found is sensor.mosaic:
-        messages.print(f"the pixels agree with the stated mosaic: {stated}", markup=False)
-        return sensor, []
-    other = {Mosaic.BGGR: "RGGB", Mosaic.RGGB: "BGGR", Mosaic.GBRG: "GRBG", Mosaic.GRBG: "GBRG", None: ""}[found]
-    question = (
-        "the pixels show no mosaic: the sensor is taken as grey"
-        if found is None
-        else f"by its pixels the mosaic is {found} or {other}, and they cannot say which (stated: {stated}): {found} "
-        f"is taken; if red and blue are exchanged, give --mosaic {other}"
-    )
-    return replace(sensor, mosaic=found), [question]
 
 
 def _watched(title: str, port: int) -> "Watch":

@@ -1,7 +1,9 @@
 """The reconstruction worker: feeds frames to a `Reconstructor` and publishes its versions in a folder."""
 
 import logging
+import math
 import os
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.calibration import Calibration
+from spiked.camera import MosaicChoice
 from spiked.errors import CheckpointError, SceneError
 from spiked.recon import NotOnePlaceError, Options, Reconstructor, State, extend
 from spiked.recon.checkpoint import CheckpointSaver, Interrupted
@@ -18,7 +21,9 @@ from spiked.recon.checkpoint_file import CHECKPOINT, exists
 from spiked.recon.frontend.windowing import SEARCH_FRAMES
 from spiked.recording import Recording, open_recording, recorded_calibration
 from spiked.ring import End, Frames, Gap, Policy, RingReader
-from spiked.sensor import Intrinsics, Sensor
+from spiked.sensor import Sensor
+from spiked.trajectory import Trajectory
+from spiked_service.results.mosaic_by_pixels import by_pixels
 from spiked_service.results.pinned_map import PinnedMap
 from spiked_service.results.recording_feed import pieces
 from spiked_service.workers.channel import WorkerChannel
@@ -68,12 +73,14 @@ def run_reconstruction(command: ReconstructionCommand, channel: WorkerChannel) -
     else:
         assert command.recording is not None, "a command has a ring or a recording"
         os.nice(_OFFLINE_NICE)  # live captures have priority
-        recording = open_recording(command.recording)
+        recording = open_recording(command.recording, **command.options.geometry())
         saver = CheckpointSaver(command.folder / CHECKPOINT, recording, _parameters(command), _log.warning)
         work = _resume(command, channel, recording) or _begin(command, recording.sensor, channel, recording)
-        work = replace(work, checkpoints=saver)
+        work = replace(work, checkpoints=saver, deadline=_deadline(command, work.reconstructor))
         work.reconstructor.expect(recording.capture_index(recording.frames - 1) + 1)
         _read(recording, work)
+    if command.ring is not None and command.options.seconds is not None:
+        work = replace(work, deadline=time.monotonic() + command.options.seconds)
     work.finish()
     if command.map is not None:
         work.extend(command.map)
@@ -87,6 +94,8 @@ class _Work:
     channel: WorkerChannel
     checkpoints: CheckpointSaver | None = None
     """Of a reconstruction from a recording."""
+    deadline: float = math.inf
+    """When its time budget is over, on the monotonic clock."""
 
     def save(self) -> None:
         """Save a checkpoint if one is due, or if the worker is to exit."""
@@ -110,6 +119,7 @@ class _Work:
         self.reconstructor.finish(
             lambda status: None if leave.is_set() else progress(status),
             lambda: leave.is_set() or stop.is_set(),
+            budget_s=None if self.deadline == math.inf else max(0.0, self.deadline - time.monotonic()),
             save=self.save,
         )
         if not leave.is_set():
@@ -144,19 +154,38 @@ class _Work:
 def _begin(
     command: ReconstructionCommand, sensor: Sensor, channel: WorkerChannel, recording: Recording | None = None
 ) -> _Work:
-    intrinsics: Intrinsics | None = command.intrinsics or sensor.intrinsics
     live = command.ring is not None and not command.can_block
-    options = options_of(command, recording)
-    reconstructor = Reconstructor(replace(sensor, intrinsics=intrinsics), options, live=live, recording=recording)
-    reconstructor.warnings += command.questions if recording is None else recording.questions
+    sensor = command.options.sensor(sensor, command.intrinsics)
+    questions = list(command.questions if recording is None else recording.questions)
+    if command.options.mosaic is MosaicChoice.AUTO:
+        sensor, question = _detected(sensor, recording)
+        questions += [] if question is None else [question]
+    reconstructor = Reconstructor(sensor, options_of(command, recording), live=live, recording=recording)
+    reconstructor.warnings += questions
     return _Work(reconstructor, ProgressReporter(reconstructor, command, channel), channel)
 
 
+def _detected(sensor: Sensor, recording: Recording | None) -> tuple[Sensor, str | None]:
+    if recording is None:
+        return sensor, "the mosaic is detected from recordings only: reconstruct this capture again to have it detected"
+    return by_pixels(recording, sensor)
+
+
+def _deadline(command: ReconstructionCommand, reconstructor: Reconstructor) -> float:
+    """End of what an earlier worker has left of the time budget, on the monotonic clock."""
+    budget_s = command.options.seconds
+    return math.inf if budget_s is None else time.monotonic() + max(0.0, budget_s - reconstructor.work_s)
+
+
 def options_of(command: ReconstructionCommand, recording: Recording | None) -> Options:
-    """The options for the library, with the calibration of the camera. Raises CalibrationError."""
-    path = command.calibration if recording is None else recorded_calibration(recording.path)
+    """The options for the library, with the calibration of the camera and given poses.
+
+    Raises CalibrationError and SceneError.
+    """
+    path = command.calibration or (None if recording is None else recorded_calibration(recording.path))
     measured = None if path is None else Calibration.read(path)
-    return replace(command.options.options(), calibration=measured)
+    poses = None if command.poses is None else Trajectory.read_tum(command.poses)
+    return replace(command.options.options(), calibration=measured, poses=poses)
 
 
 def _parameters(command: ReconstructionCommand) -> dict[str, Any]:
@@ -270,6 +299,11 @@ def _read(recording: Recording, work: _Work) -> None:
         if work.reconstructor.frames:
             work.save()
         if work.channel.stop.is_set():
+            return
+        if time.monotonic() > work.deadline:
+            work.reconstructor.warnings.append(
+                f"the time was over after {expected:,} frames, and the others are left out: raise seconds"
+            )
             return
         if piece.index > expected:
             work.lose(expected, piece.index - expected, causes.get(expected, "unknown"))

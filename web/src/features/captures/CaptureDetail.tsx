@@ -23,9 +23,10 @@ import { Icon } from "../../shared/ui/icons";
 import { CaptureBadge, ErrorMessage, Loading, Panel } from "../../shared/ui/parts";
 import { MapPanel, type MapTask } from "./MapPanel";
 import { Plots } from "./Plots";
-import { ReconstructionsPanel, RerunPanel } from "./ReconstructionsPanel";
+import { ReconstructionsPanel } from "./ReconstructionsPanel";
 import { RecordingPanel } from "./RecordingPanel";
 import { removeWithUndo } from "./remove";
+import { RerunPanel } from "./RerunPanel";
 import { ReconstructionTexts } from "./ReconstructionTexts";
 import { LogPanel, OptionsPanel, ResultPanel } from "./ResultPanel";
 
@@ -106,7 +107,9 @@ function Detail({ capture }: { capture: Capture }): JSX.Element {
           {form === "rerun" && (
             <RerunPanel
               initial={job?.options ?? {}}
-              onSubmit={(options) => start(() => calls.submit(capture.id, options))}
+              jobs={jobs}
+              nameOf={nameOfJob}
+              onSubmit={(options, given) => start(() => calls.submit(capture.id, options, null, given))}
               onCancel={() => setForm(null)}
             />
           )}

@@ -3,16 +3,13 @@
 import { type JSX, useState } from "react";
 
 import * as calls from "../../shared/api/calls";
-import type { OptionValues, Reconstruction, Task } from "../../shared/api/types";
+import type { Reconstruction, Task } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
 import { progressText } from "../../shared/state/capture";
 import { count, decibel, when } from "../../shared/state/format";
 import { adjust, go } from "../../shared/state/route";
 import { isEnded, removeReconstruction, storeReconstruction } from "../../shared/state/store";
-import { useFetch } from "../../shared/state/useFetch";
 import { ActionButton } from "../../shared/ui/access";
-import { Fetched } from "../../shared/ui/Fetched";
-import { OptionsForm } from "../../shared/ui/OptionsForm";
 import { Icon } from "../../shared/ui/icons";
 import { Badge, Empty, JobBadge, JobReason, jobTone, Panel, Warnings } from "../../shared/ui/parts";
 import { Table } from "../../shared/ui/Table";
@@ -212,26 +209,4 @@ function DeleteButton({ job, name }: { job: Reconstruction; name: string }): JSX
 function CancelButton({ job }: { job: Reconstruction }): JSX.Element {
   const cancel = async (): Promise<void> => storeReconstruction(await calls.cancel(job.id));
   return <ActionButton onClick={() => void attempt(cancel)}>Cancel</ActionButton>;
-}
-
-/** The form for another reconstruction of the capture. */
-export function RerunPanel({
-  initial,
-  onSubmit,
-  onCancel,
-}: {
-  initial: OptionValues;
-  onSubmit: (values: OptionValues) => Promise<void>;
-  onCancel: () => void;
-}): JSX.Element {
-  const schema = useFetch("options", calls.optionSchema);
-  return (
-    <Panel title="Options of the new reconstruction">
-      <Fetched from={schema} what="the options">
-        {(fields) => (
-          <OptionsForm schema={fields} initial={initial} action="Reconstruct" onSubmit={onSubmit} onCancel={onCancel} />
-        )}
-      </Fetched>
-    </Panel>
-  );
 }

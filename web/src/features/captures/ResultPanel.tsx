@@ -111,7 +111,11 @@ export function ResultPanel({
 }
 
 export function OptionsPanel({ job }: { job: Reconstruction }): JSX.Element {
-  const entries = Object.entries(job.options);
+  const entries = Object.entries({
+    ...job.options,
+    poses: job.poses_from === "" ? "estimated" : job.poses_from === "file" ? "of a file" : `of ${job.poses_from}`,
+    calibration: job.calibration_from === "" ? "of the recording" : `of ${job.calibration_from}`,
+  });
   return (
     <Panel title="Options used">
       <dl className="facts">

@@ -1,8 +1,9 @@
-import { expect, it } from "vitest";
+import { describe, expect, it } from "vitest";
 
 import type { Timeline } from "../../shared/api/types";
 import { fieldsOf, optionsOf, valuesOf, withOptions } from "../../shared/ui/options";
 import { flicker, joined } from "./series";
+import { thinned } from "./thinned";
 import { merged } from "../live/Histogram";
 
 const SCHEMA = {
@@ -79,4 +80,18 @@ it("joins the bins of a histogram of few frames", () => {
   expect(merged(comb).edges[8]).toBe(1);
   const full = { edges: comb.edges, counts: comb.counts.map(() => 2) };
   expect(merged(full)).toEqual(full);
+});
+
+describe("poses of a file that is sent", () => {
+  it("a long one is thinned, and keeps its ends", () => {
+    const lines = Array.from({ length: 100 }, (_, at) => `${at} 0 0 0 0 0 0 1`);
+    const file = `# time\n${lines.join("\n")}\n`;
+    expect(thinned(file)).toEqual({ text: `${lines.join("\n")}\n`, every: 1 });
+    const { text, every } = thinned(file, file.length / 3 + 1);
+    const kept = text.trim().split("\n");
+    expect(every).toBe(3);
+    expect(kept).toEqual(lines.filter((_, at) => at % 3 === 0));
+    expect(kept.at(-1)).toBe(lines.at(-1));
+    expect(() => thinned("# nothing\n")).toThrow("no poses");
+  });
 });

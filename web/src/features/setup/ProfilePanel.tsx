@@ -5,6 +5,7 @@ import { type JSX, useState } from "react";
 import * as calls from "../../shared/api/calls";
 import type { Device, OptionSchema, OptionValues, Profile } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
+import { lensAsText, textAsLens, withLensText } from "../../shared/state/lensField";
 import { useService } from "../../shared/state/store";
 import { toast } from "../../shared/state/toasts";
 import { useFetch } from "../../shared/state/useFetch";
@@ -13,7 +14,6 @@ import { Fetched } from "../../shared/ui/Fetched";
 import { OptionsForm } from "../../shared/ui/OptionsForm";
 import { Empty, Panel } from "../../shared/ui/parts";
 import { CalibrationPanel } from "./CalibrationPanel";
-import { lensOfText, textOfLens } from "../../shared/state/lensText";
 
 export function ProfilePanel(): JSX.Element {
   const devices = useService((state) => state.devices);
@@ -89,7 +89,7 @@ function ProfileForm({
   onChange: () => void;
 }): JSX.Element {
   const save = async (values: OptionValues): Promise<void> => {
-    if (await attempt(() => calls.setProfile(device.id, profileOf(values)))) {
+    if (await attempt(() => calls.setProfile(device.id, textAsLens(values)))) {
       toast("Profile saved; captures that run keep theirs");
       onChange();
     }
@@ -101,32 +101,8 @@ function ProfileForm({
   };
   return (
     <>
-      <OptionsForm schema={editable(schema)} initial={valuesOfProfile(profile)} action="Save" onSubmit={save} />
+      <OptionsForm schema={withLensText(schema)} initial={lensAsText({ ...profile })} action="Save" onSubmit={save} />
       {profile !== null && <ActionButton onClick={() => void remove()}>Remove the profile</ActionButton>}
     </>
   );
-}
-
-/** Intrinsics are written as text, as in a source. */
-function editable(schema: OptionSchema): OptionSchema {
-  const { intrinsics, ...others } = schema.properties ?? {};
-  const hint = `${intrinsics?.description ?? ""} \`fx,fy,cx,cy\`, and the coefficients of the lens after it.`;
-  return {
-    ...schema,
-    properties: {
-      ...others,
-      intrinsics: { anyOf: [{ type: "string" }, { type: "null" }], default: null, description: hint },
-    },
-  };
-}
-
-const valuesOfProfile = (profile: Profile | null): OptionValues =>
-  profile === null
-    ? {}
-    : { ...profile, intrinsics: profile.intrinsics == null ? null : textOfLens(profile.intrinsics) };
-
-/** Throws an Error for intrinsics that cannot be read. */
-function profileOf(values: OptionValues): Profile {
-  const { intrinsics, ...others } = values;
-  return typeof intrinsics === "string" ? { ...others, intrinsics: lensOfText(intrinsics) } : others;
 }

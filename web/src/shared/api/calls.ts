@@ -171,11 +171,18 @@ export const unfinished = async (): Promise<Reconstruction[]> => {
 export const complete = async (): Promise<Reconstruction[]> =>
   (await answered(client.GET("/api/v1/reconstructions", { params: { query: { state: "complete", limit: 200 } } })))
     .items;
+/** What is not estimated, and not taken from the recording. */
+export type Given = Partial<Record<"poses" | "poses_of" | "calibration_of", string | null>>;
 /** With `map`, the map of that reconstruction is extended. */
-export const submit = (captureId: string, options: OptionValues, map: string | null = null): Promise<Reconstruction> =>
+export const submit = (
+  captureId: string,
+  options: OptionValues,
+  map: string | null = null,
+  given: Given = {},
+): Promise<Reconstruction> =>
   answered(
     client.POST("/api/v1/reconstructions", {
-      body: { capture_id: captureId, options, map },
+      body: { capture_id: captureId, options, map, ...given },
       params: { header: idempotent() },
     }),
   );

@@ -1,6 +1,6 @@
 /** A form for options, generated from their JSON Schema. */
 
-import { type JSX, type SubmitEvent, useState } from "react";
+import { type JSX, type ReactNode, type SubmitEvent, useState } from "react";
 
 import type { OptionSchema, OptionValues } from "../api/types";
 import { ActionButton } from "./access";
@@ -14,6 +14,7 @@ export function OptionsForm({
   onSubmit,
   onCancel,
   onChange,
+  children,
 }: {
   schema: OptionSchema;
   initial: OptionValues;
@@ -23,6 +24,8 @@ export function OptionsForm({
   onCancel?: () => void;
   /** Told of all values while they are changed. */
   onChange?: (values: OptionValues) => void;
+  /** Further inputs, below those of the schema. */
+  children?: ReactNode;
 }): JSX.Element {
   const fields = fieldsOf(schema);
   const [texts, setTexts] = useState<Record<string, string>>(() =>
@@ -51,6 +54,7 @@ export function OptionsForm({
           </small>
         </label>
       ))}
+      {children}
       <div className="buttons">
         <ActionButton type="submit" className="primary" disabled={busy}>
           {action}

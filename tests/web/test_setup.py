@@ -1,10 +1,12 @@
 """Cameras on the Set-up page: their profile is edited, and their pixels are calibrated."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from browsing import until
+from browsing import until, violations
+from spiked_service.settings.tokens import Scope, Tokens
 
 from spiked.sensor import Sensor
 from tests.still_recordings import pixels, place, still
@@ -38,6 +40,61 @@ def test_the_profile_of_a_camera_is_edited(daemon: Callable[..., Any], visit: Ca
     panel.get_by_role("button", name="Remove the profile").click()
     panel.get_by_text("Nothing is stated of this camera.").wait_for()
     assert one.http.get("devices/sim%3A/profile").status_code == 404
+
+
+def test_settings_are_changed_and_what_restarts_is_told(
+    daemon: Callable[..., Any], visit: Callable[..., Any], tmp_path: Path, pictures_folder: Path
+) -> None:
+    file = tmp_path / "spiked.toml"
+    file.write_text("# ours\nretention_days = 90\n")
+    one = daemon("--config", str(file), "--set", "limit_captures=2", "--no-capture")
+    page = visit(f"{one.address}?page=setup")
+    panel = page.locator(".panel:has(h2:text-is('Configuration'))")
+    panel.locator("summary", has_text="Change settings").click()
+    panel.get_by_text("Given at the start or by the environment, and changed there: limit_captures").wait_for()
+    panel.get_by_label(re.compile("^retention days")).fill("30")
+    panel.get_by_label(re.compile("^limit renders")).fill("3")
+    panel.get_by_label(re.compile("^log format")).select_option("json")
+    assert violations(page) == []
+    panel.screenshot(path=pictures_folder / "settings.png")
+    panel.get_by_role("button", name="Save").click()
+    page.get_by_text("In effect: limit_renders, retention_days; after a restart: log_format").wait_for()
+    panel.get_by_text("After a restart of the service: log_format").wait_for()
+    assert file.read_text() == '# ours\nretention_days = 30\nlog_format = "json"\nlimit_renders = 3\n'
+    panel.get_by_label(re.compile("^retention days")).fill("40000")
+    field = panel.get_by_label(re.compile("^retention days"))
+    panel.get_by_role("button", name="Save").click()
+    assert field.evaluate("field => !field.checkValidity()"), "the browser refuses it"
+    panel.get_by_label(re.compile("^retention days")).fill("")
+    panel.get_by_role("button", name="Save").click()
+    until(lambda: "retention_days" not in file.read_text(), "captures are kept for ever")
+
+
+def test_tokens_are_made_and_revoked(
+    daemon: Callable[..., Any], visit: Callable[..., Any], tmp_path: Path, pictures_folder: Path
+) -> None:
+    tokens = Tokens(tmp_path / "data")
+    mine = tokens.create("mine")
+    one = daemon("--set", "require_token=true", "--no-capture", token=mine)
+    page = visit(f"{one.address}?token={mine}&page=setup")
+    panel = page.locator(".panel:has(h2:text-is('Tokens'))")
+    panel.locator("summary", has_text="Create a token").click()
+    panel.get_by_label("Name").fill("display")
+    panel.get_by_label("Scope").select_option("operate")
+    panel.get_by_role("button", name="Create").click()
+    made = panel.locator(".made")
+    made.wait_for()
+    secret = made.locator("code").inner_text()
+    holder = tokens.holder_of(secret)
+    assert holder is not None and (holder.name, holder.scope) == ("display", Scope.OPERATE)
+    assert violations(page) == []
+    panel.screenshot(path=pictures_folder / "tokens.png")
+    made.get_by_role("button", name="Hide").click()
+    assert secret not in page.content()
+    panel.get_by_role("button", name="Revoke display").click()
+    panel.get_by_role("button", name="Revoke at once").click()
+    panel.get_by_role("row").filter(has_text="display").wait_for(state="detached")
+    assert tokens.holder_of(secret) is None
 
 
 def test_a_person_calibrates_a_camera(

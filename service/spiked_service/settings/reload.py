@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spiked.errors import ConfigurationError
+from spiked_service.settings.editing import SettingsFile, Value, check_editable
 from spiked_service.settings.settings import Configuration, Settings, load_settings, reloadable
 
 
@@ -48,21 +49,46 @@ class ReloadableSettings:
     def reload(self) -> Reloaded:
         """Read file and environment again and apply what can be reloaded. On ConfigurationError nothing changes."""
         with self._lock:
-            before = self._configuration
+            return self._reload()
+
+    def change(self, changes: Mapping[str, Value]) -> Reloaded:
+        """Write values into the file of settings, and reload it. On ConfigurationError nothing changes."""
+        with self._lock:
             after = load_settings(self._flags, self._file)
-            old, new = before.settings, after.settings
-            names = [name for name in Settings.model_fields if getattr(old, name) != getattr(new, name)]
-            changed = [name for name in names if reloadable(name)]
-            values = {name: getattr(new, name) for name in changed}
-            origins = {**before.origins, **{name: after.origins[name] for name in changed}}
+            check_editable(changes, after.origins)
+            file = SettingsFile(after.file)
+            file.change(changes, self._flags)
             try:
-                self._take(Configuration(old.model_copy(update=values), origins, after.file))
+                return self._reload()
             except ConfigurationError:
-                self._take(before)
+                file.put_back()
                 raise
-            return Reloaded(changed, [name for name in names if name not in changed])
+
+    def waiting(self) -> list[str]:
+        """Settings whose value in file and environment takes effect after a restart. Raises ConfigurationError."""
+        after = load_settings(self._flags, self._file)
+        return [name for name in _differences(self.now, after.settings) if not reloadable(name)]
+
+    def _reload(self) -> Reloaded:
+        before = self._configuration
+        after = load_settings(self._flags, self._file)
+        old, new = before.settings, after.settings
+        names = _differences(old, new)
+        changed = [name for name in names if reloadable(name)]
+        values = {name: getattr(new, name) for name in changed}
+        origins = {**before.origins, **{name: after.origins[name] for name in changed}}
+        try:
+            self._take(Configuration(old.model_copy(update=values), origins, after.file))
+        except ConfigurationError:
+            self._take(before)
+            raise
+        return Reloaded(changed, [name for name in names if name not in changed])
 
     def _take(self, configuration: Configuration) -> None:
         self._configuration = configuration
         for listener in self._listeners:
             listener(self.now)
+
+
+def _differences(old: Settings, new: Settings) -> list[str]:
+    return [name for name in Settings.model_fields if getattr(old, name) != getattr(new, name)]

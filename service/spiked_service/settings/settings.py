@@ -264,8 +264,12 @@ def settings_file(given: Path | None = None) -> Path | None:
         if not named.is_file():
             raise ConfigurationError(f"there is no configuration file {named}")
         return named
-    own = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "spiked" / "spiked.toml"
-    return next((path for path in (own, Path("/etc/spiked/spiked.toml")) if path.is_file()), None)
+    return next((path for path in (own_file(), Path("/etc/spiked/spiked.toml")) if path.is_file()), None)
+
+
+def own_file() -> Path:
+    """The user's own file, which need not exist."""
+    return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "spiked" / "spiked.toml"
 
 
 def load_settings(flags: Mapping[str, object] | None = None, file: Path | None = None) -> Configuration:

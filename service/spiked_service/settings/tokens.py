@@ -62,6 +62,8 @@ class StoredToken(BaseModel):
     expires_at: datetime | None = None
     scope: Scope = Scope.ADMIN
     """Tokens of older releases opened everything."""
+    created_by: str | None = None
+    """The token that a request created it with; None: the command line."""
 
     def expired(self, now: datetime) -> bool:
         """Whether it no longer opens anything."""
@@ -102,8 +104,13 @@ class Tokens:
             found = found or Holder("settings", Scope.ADMIN)
         return found
 
-    def create(self, name: str, lifetime: timedelta | None = None, scope: Scope = Scope.ADMIN) -> str:
-        """A new token; this is the only time that it is seen. Raises ConfigurationError for a name that is taken."""
+    def create(
+        self, name: str, lifetime: timedelta | None = None, scope: Scope = Scope.ADMIN, by: str | None = None
+    ) -> str:
+        """A new token; this is the only time that it is seen. Raises ConfigurationError for a name that is taken.
+
+        One that is created `by` another token ends no later than that one.
+        """
         if not _NAME.fullmatch(name):
             raise ConfigurationError(f"{name!r} cannot name a token: use letters, digits, '.', '-' and '_'")
         secret = _PREFIX + secrets.token_urlsafe(32)
@@ -111,8 +118,14 @@ class Tokens:
         with self._changing() as tokens:
             if any(token.name == name for token in tokens):
                 raise ConfigurationError(f"there is a token {name} already; revoke it first, or take another name")
-            until = None if lifetime is None else now + lifetime
-            tokens.append(StoredToken(name=name, sha256=_hash(secret), created_at=now, expires_at=until, scope=scope))
+            ends = [] if lifetime is None else [now + lifetime]
+            ends += [token.expires_at for token in tokens if token.name == by and token.expires_at is not None]
+            until = min(ends, default=None)
+            tokens.append(
+                StoredToken(
+                    name=name, sha256=_hash(secret), created_at=now, expires_at=until, scope=scope, created_by=by
+                )
+            )
         return secret
 
     def revoke(self, name: str) -> None:

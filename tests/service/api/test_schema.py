@@ -69,6 +69,8 @@ def configuration(known: dict[str, str]) -> str:
     for path in OF_SOME:
         lines += ["[[operations]]", f'include-path = "{path}"']
         lines += ["checks.ensure_resource_availability.enabled = false"]
+    # It would change the limits of the service that answers, in the file of the user who runs the tests.
+    lines += ["[[operations]]", 'include-path = "/api/v1/configuration"', 'include-method = "PATCH"', "enabled = false"]
     return "\n".join(lines) + "\n"
 
 

@@ -27,7 +27,10 @@ METHODS = ("get", "head", "post", "put", "patch", "delete")
 ADMIN = {
     ("get", "/api/v1/configuration"),
     ("post", "/api/v1/configuration:reload"),
+    ("patch", "/api/v1/configuration"),
     ("get", "/api/v1/tokens"),
+    ("post", "/api/v1/tokens"),
+    ("delete", "/api/v1/tokens/{name}"),
 }
 LOOKING = {
     ("post", "/api/v1/captures/{capture_id}/views"),

@@ -67,6 +67,8 @@ class Caller:
     """Name of its token; None if no token is required."""
     scope: TokenScope = TokenScope.ADMIN
     """What its token allows; everything if no token is required."""
+    token_scope: TokenScope | None = None
+    """Scope of the token that it brings, whether one is required or not."""
 
 
 def is_loopback(host: str) -> bool:
@@ -113,9 +115,10 @@ class Security:
         if holder is not None and request.path == "/" and "token" in request.query:
             await _remember(request)(scope, receive, _with_headers(send))
             return
-        caller = Caller(request.address, None) if holder is None else Caller(request.address, holder.name)
-        if self._guarded and holder is not None:
-            caller = Caller(request.address, holder.name, holder.scope)
+        caller = Caller(request.address, None)
+        if holder is not None:
+            allowed = holder.scope if self._guarded else TokenScope.ADMIN
+            caller = Caller(request.address, holder.name, allowed, holder.scope)
         scope.setdefault("state", {})["caller"] = caller
         passed = self._app(scope, self._limited(request, receive), _with_headers(send))
         if not self._guarded or holder is None:

@@ -1,16 +1,29 @@
 """`configuration` and `tokens`: the settings in effect and the tokens of the service."""
 
-from datetime import datetime
-from typing import Any
+from datetime import datetime, timedelta
+from http import HTTPStatus
+from typing import Annotated, Any
 
-from fastapi import APIRouter
-from pydantic import BaseModel, Field
+from fastapi import APIRouter, Request, Response
+from pydantic import BaseModel, Field, StrictBool, StrictFloat, StrictInt, StrictStr
 
+from spiked.errors import ConfigurationError
 from spiked_service.api.auth.scopes import needs
-from spiked_service.api.problems import problems
+from spiked_service.api.auth.security import Caller
+from spiked_service.api.problems import ForbiddenError, problems
+from spiked_service.api.routes.options import whole
+from spiked_service.api.schemas.base import In, example
+from spiked_service.events.logging import logger
+from spiked_service.settings.editing import EDITABLE
 from spiked_service.settings.reload import ReloadableSettings
-from spiked_service.settings.settings import SettingOrigin, field, reloadable
+from spiked_service.settings.settings import MOST_DAYS, SettingOrigin, Settings, field, own_file, reloadable
 from spiked_service.settings.tokens import Scope, Tokens
+from spiked_service.store.catalogue import UnknownIdError
+
+_log = logger("spiked.audit")
+_LONGEST_NAME = 64
+"""Characters of a token's name."""
+TokenName = Annotated[str, Field(pattern=rf"^[A-Za-z0-9][A-Za-z0-9._-]{{0,{_LONGEST_NAME - 1}}}$")]
 
 
 class SettingOut(BaseModel):
@@ -20,6 +33,8 @@ class SettingOut(BaseModel):
     value: Any = Field(examples=[8])
     origin: SettingOrigin
     reloadable: bool = Field(description="Whether `configuration:reload` brings a new value into effect.")
+    editable: bool = Field(description="Whether `PATCH configuration` changes it; others are changed in the file.")
+    option: dict[str, Any] = Field(description="JSON Schema: type, limits, default, meaning.")
     doc: str
 
 
@@ -27,6 +42,21 @@ class SettingsOut(BaseModel):
     """All settings in effect."""
 
     items: list[SettingOut]
+    file: str = Field(description="The file that `PATCH configuration` changes.")
+    needs_restart: list[str] = Field(description="Settings whose value in the file takes effect after a restart.")
+    problem: str | None = Field(description="Why the file as it is now cannot be loaded; null if it can be.")
+
+
+class SettingsChange(In):
+    """New values of settings."""
+
+    model_config = example(values={"retention_days": 30, "log_level": "info"})
+
+    values: dict[str, StrictBool | StrictInt | StrictFloat | StrictStr | None] = Field(
+        min_length=1,
+        max_length=64,
+        description="By the names of `GET configuration`; null removes a setting from the file: its default.",
+    )
 
 
 class ReloadedOut(BaseModel):
@@ -43,6 +73,7 @@ class TokenOut(BaseModel):
     created_at: datetime
     expires_at: datetime | None
     scope: Scope = Field(description="read: look and download; operate: change captures, too; admin: set-up, too.")
+    created_by: str | None = Field(description="The token that it was created with; null: by `spiked token`.")
 
 
 class TokensOut(BaseModel):
@@ -51,9 +82,31 @@ class TokensOut(BaseModel):
     items: list[TokenOut]
 
 
+class TokenRequest(In):
+    """A token to be made."""
+
+    model_config = example(name="display", scope="read", days=90)
+
+    name: TokenName = Field(description="Of its user or device.")
+    scope: Scope
+    days: StrictFloat | None = Field(
+        None,
+        gt=0,
+        le=MOST_DAYS,
+        description="Until it expires; null: when the token of this request does, if that expires.",
+    )
+
+
+class NewTokenOut(TokenOut):
+    """A new token."""
+
+    secret: str = Field(description="The token itself, which is not shown again: only its hash is kept.")
+
+
 def configuration_routes(settings: ReloadableSettings, tokens: Tokens) -> APIRouter:
     """`configuration` and `tokens`."""
     router = APIRouter(tags=["operations"])
+    schema = whole(Settings.model_json_schema())["properties"]
 
     @router.get("/configuration", responses=problems(), openapi_extra=needs(Scope.ADMIN))
     def get_configuration() -> SettingsOut:
@@ -65,11 +118,37 @@ def configuration_routes(settings: ReloadableSettings, tokens: Tokens) -> APIRou
                 value=value,
                 origin=configuration.origins[name],
                 reloadable=reloadable(name),
+                editable=name in EDITABLE,
+                option=schema[name],
                 doc=field(name).description or "",
             )
             for name, value in configuration.shown().items()
         ]
-        return SettingsOut(items=items)
+        try:
+            waiting, trouble = settings.waiting(), None
+        except ConfigurationError as error:
+            waiting, trouble = [], str(error)
+        file = str(configuration.file or own_file())
+        return SettingsOut(items=items, file=file, needs_restart=waiting, problem=trouble)
+
+    @router.patch("/configuration", responses=problems(), openapi_extra=needs(Scope.ADMIN))
+    def change_configuration(body: SettingsChange, request: Request) -> ReloadedOut:
+        """Change settings in the file that the service was started with, and reload it. An error changes nothing.
+
+        Limits, retention, logs, workers and the choice of the renderer can be changed. Addresses, tokens, certificates,
+        folders and devices are changed on the machine of the service only.
+        """
+        done = settings.change(body.values)
+        caller: Caller = request.state.caller
+        _log.info(
+            "settings changed",
+            values=body.values,
+            caller=caller.name,
+            address=caller.address,
+            changed=done.changed,
+            waiting=done.waiting,
+        )
+        return ReloadedOut(changed=done.changed, needs_restart=done.waiting)
 
     @router.post("/configuration:reload", responses=problems(), openapi_extra=needs(Scope.ADMIN))
     def reload_configuration() -> ReloadedOut:
@@ -77,13 +156,54 @@ def configuration_routes(settings: ReloadableSettings, tokens: Tokens) -> APIRou
         done = settings.reload()
         return ReloadedOut(changed=done.changed, needs_restart=done.waiting)
 
+    _add_token_routes(router, tokens)
+    return router
+
+
+def _add_token_routes(router: APIRouter, tokens: Tokens) -> None:
+    """`tokens`."""
+
     @router.get("/tokens", responses=problems(), openapi_extra=needs(Scope.ADMIN))
     def list_tokens() -> TokensOut:
-        """Names and dates of the tokens; `spiked token` creates and revokes them."""
-        items = [
-            TokenOut(name=token.name, created_at=token.created_at, expires_at=token.expires_at, scope=token.scope)
-            for token in tokens.all()
-        ]
-        return TokensOut(items=items)
+        """Names, scopes and dates of the tokens."""
+        return TokensOut(items=[TokenOut.model_validate(one, from_attributes=True) for one in tokens.all()])
 
-    return router
+    @router.post("/tokens", status_code=HTTPStatus.CREATED, responses=problems(), openapi_extra=needs(Scope.ADMIN))
+    def create_token(body: TokenRequest, request: Request, response: Response) -> NewTokenOut:
+        """Make a token; this answer is the only one that has it.
+
+        Only who brings a token of scope `admin` may, even where none is required: the first is made by `spiked token
+        create`. A token ends no later than the one that it was made with.
+        """
+        caller = _signed_in(request)
+        lifetime = None if body.days is None else timedelta(days=body.days)
+        secret = tokens.create(body.name, lifetime, body.scope, by=caller.name)
+        (made,) = (one for one in tokens.all() if one.name == body.name)
+        _log.warning("token created", token=body.name, scope=body.scope, caller=caller.name, address=caller.address)
+        response.headers["Cache-Control"] = "no-store"
+        return NewTokenOut(secret=secret, **TokenOut.model_validate(made, from_attributes=True).model_dump())
+
+    @router.delete(
+        "/tokens/{name}", status_code=HTTPStatus.NO_CONTENT, responses=problems(404), openapi_extra=needs(Scope.ADMIN)
+    )
+    def revoke_token(name: TokenName, request: Request) -> None:
+        """Revoke a token, and end what it has opened, within a second. Who may: see `POST tokens`."""
+        caller = _signed_in(request)
+        if all(one.name != name for one in tokens.all()):
+            raise UnknownIdError(f"there is no token {name}; GET tokens lists them")
+        tokens.revoke(name)
+        _log.warning("token revoked", token=name, caller=caller.name, address=caller.address)
+
+
+def _signed_in(request: Request) -> Caller:
+    """Who brings a token of scope `admin`. Raises ForbiddenError for others, who may do all the rest on loopback.
+
+    A token outlasts the settings: one that is made while none is required opens the service when one is.
+    """
+    caller: Caller = request.state.caller
+    if caller.token_scope is not Scope.ADMIN:
+        raise ForbiddenError(
+            "tokens are made and revoked with a token of scope admin only, even where none is required: "
+            "`spiked token create NAME` makes the first"
+        )
+    return caller

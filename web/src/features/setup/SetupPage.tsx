@@ -3,19 +3,18 @@
 import type { JSX } from "react";
 
 import * as calls from "../../shared/api/calls";
-import type { Finding, Setting, Token } from "../../shared/api/types";
+import type { Finding } from "../../shared/api/types";
 import { allows } from "../../shared/state/access";
-import { attempt } from "../../shared/state/attempt";
-import { bytes, duration, when } from "../../shared/state/format";
+import { bytes, duration } from "../../shared/state/format";
 import { useService } from "../../shared/state/store";
-import { toast } from "../../shared/state/toasts";
 import { type Fetch, useFetch } from "../../shared/state/useFetch";
 import { ScopeNote } from "../../shared/ui/access";
 import { Fetched } from "../../shared/ui/Fetched";
 import { Icon } from "../../shared/ui/icons";
 import { Badge, Empty, Loading, Markup, Panel, type Tone } from "../../shared/ui/parts";
-import { Table } from "../../shared/ui/Table";
+import { ConfigurationPanel } from "./ConfigurationPanel";
 import { ProfilePanel } from "./ProfilePanel";
+import { TokensPanel } from "./TokensPanel";
 
 const TONES: Record<Finding["status"], Tone> = { ok: "good", warning: "warning", problem: "problem" };
 const LINKS = [
@@ -26,8 +25,6 @@ const LINKS = [
   { href: "healthz", label: "Health", hint: "The process answers" },
   { href: "readyz", label: "Readiness", hint: "Captures can be started" },
 ] as const;
-const SETTING_COLUMNS = [{ name: "Setting" }, { name: "Value" }, { name: "From" }, { name: "Reload" }];
-const TOKEN_COLUMNS = [{ name: "Name" }, { name: "Scope" }, { name: "Created" }, { name: "Expires" }];
 
 export function SetupPage(): JSX.Element {
   const scope = useService((state) => state.system?.scope ?? null);
@@ -38,11 +35,11 @@ export function SetupPage(): JSX.Element {
       <div>
         <Doctor />
         <ProfilePanel />
-        {administrator && <Configuration />}
+        {administrator && <ConfigurationPanel />}
       </div>
       <div>
         <Service />
-        {administrator && <Tokens />}
+        {administrator && <TokensPanel />}
         {scope !== null && !administrator && (
           <Panel title="Administration">
             <p>Configuration and tokens are hidden.</p>
@@ -128,91 +125,6 @@ function Service(): JSX.Element {
         </dl>
       )}
     </Panel>
-  );
-}
-
-function Tokens(): JSX.Element {
-  const tokens = useFetch("tokens", calls.tokens);
-  return (
-    <Panel title="Tokens" aside={<Refresh of={tokens} label="Refresh the tokens" />}>
-      <Fetched from={tokens} what="the tokens">
-        {(items) =>
-          items.length === 0 ? (
-            <p>No tokens, other than one in the settings, if any.</p>
-          ) : (
-            <Table label="Table of tokens" className="grid" columns={TOKEN_COLUMNS}>
-              {items.map((token) => (
-                <tr key={token.name}>
-                  <th scope="row">{token.name}</th>
-                  <td>{token.scope}</td>
-                  <td className="dim">{when(token.created_at)}</td>
-                  <td>{expiry(token)}</td>
-                </tr>
-              ))}
-            </Table>
-          )
-        }
-      </Fetched>
-      <p className="dim note">
-        <code>spiked token create NAME --days 30</code> creates a token and prints it once;{" "}
-        <code>spiked token revoke NAME</code> revokes it at once, for this page too.
-      </p>
-    </Panel>
-  );
-}
-
-function expiry({ expires_at: end }: Token): JSX.Element {
-  if (end === null) return <span className="dim">never</span>;
-  return Date.parse(end) <= Date.now() ? <Badge tone="warning">expired {when(end)}</Badge> : <>{when(end)}</>;
-}
-
-function Configuration(): JSX.Element {
-  const configuration = useFetch("configuration", calls.configuration);
-  const reload = async (): Promise<void> => {
-    if (!(await attempt(calls.reloadConfiguration))) return;
-    toast("Configuration reloaded");
-    configuration.again();
-  };
-  return (
-    <Panel
-      title="Configuration"
-      aside={
-        <button type="button" disabled={configuration.loading} onClick={() => void reload()}>
-          <Icon name="again" /> Reload
-        </button>
-      }
-    >
-      <Fetched from={configuration} what="the configuration">
-        {(items) => (
-          <Table label="Table of settings" className="grid configuration" columns={SETTING_COLUMNS}>
-            {items.map((item) => (
-              <SettingRow key={item.key} setting={item} />
-            ))}
-          </Table>
-        )}
-      </Fetched>
-    </Panel>
-  );
-}
-
-function SettingRow({ setting }: { setting: Setting }): JSX.Element {
-  const { value } = setting;
-  return (
-    <tr>
-      <th scope="row">
-        <code>{setting.key}</code>
-        <span className="dim">
-          <Markup>{setting.doc}</Markup>
-        </span>
-      </th>
-      <td>
-        <code>{value === null ? "–" : typeof value === "string" ? value : JSON.stringify(value)}</code>
-      </td>
-      <td>
-        <span className={setting.origin === "default" ? "dim" : ""}>{setting.origin}</span>
-      </td>
-      <td className="dim">{setting.reloadable ? "yes" : "restart"}</td>
-    </tr>
   );
 }
 

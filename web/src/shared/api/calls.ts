@@ -21,7 +21,9 @@ import type {
   RevertRequest,
   Scale,
   ScaleRequest,
-  Setting,
+  NewToken,
+  Reloaded,
+  Settings,
   SourceKind,
   ScenePoint,
   Spikes,
@@ -31,6 +33,7 @@ import type {
   TagScaleRequest,
   Timeline,
   Token,
+  TokenRequest,
   Trajectory,
   Upload,
   UploadRequest,
@@ -49,9 +52,14 @@ export const devices = async (): Promise<Device[]> => (await answered(client.GET
 export const doctor = async (): Promise<Finding[]> =>
   ((await (await request("doctor")).json()) as { items: Finding[] }).items;
 export const system = (): Promise<System> => answered(client.GET("/api/v1/system"));
-export const configuration = async (): Promise<Setting[]> =>
-  (await answered(client.GET("/api/v1/configuration"))).items;
-export const reloadConfiguration = (): Promise<unknown> => answered(client.POST("/api/v1/configuration:reload"));
+export const configuration = (): Promise<Settings> => answered(client.GET("/api/v1/configuration"));
+export const reloadConfiguration = (): Promise<Reloaded> => answered(client.POST("/api/v1/configuration:reload"));
+/** null removes a setting from the file: its default. */
+export const changeConfiguration = (values: OptionValues): Promise<Reloaded> =>
+  answered(client.PATCH("/api/v1/configuration", { body: { values: values as Record<string, null> } }));
+export const createToken = (body: TokenRequest): Promise<NewToken> => answered(client.POST("/api/v1/tokens", { body }));
+export const revokeToken = (name: string): Promise<unknown> =>
+  answered(client.DELETE("/api/v1/tokens/{name}", { params: { path: { name } } }));
 export const tokens = async (): Promise<Token[]> => (await answered(client.GET("/api/v1/tokens"))).items;
 export const optionSchema = async (): Promise<OptionSchema> => await answered(client.GET("/api/v1/options"));
 export const sourceKinds = async (): Promise<SourceKind[]> =>

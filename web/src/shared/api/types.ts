@@ -52,6 +52,10 @@ export type Closure = Schemas["ClosureOut"];
 export type Timeline = Schemas["TimelineOut"];
 export type System = Schemas["SystemOut"];
 export type Setting = Schemas["SettingOut"];
+export type Reloaded = Schemas["ReloadedOut"];
+export type Settings = Schemas["SettingsOut"];
+export type NewToken = Schemas["NewTokenOut"];
+export type TokenRequest = Schemas["TokenRequest"];
 export type Token = Schemas["TokenOut"];
 export type Scope = Schemas["Scope"];
 

@@ -19,6 +19,7 @@ import pytest
 from spiked_service.base.health import CheckResult, CheckStatus, EventLoopHeartbeat, Health, failed
 from spiked_service.operations.systemd import SystemdNotifier
 from spiked_service.settings.reload import ReloadableSettings
+from waiting import until
 
 from spiked.errors import ConfigurationError
 
@@ -141,6 +142,21 @@ def test_the_system_tells_of_itself(daemon: Callable[..., Any], tmp_path: Path) 
     assert minutes == pytest.approx(system["disk"]["recording_s"] / 60, rel=0.1, abs=1), "one forecast"
     assert system["memory_bytes"] > 10e6
     assert system["uptime_s"] >= 0
+
+
+def test_the_forecast_of_the_disk_is_that_of_the_cameras_that_run(daemon: Callable[..., Any]) -> None:
+    one = daemon("--no-capture")
+    for width in (96, 64):
+        source = f"sim:?width={width}&height=64&pace=0.02"
+        started = one.http.post("captures", json={"source": source, "reconstruct": False})
+        path = f"captures/{started.json()['id']}"
+        until(lambda path=path: one.http.get(path).json()["sensor"], "it runs")
+    disk = one.http.get("system").json()["disk"]
+    assert disk["recording_of"] == "96x64 at 20 kHz and 64x64 at 20 kHz"
+    assert disk["recording_s"] == pytest.approx(disk["free_bytes"] / (20_000 * (96 + 64) * 64 / 8), rel=0.01)
+    finding = {item["name"]: item["finding"] for item in one.http.get("doctor").json()["items"]}["disk space"]
+    minutes = int(re.search(r"(\d+) minutes of 96x64 at 20 kHz and 64x64 at 20 kHz", finding)[1])
+    assert minutes == pytest.approx(disk["recording_s"] / 60, rel=0.1, abs=1), "one forecast"
     assert one.http.get("tokens").json() == {"items": []}
     checks = httpx.get(f"{one.address}readyz").json()["checks"]
     assert "zmq" in [check["name"] for check in checks]

@@ -90,7 +90,7 @@ def _api(services: Services) -> APIRouter:
     api.include_router(cleaning_routes(reconstructions.rows, results, once))
     api.include_router(scale_routes(reconstructions.rows, results, once))
     api.include_router(reconstruction_record_routes(reconstructions.rows, once))
-    api.include_router(doctor_routes(folder.path))
+    api.include_router(doctor_routes(folder.path, captures))
     api.include_router(option_routes())
     api.include_router(upload_routes(services.uploads, captures, services.sources, profiles, once))
     api.include_router(event_routes(services.bus, services.event_clients))

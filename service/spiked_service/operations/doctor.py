@@ -5,12 +5,12 @@ import re
 import shutil
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from spiked_driver.framing import USB_COMPACT_BYTES, USB_FRAME_BYTES, USB_HEIGHT, USB_WIDTH
+from spiked_driver.framing import USB_FRAME_BYTES
 from spiked_driver.ft60x import PRODUCTS, VENDOR_ID
 from spiked_driver.realtime import PRIORITY, may_lock_memory, may_schedule
 from spiked_driver.source_kind import RATE_HZ
@@ -23,13 +23,11 @@ from spiked.render.choice import chosen
 from spiked.ring.segment import FOLDER as RING_FOLDER
 from spiked.ring.writer import DEFAULT_BYTES, MOST_BACKLOG_BYTES
 from spiked.sensor import Sensor
+from spiked_service.operations.disk_forecast import disk_forecast
 from spiked_service.store.folder import nearest_folder, space_at
 
 UDEV_FOLDERS = tuple(Path(folder) for folder in ("/etc", "/run", "/usr/lib", "/lib", "/usr/local/lib"))
 CPU = Path("/sys/devices/system/cpu")
-USB_CAMERA = Sensor(USB_WIDTH, USB_HEIGHT, RATE_HZ)
-"""What forecasts are about while no camera runs."""
-_PIXELS_S = USB_COMPACT_BYTES * RATE_HZ
 _WIRE_S = USB_FRAME_BYTES * RATE_HZ
 _BUS_S = 400e6
 """What is left of 5 Gbit/s after encoding and protocol, about."""
@@ -61,8 +59,11 @@ class Diagnosis:
     what_to_do: str | None = None
 
 
-def examine(data: Path) -> list[Diagnosis]:
-    """All that matters; takes about a second for the disk below the data folder. Changes nothing."""
+def examine(data: Path, running: Sequence[Sensor] = ()) -> list[Diagnosis]:
+    """All that matters; takes about a second for the disk below the data folder. Changes nothing.
+
+    `running` are the sensors of the cameras that record now.
+    """
     cameras = find_cameras()
     return [
         _cameras(cameras),
@@ -74,7 +75,7 @@ def examine(data: Path) -> list[Diagnosis]:
         _priority(),
         _memory(),
         _shared_memory(),
-        *disk_findings(data),
+        *disk_findings(data, running),
         _renderer(),
     ]
 
@@ -241,14 +242,13 @@ def _renderer() -> Diagnosis:
     return Diagnosis(name, DiagnosisStatus.OK, f"{choice.renderer}: {choice.reason}")
 
 
-def disk_findings(data: Path) -> Iterator[Diagnosis]:
+def disk_findings(data: Path, running: Sequence[Sensor] = ()) -> Iterator[Diagnosis]:
     """Free space and measured write speed of the disk below the data folder."""
     folder = nearest_folder(data)
     space = space_at(folder)
-    free, seconds = space.free_bytes, space.recording_s(USB_CAMERA)
-    of = f"{USB_CAMERA.width}x{USB_CAMERA.height} at {USB_CAMERA.frame_rate_hz / 1e3:g} kHz"
-    found = f"{free / 1e9:.0f} GB free in {folder}, {seconds / 60:.0f} minutes of {of}"
-    if seconds >= 60 * _MINUTES:
+    free, forecast = space.free_bytes, disk_forecast(space, running)
+    found = f"{free / 1e9:.0f} GB free in {folder}, {forecast.seconds / 60:.0f} minutes of {forecast.of}"
+    if forecast.seconds >= 60 * _MINUTES:
         yield Diagnosis("disk space", DiagnosisStatus.OK, found)
     else:
         yield Diagnosis(
@@ -265,8 +265,8 @@ def disk_findings(data: Path) -> Iterator[Diagnosis]:
         todo = "give a folder with --data that this user may write"
         yield Diagnosis("disk speed", DiagnosisStatus.PROBLEM, f"{folder} cannot be written: {error.strerror}", todo)
         return
-    found = f"{speed / 1e6:.0f} MB/s written and flushed; recording takes {_PIXELS_S / 1e6:.0f}"
-    if speed > 1.2 * _PIXELS_S:
+    found = f"{speed / 1e6:.0f} MB/s written and flushed; recording takes {forecast.bytes_s / 1e6:.0f}"
+    if speed > 1.2 * forecast.bytes_s:
         yield Diagnosis("disk speed", DiagnosisStatus.OK, found)
     else:
         todo = "record to a faster disk (--data), or shorter than memory holds"

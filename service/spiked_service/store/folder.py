@@ -9,7 +9,6 @@ from pathlib import Path
 
 from spiked.errors import ConfigurationError
 from spiked.recon.checkpoint_file import CHECKPOINT
-from spiked.sensor import Sensor
 from spiked_service.base.ids import is_id
 
 _LOCK = "lock"
@@ -24,10 +23,6 @@ class Space:
     free_bytes: int
     """Bytes available to unprivileged users."""
     total_bytes: int
-
-    def recording_s(self, sensor: Sensor) -> float:
-        """Seconds of recording of this sensor that fit."""
-        return self.free_bytes / (sensor.compact().frame_bytes * sensor.frame_rate_hz)
 
 
 def nearest_folder(path: Path) -> Path:

@@ -9,6 +9,8 @@ from pydantic import Field
 
 from spiked_service.api.problems import problems
 from spiked_service.api.schemas.base import Out
+from spiked_service.captures.captures import Captures
+from spiked_service.operations.disk_forecast import running_sensors
 from spiked_service.operations.doctor import Diagnosis, DiagnosisStatus, examine
 
 _FRESH_S = 5.0
@@ -38,8 +40,9 @@ class DoctorOut(Out):
 class _Doctor:
     """Runs the checks, and reuses their results for a while."""
 
-    def __init__(self, data: Path) -> None:
+    def __init__(self, data: Path, captures: Captures) -> None:
         self._data = data
+        self._captures = captures
         self._lock = threading.Lock()
         self._at_s = -_FRESH_S
         self._findings: list[Diagnosis] = []
@@ -48,15 +51,15 @@ class _Doctor:
         """New or reused results."""
         with self._lock:
             if time.monotonic() - self._at_s > _FRESH_S:
-                self._findings = examine(self._data)
+                self._findings = examine(self._data, running_sensors(self._captures))
                 self._at_s = time.monotonic()
             return self._findings
 
 
-def doctor_routes(data: Path) -> APIRouter:
+def doctor_routes(data: Path, captures: Captures) -> APIRouter:
     """`doctor`, with the disk of the data folder."""
     router = APIRouter(tags=["devices"])
-    doctor = _Doctor(data)
+    doctor = _Doctor(data, captures)
 
     @router.get("/doctor", responses=problems())
     def examine_machine() -> DoctorOut:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 from spiked_service.api.problems import problems
 from spiked_service.api.services import Services
 from spiked_service.base.version import installed_version
-from spiked_service.operations.doctor import USB_CAMERA
+from spiked_service.operations.disk_forecast import disk_forecast, running_sensors
 from spiked_service.settings.tokens import Scope
 
 
@@ -21,10 +21,10 @@ class DiskOut(BaseModel):
     free_bytes: int
     total_bytes: int
     recording_s: float = Field(
-        description="How long a recording there is room for, of the camera that runs at the rate that it states, or of "
-        "a USB camera if none runs."
+        description="How long a recording there is room for, of the cameras that run at the rates that they state, or "
+        "of a USB camera if none runs; `GET doctor` says the same."
     )
-    recording_of: str = Field(description="That camera.", examples=["400x250 at 20 kHz"])
+    recording_of: str = Field(description="These cameras.", examples=["400x250 at 20 kHz"])
 
 
 class ZmqOut(BaseModel):
@@ -60,8 +60,7 @@ def system_routes(services: Services) -> APIRouter:
     def get_system(request: Request) -> SystemOut:
         """Version, uptime, disk, memory, and what the token of the request allows."""
         space = services.folder.space()
-        running = (one.row.sensor for one in services.captures.live() if one.row.sensor is not None)
-        sensor = next(running, USB_CAMERA)
+        forecast = disk_forecast(space, running_sensors(services.captures))
         return SystemOut(
             version=installed_version(),
             started_at=started_at,
@@ -70,8 +69,8 @@ def system_routes(services: Services) -> APIRouter:
             disk=DiskOut(
                 free_bytes=space.free_bytes,
                 total_bytes=space.total_bytes,
-                recording_s=space.recording_s(sensor),
-                recording_of=f"{sensor.width}x{sensor.height} at {sensor.frame_rate_hz / 1e3:g} kHz",
+                recording_s=forecast.seconds,
+                recording_of=forecast.of,
             ),
             memory_bytes=resident_bytes(),
             pid=os.getpid(),

@@ -19,7 +19,8 @@ from spiked_service.captures.ring_counts import RingCount
 from spiked_service.captures.sources import device_of, realtime
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue import Reconstructions
-from spiked_service.store.catalogue import CaptureFilter, Catalogue, Page, StoreError, UnknownIdError
+from spiked_service.store.capture_listing import CaptureFilter, CaptureSort
+from spiked_service.store.catalogue import Catalogue, Page, StoreError, UnknownIdError
 from spiked_service.store.disk_space import DiskSpace, recording_bytes
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import CaptureEdit, CaptureRow, Plan
@@ -202,9 +203,16 @@ class Captures:
         ring = None if opened is None else opened.name
         return Snapshot(row, counters, self._reconstructions.rows.of(row.id), ring)
 
-    def list(self, limit: int = 50, cursor: str | None = None, **wanted: Unpack[CaptureFilter]) -> Page[CaptureRow]:
-        """Newest first."""
-        return self._catalogue.capture_page(limit, cursor, **wanted)
+    def list(
+        self,
+        limit: int = 50,
+        cursor: str | None = None,
+        sort: CaptureSort = CaptureSort.STARTED,
+        descending: bool = True,
+        **wanted: Unpack[CaptureFilter],
+    ) -> Page[CaptureRow]:
+        """Newest first, unless another order is wanted. See `Catalogue.capture_page`."""
+        return self._catalogue.capture_page(limit, cursor, sort, descending, **wanted)
 
     def live(self) -> Sequence[Snapshot]:
         """Captures that have not ended, oldest first."""

@@ -6,16 +6,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, ParamSpec, Protocol, TypedDict, TypeVar, Unpack
+from typing import Any, Generic, ParamSpec, Protocol, TypeVar, Unpack
 
 from pydantic import TypeAdapter, ValidationError
 
 from spiked.errors import SpikedError
+from spiked_service.store.capture_listing import SORT_KEYS, CaptureFilter, CaptureSort, matching
 from spiked_service.store.disk_reserve import DiskReserve
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.migrations import MIGRATIONS, copy_before_migration, migrate, schema_of, written_by
 from spiked_service.store.row_copies import RowCopies
-from spiked_service.store.rows import CaptureRow, CaptureState, JobState, ReconstructionRow, UploadRow, VersionRow
+from spiked_service.store.rows import CaptureRow, JobState, ReconstructionRow, UploadRow, VersionRow
 
 _WAIT_S = 5.0
 """Longest wait for another process that writes the catalogue, seconds."""
@@ -56,18 +57,8 @@ class Page(Generic[_Row]):
     items: list[_Row]
     next_cursor: str | None
     """None on the last page."""
-
-
-class CaptureFilter(TypedDict, total=False):
-    """Which captures are listed; None and what is left out: any."""
-
-    query: str | None
-    """Looked for in name, notes, source, tags and metadata."""
-    state: CaptureState | None
-    deleted: bool
-    """Those that were removed, instead of the others."""
-    group: str | None
-    tag: str | None
+    total: int | None = None
+    """Rows on all pages, where they were counted."""
 
 
 class Catalogue:
@@ -167,25 +158,26 @@ class Catalogue:
         self,
         limit: int = 50,
         cursor: str | None = None,
+        sort: CaptureSort = CaptureSort.STARTED,
+        descending: bool = True,
         **wanted: Unpack[CaptureFilter],
     ) -> Page[CaptureRow]:
-        """Captures, newest first."""
-        state, group, tag, query = (wanted.get(key) for key in ("state", "group", "tag", "query"))
-        where, values = ["deleted_at IS NOT NULL" if wanted.get("deleted") else "deleted_at IS NULL"], list[Any]()
-        if state is not None:
-            where.append("state = ?")
-            values.append(str(state))
-        if group is not None:
-            where.append("json_extract(document, '$.group') = ?")
-            values.append(group)
-        if tag is not None:
-            where.append("EXISTS (SELECT 1 FROM json_each(document, '$.tags') WHERE value = ?)")
-            values.append(tag)
-        if query:
-            fields = ("$.name", "$.notes", "$.plan.source", "$.tags", "$.metadata")
-            where.append("(" + " OR ".join(f"instr(lower(json_extract(document, '{f}')), ?)" for f in fields) + ")")
-            values += [str(query).lower()] * len(fields)
-        return self.captures.page(where, values, limit, cursor)
+        """Captures, newest first unless another order is wanted, with the number of all that match.
+
+        Raises UnknownIdError for the cursor of a capture that was purged meanwhile.
+        """
+        where, values = matching(wanted)
+        ((total,),) = self.read(f"SELECT count(*) FROM captures WHERE {' AND '.join(where)}", tuple(values))
+        key, side, way = SORT_KEYS[sort], "<" if descending else ">", "DESC" if descending else "ASC"
+        if cursor is not None:
+            last = self.read(f"SELECT {key} FROM captures WHERE id = ?", (cursor,))
+            if not last and sort is not CaptureSort.STARTED:
+                raise UnknownIdError(f"capture {cursor}, after which the list goes on, is gone; list anew")
+            where.append(f"({key}, id) {side} (?, ?)")
+            values += [last[0][0] if last else cursor, cursor]
+        ordered = f"{' AND '.join(where)} ORDER BY {key} {way}, id {way} LIMIT ?"
+        rows = self.captures.where(ordered, (*values, limit + 1))
+        return Page(rows[:limit], rows[limit - 1].id if len(rows) > limit else None, total)
 
     def capture_counts(self) -> dict[str, int]:
         """Number of captures by state, without removed ones."""

@@ -13,7 +13,8 @@ from spiked_service.api.schemas.captures import CaptureChange, CaptureOut, Captu
 from spiked_service.api.sources import Sources
 from spiked_service.base.errors import BusyError
 from spiked_service.captures.captures import Captures
-from spiked_service.store.rows import CaptureState, Plan
+from spiked_service.store.capture_listing import CaptureFilter, CaptureSort
+from spiked_service.store.rows import CaptureState, Grade, Plan
 
 
 def capture_routes(captures: Captures, sources: Sources, route_class: type[APIRoute]) -> APIRouter:
@@ -43,11 +44,18 @@ def capture_routes(captures: Captures, sources: Sources, route_class: type[APIRo
             str | None, Query(max_length=64, description="Captures that were started together, by their group's id.")
         ] = None,
         tag: Annotated[str | None, Query(max_length=64, description="Captures with this tag.")] = None,
+        grade: Annotated[Grade | None, Query(description="Captures with this verdict.")] = None,
+        keep: Annotated[bool | None, Query(description="Captures that are, or are not, to be kept.")] = None,
+        sort: Annotated[
+            CaptureSort, Query(description="By which all captures are sorted, not only those of a page.")
+        ] = CaptureSort.STARTED,
+        descending: Annotated[bool, Query(description="The newest, largest or last first.")] = True,
     ) -> CapturePage:
-        """Captures, newest first."""
-        page = captures.list(limit, cursor, query=q, state=state, deleted=deleted, group=group, tag=tag)
+        """Captures, newest first unless another order is asked for. All pages are asked for with the same order."""
+        wanted = CaptureFilter(query=q, state=state, deleted=deleted, group=group, tag=tag, grade=grade, keep=keep)
+        page = captures.list(limit, cursor, sort, descending, **wanted)
         items = [CaptureOut.of(captures.snapshot(row)) for row in page.items]
-        return CapturePage(items=items, next_cursor=page.next_cursor)
+        return CapturePage(items=items, next_cursor=page.next_cursor, total=page.total or 0)
 
     @router.get("/{capture_id:id}", responses=problems(404))
     def get_capture(capture_id: str) -> CaptureOut:

@@ -435,7 +435,9 @@ class CaptureOut(Out):
 
 
 class CapturePage(PageOut[CaptureOut]):
-    """Captures, newest first."""
+    """Captures, newest first or in the order that was asked for."""
+
+    total: int = Field(description="Captures on all pages.")
 
 
 class RateHistogram(Out):

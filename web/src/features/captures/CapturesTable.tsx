@@ -1,93 +1,47 @@
 /** The table of captures, newest first, searched by the service. */
 
-import { type JSX, useEffect, useState } from "react";
+import { type JSX, useEffect, useRef, useState } from "react";
 
-import { address, captures as fetchCaptures } from "../../shared/api/calls";
-import type { Capture } from "../../shared/api/types";
+import { address } from "../../shared/api/calls";
+import type { Capture, CaptureSort } from "../../shared/api/types";
 import { lengthOf, nameOf, sourceOf } from "../../shared/state/capture";
-import { bytes, when } from "../../shared/state/format";
+import { bytes, count, when } from "../../shared/state/format";
 import { adjust, go, useRoute } from "../../shared/state/route";
-import { loadReconstructions, newestReconstruction, useService, errorText } from "../../shared/state/store";
+import { loadReconstructions, newestReconstruction, useService } from "../../shared/state/store";
 import { ActionButton } from "../../shared/ui/access";
 import { Icon } from "../../shared/ui/icons";
 import { PageLink } from "../../shared/ui/PageLink";
 import { CaptureBadge, Empty, ErrorMessage, JobBadge, JobReason, Loading } from "../../shared/ui/parts";
-import { Table } from "../../shared/ui/Table";
-import { filtered, type Filter, type Order, sorted } from "./listing";
+import { type Column, Table } from "../../shared/ui/Table";
 import { DeletedBar, ListControls, SelectionBar } from "./SelectionBar";
 import { removeWithUndo, restored } from "./remove";
 import { UploadPanel } from "./UploadPanel";
+import { type Filter, type Order, useListing } from "./useListing";
 
-const ROWS = 50;
-const TYPING_MS = 200;
-
-const COLUMNS = [
+const COLUMNS: (Column & { sort?: CaptureSort })[] = [
   { name: "Select", hidden: true },
   { name: "Picture", hidden: true },
-  { name: "Name" },
-  { name: "Started" },
-  { name: "Length", number: true },
-  { name: "Size", number: true },
-  { name: "Verdict" },
-  { name: "Reconstruction" },
+  { name: "Name", sort: "name" },
+  { name: "Started", sort: "started" },
+  { name: "Length", number: true, sort: "length" },
+  { name: "Size", number: true, sort: "size" },
+  { name: "Verdict", sort: "verdict" },
+  { name: "Reconstruction", sort: "reconstruction" },
   { name: "Actions", hidden: true },
 ];
 
-interface Listed {
-  search: string;
-  deleted: boolean;
-  items: Capture[];
-  cursor: string | null;
-}
-
 export function CapturesTable(): JSX.Element {
   const { search } = useRoute();
-  const [listed, setListed] = useState<Listed | null>(null);
-  const [problem, setProblem] = useState<string | null>(null);
-  const [round, setRound] = useState(0);
   const [uploads, setUploads] = useState(false);
   const [selected, setSelected] = useState<ReadonlySet<string>>(new Set());
   const [filter, setFilter] = useState<Filter>("");
-  const [order, setOrder] = useState<Order>("newest");
+  const [order, setOrder] = useState<Order>({ sort: "started", descending: true });
+  const { listed, problem, newer, more, again, forget } = useListing(search, filter, order);
   const known = useService((state) => state.captures);
-  const newest = Object.keys(known).sort().at(-1);
   const deleted = filter === "deleted";
 
-  useEffect(() => {
-    let current = true;
-    const timer = setTimeout(() => {
-      fetchCaptures({ limit: ROWS, q: search, deleted }).then(
-        (page) => {
-          if (!current) return;
-          setListed({ search, deleted, items: page.items, cursor: page.next_cursor });
-          setProblem(null);
-        },
-        (error: unknown) => current && setProblem(errorText(error)),
-      );
-    }, TYPING_MS);
-    return () => {
-      current = false;
-      clearTimeout(timer);
-    };
-  }, [search, deleted, round, newest]);
-
-  const more = async (): Promise<void> => {
-    if (listed?.cursor == null) return;
-    try {
-      const page = await fetchCaptures({
-        limit: ROWS,
-        q: listed.search,
-        deleted: listed.deleted,
-        cursor: listed.cursor,
-      });
-      setListed({ ...listed, items: [...listed.items, ...page.items], cursor: page.next_cursor });
-    } catch (error) {
-      setProblem(errorText(error));
-    }
-  };
-
   const Bar = deleted ? DeletedBar : SelectionBar;
-  const shown = listed === null ? [] : sorted(filtered(listed.items, filter), order);
+  const shown = listed?.items ?? [];
   return (
     <div className="captures">
       <header className="head">
@@ -124,39 +78,57 @@ export function CapturesTable(): JSX.Element {
           chosen={shown.filter((one) => selected.has(one.id)).map((one) => known[one.id] ?? one)}
           onDone={() => {
             setSelected(new Set());
-            setRound((n) => n + 1);
+            again();
           }}
           onNone={() => setSelected(new Set())}
         />
       )}
-      {problem !== null && <ErrorMessage text={problem} again={() => setRound((n) => n + 1)} />}
+      {problem !== null && <ErrorMessage text={problem} again={again} />}
+      {newer && (
+        <p className="warning" role="status">
+          There are new captures.{" "}
+          <button type="button" onClick={again}>
+            List them, too
+          </button>
+        </p>
+      )}
       {listed === null && problem === null && <Loading what="captures" />}
       {listed !== null &&
         (listed.items.length === 0 ? (
-          listed.deleted && listed.search === "" ? (
+          listed.filter === "deleted" && listed.q === "" ? (
             <Empty icon="trash" title="Nothing is deleted">
               <button onClick={() => setFilter("")}>Show all</button>
             </Empty>
-          ) : listed.search === "" ? (
+          ) : listed.q === "" && listed.filter === "" ? (
             <Empty icon="captures" title="No captures yet">
               <button onClick={() => go({ page: "live" })}>Start one</button>
             </Empty>
           ) : (
-            <Empty icon="search" title={`No capture matches “${listed.search}”`}>
-              <button onClick={() => adjust({ search: "" })}>Show all</button>
+            <Empty icon="search" title={`No capture matches “${listed.q === "" ? listed.filter : listed.q}”`}>
+              <button
+                onClick={() => {
+                  setFilter("");
+                  adjust({ search: "" });
+                }}
+              >
+                Show all
+              </button>
             </Empty>
           )
         ) : (
           <Table
             label="Table of captures"
             className="list"
-            columns={COLUMNS}
+            columns={COLUMNS.map(({ sort, ...column }) =>
+              sort === undefined ? column : { ...column, sorting: sortingBy(sort, order, setOrder) },
+            )}
             below={
-              listed.cursor !== null && (
-                <button type="button" className="more" onClick={() => void more()}>
-                  Show more
-                </button>
-              )
+              <p className="below">
+                <span className="dim" role="status">
+                  {count(shown.length)} of {count(listed.total)}
+                </span>
+                {listed.cursor !== null && <MoreButton onMore={more} />}
+              </p>
             }
           >
             {shown.map((one) => (
@@ -167,15 +139,42 @@ export function CapturesTable(): JSX.Element {
                 onSelect={(wanted) =>
                   setSelected((old) => new Set(wanted ? [...old, one.id] : [...old].filter((id) => id !== one.id)))
                 }
-                onRemoved={() =>
-                  setListed((old) => old && { ...old, items: old.items.filter((item) => item.id !== one.id) })
-                }
-                onRestored={() => setRound((n) => n + 1)}
+                onRemoved={() => forget(one.id)}
+                onRestored={again}
               />
             ))}
           </Table>
         ))}
     </div>
+  );
+}
+
+/** First by what is usually looked for: the newest and largest; a second click turns the order. */
+function sortingBy(sort: CaptureSort, order: Order, onOrder: (order: Order) => void): Column["sorting"] {
+  const active = order.sort === sort;
+  return {
+    direction: active ? (order.descending ? "descending" : "ascending") : "none",
+    onSort: () => onOrder({ sort, descending: active ? !order.descending : sort !== "name" }),
+  };
+}
+
+/** Fetches more when it comes into view, or is pressed. */
+function MoreButton({ onMore }: { onMore: () => void }): JSX.Element {
+  const button = useRef<HTMLButtonElement>(null);
+  const latest = useRef(onMore);
+  useEffect(() => {
+    latest.current = onMore;
+  });
+  useEffect(() => {
+    if (button.current === null) return;
+    const watch = new IntersectionObserver((seen) => seen.some((one) => one.isIntersecting) && latest.current());
+    watch.observe(button.current);
+    return () => watch.disconnect();
+  });
+  return (
+    <button ref={button} type="button" className="more" onClick={onMore}>
+      Show more
+    </button>
   );
 }
 

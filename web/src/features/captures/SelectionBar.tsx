@@ -15,7 +15,23 @@ import {
 } from "../../shared/state/store";
 import { toast } from "../../shared/state/toasts";
 import { ActionButton } from "../../shared/ui/access";
-import type { Filter, Order } from "./listing";
+import type { Filter, Order } from "./useListing";
+
+/** All that the heads of the columns give; these are not in sight on a phone. */
+const ORDERS: readonly (Order & { label: string })[] = [
+  { sort: "started", descending: true, label: "newest first" },
+  { sort: "started", descending: false, label: "oldest first" },
+  { sort: "name", descending: false, label: "by name" },
+  { sort: "name", descending: true, label: "by name, from Z" },
+  { sort: "size", descending: true, label: "largest first" },
+  { sort: "size", descending: false, label: "smallest first" },
+  { sort: "length", descending: true, label: "longest first" },
+  { sort: "length", descending: false, label: "shortest first" },
+  { sort: "verdict", descending: true, label: "best verdict first" },
+  { sort: "verdict", descending: false, label: "worst verdict first" },
+  { sort: "reconstruction", descending: true, label: "by reconstruction" },
+  { sort: "reconstruction", descending: false, label: "not reconstructed first" },
+];
 
 export function ListControls({
   filter,
@@ -38,12 +54,16 @@ export function ListControls({
         <option value="kept">kept</option>
         <option value="deleted">deleted</option>
       </select>
-      <select aria-label="Order" value={order} onChange={(event) => onOrder(event.target.value as Order)}>
-        <option value="newest">newest first</option>
-        <option value="oldest">oldest first</option>
-        <option value="name">by name</option>
-        <option value="size">largest first</option>
-        <option value="length">longest first</option>
+      <select
+        aria-label="Order"
+        value={ORDERS.findIndex((one) => one.sort === order.sort && one.descending === order.descending)}
+        onChange={(event) => onOrder(ORDERS[Number(event.target.value)] ?? order)}
+      >
+        {ORDERS.map((one, at) => (
+          <option key={one.label} value={at}>
+            {one.label}
+          </option>
+        ))}
       </select>
     </>
   );

@@ -4,6 +4,7 @@ import type { Timeline } from "../../shared/api/types";
 import { fieldsOf, optionsOf, valuesOf, withOptions } from "../../shared/ui/options";
 import { flicker, joined } from "./series";
 import { thinned } from "./thinned";
+import { withFirst } from "./useListing";
 import { merged } from "../live/Histogram";
 
 const SCHEMA = {
@@ -93,5 +94,23 @@ describe("poses of a file that is sent", () => {
     expect(kept).toEqual(lines.filter((_, at) => at % 3 === 0));
     expect(kept.at(-1)).toBe(lines.at(-1));
     expect(() => thinned("# nothing\n")).toThrow("no poses");
+  });
+});
+
+describe("a new first page of the list", () => {
+  const list = (ids: string[], cursor: string | null, total: number) => ({
+    items: ids.map((id) => ({ id })),
+    cursor,
+    total,
+  });
+
+  it("comes before what was fetched, which stays", () => {
+    const old = list(["e", "d", "c", "b"], "b", 5);
+    expect(withFirst(old, list(["g", "e", "c"], "c", 6))).toEqual(list(["g", "e", "c", "b"], "b", 6));
+  });
+
+  it("replaces a list that it does not meet", () => {
+    const first = list(["i", "h"], "h", 9);
+    expect(withFirst(list(["c", "b"], "b", 5), first)).toBe(first);
   });
 });

@@ -7,11 +7,13 @@ import type {
   CaptureChange,
   CapturePage,
   CaptureRequest,
+  CaptureSort,
   CleanRequest,
   ExportFormat,
   Device,
   Edited,
   Finding,
+  Grade,
   OptionSchema,
   OptionValues,
   PreviewKind,
@@ -92,6 +94,8 @@ export const calibrate = (device_id: string, body: { dark: string | null; flat: 
 export const uploadSchema = async (): Promise<OptionSchema> => await answered(client.GET("/api/v1/options/upload"));
 export const createUpload = (body: UploadRequest): Promise<Upload> =>
   answered(client.POST("/api/v1/uploads", { body, params: { header: idempotent() } }));
+/** Those that have not become captures, newest first. */
+export const uploads = async (): Promise<Upload[]> => (await answered(client.GET("/api/v1/uploads"))).items;
 export const upload = (upload_id: string): Promise<Upload> =>
   answered(client.GET("/api/v1/uploads/{upload_id}", { params: { path: { upload_id } } }));
 export const removeUpload = (upload_id: string): Promise<unknown> =>
@@ -121,6 +125,10 @@ export const captures = (wanted: {
   cursor?: string;
   q?: string;
   deleted?: boolean;
+  keep?: boolean;
+  grade?: Grade;
+  sort?: CaptureSort;
+  descending?: boolean;
 }): Promise<CapturePage> => answered(client.GET("/api/v1/captures", { params: { query: wanted } }));
 export const capture = (id: string): Promise<Capture> =>
   answered(client.GET("/api/v1/captures/{capture_id}", ofCapture(id)));

@@ -21,6 +21,7 @@ export type Calibrated = Schemas["CalibratedOut"];
 export type SourceKind = Schemas["SourceKindOut"];
 export type Sensor = Schemas["SensorOut"];
 export type Capture = Schemas["CaptureOut"];
+export type CaptureSort = Schemas["CaptureSort"];
 export type CapturePage = Schemas["CapturePage"];
 export type CaptureRequest = Schemas["CaptureRequest"];
 export type CaptureChange = Schemas["CaptureChange"];

@@ -71,7 +71,7 @@ it("keeps older and removed captures, and what messages told meanwhile, when it 
   handleMessage(message("job", { ...ends, state: "complete" }));
   handleMessage(message("job", { ...job("z", "e", 0), state: "queued" }));
   handleMessage(message("capture", capture("f")));
-  page.resolve({ items: [capture("e", { state: "complete" }), capture("b")], next_cursor: "more" });
+  page.resolve({ items: [capture("e", { state: "complete" }), capture("b")], next_cursor: "more", total: 9 });
   open.resolve([{ ...ends, state: "running" }]);
   await again;
   const { captures, reconstructions } = useService.getState();

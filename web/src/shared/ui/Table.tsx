@@ -8,7 +8,11 @@ export interface Column {
   number?: boolean;
   /** The name is for screen readers only. */
   hidden?: boolean;
+  /** The head is a button that sorts by the column. */
+  sorting?: { direction: "ascending" | "descending" | "none"; onSort: () => void } | undefined;
 }
+
+const ARROWS = { ascending: " ↑", descending: " ↓", none: "" };
 
 export function Table({
   label,
@@ -30,8 +34,22 @@ export function Table({
         <thead>
           <tr>
             {columns.map((column) => (
-              <th key={column.name} scope="col" className={column.number === true ? "number" : undefined}>
-                {column.hidden === true ? <span className="hidden">{column.name}</span> : column.name}
+              <th
+                key={column.name}
+                scope="col"
+                className={column.number === true ? "number" : undefined}
+                aria-sort={column.sorting?.direction}
+              >
+                {column.hidden === true ? (
+                  <span className="hidden">{column.name}</span>
+                ) : column.sorting === undefined ? (
+                  column.name
+                ) : (
+                  <button type="button" className="bare sorts" onClick={column.sorting.onSort}>
+                    {column.name}
+                    <span aria-hidden="true">{ARROWS[column.sorting.direction]}</span>
+                  </button>
+                )}
               </th>
             ))}
           </tr>

@@ -1,0 +1,157 @@
+/** The captures that the service lists: found, filtered and sorted by it over all of them, fetched page by page. */
+
+import { useEffect, useRef, useState } from "react";
+
+import * as calls from "../../shared/api/calls";
+import type { Capture, CaptureSort, Grade } from "../../shared/api/types";
+import { errorText, useService } from "../../shared/state/store";
+
+const PAGE = 100;
+/** Most that one request may ask for. */
+const MOST = 200;
+const TYPING_MS = 200;
+
+export type Filter = Grade | "" | "kept" | "deleted";
+export interface Order {
+  sort: CaptureSort;
+  descending: boolean;
+}
+
+export interface Listing {
+  /** What was asked for when it was answered; null before the first answer. */
+  listed: Listed | null;
+  problem: string | null;
+  /** Captures that came after the list, where they do not belong at its beginning. */
+  newer: boolean;
+  more: () => void;
+  again: () => void;
+  forget: (id: string) => void;
+}
+
+interface Wanted extends Order {
+  q: string;
+  filter: Filter;
+}
+
+interface Listed extends Wanted {
+  items: Capture[];
+  cursor: string | null;
+  total: number;
+}
+
+const newestOf = (ids: readonly string[]): string => ids.reduce((newest, id) => (id > newest ? id : newest), "");
+
+export function useListing(q: string, filter: Filter, { sort, descending }: Order): Listing {
+  const [listed, setListed] = useState<Listed | null>(null);
+  const [problem, setProblem] = useState<string | null>(null);
+  const [round, setRound] = useState(0);
+  const [busy, setBusy] = useState(false);
+  const newest = useService((state) => newestOf(Object.keys(state.captures)));
+  const [upTo, setUpTo] = useState("");
+  const now = useRef(listed);
+  useEffect(() => {
+    now.current = listed;
+  });
+
+  useEffect(() => {
+    let current = true;
+    const wanted = { q, filter, sort, descending };
+    const fetchAll = async (): Promise<void> => {
+      // The same list, fetched again, is as long as it was.
+      const shown = now.current !== null && isSame(now.current, wanted) ? now.current.items.length : 0;
+      let found = await page(wanted, Math.min(MOST, Math.max(PAGE, shown)));
+      while (found.items.length < shown && found.cursor !== null && current) {
+        const next = await page(wanted, MOST, found.cursor);
+        found = { ...next, items: [...found.items, ...next.items] };
+      }
+      if (!current) return;
+      setListed(found);
+      setUpTo(newestOf(Object.keys(useService.getState().captures)));
+      setProblem(null);
+    };
+    const timer = setTimeout(
+      () => void fetchAll().catch((error: unknown) => current && setProblem(errorText(error))),
+      TYPING_MS,
+    );
+    return () => {
+      current = false;
+      clearTimeout(timer);
+    };
+  }, [q, filter, sort, descending, round]);
+
+  const waits = listed !== null && newest > upTo;
+  const atTheTop = sort === "started" && descending;
+  useEffect(() => {
+    if (!waits || !atTheTop) return;
+    let current = true;
+    page({ q, filter, sort, descending }, PAGE).then(
+      (found) => {
+        if (!current) return;
+        setUpTo(newest);
+        setListed((old) => (old === null || !isSame(old, found) ? found : withFirst(old, found)));
+      },
+      (error: unknown) => current && setProblem(errorText(error)),
+    );
+    return () => {
+      current = false;
+    };
+  }, [waits, atTheTop, newest, q, filter, sort, descending]);
+
+  const more = (): void => {
+    if (busy || listed?.cursor == null) return;
+    const before = listed;
+    setBusy(true);
+    page(before, PAGE, listed.cursor)
+      .then((found) =>
+        setListed((old) =>
+          old === null || !isSame(old, before) || old.cursor !== before.cursor
+            ? old
+            : { ...found, items: [...old.items, ...found.items] },
+        ),
+      )
+      .catch((error: unknown) => setProblem(errorText(error)))
+      .finally(() => setBusy(false));
+  };
+  return {
+    listed,
+    problem,
+    newer: waits && !atTheTop,
+    more,
+    again: () => setRound((n) => n + 1),
+    forget: (id) =>
+      setListed((old) => old && { ...old, total: old.total - 1, items: old.items.filter((one) => one.id !== id) }),
+  };
+}
+
+const isSame = (one: Wanted, other: Wanted): boolean =>
+  one.q === other.q && one.filter === other.filter && one.sort === other.sort && one.descending === other.descending;
+
+async function page(wanted: Wanted, limit: number, cursor?: string): Promise<Listed> {
+  const { q, filter, sort, descending } = wanted;
+  const found = await calls.captures({
+    limit,
+    q,
+    sort,
+    descending,
+    deleted: filter === "deleted",
+    ...(filter === "kept" ? { keep: true } : {}),
+    ...(filter === "good" || filter === "degraded" || filter === "bad" ? { grade: filter } : {}),
+    ...(cursor === undefined ? {} : { cursor }),
+  });
+  return { q, filter, sort, descending, items: found.items, cursor: found.next_cursor, total: found.total };
+}
+
+/** The list with a new first page of it; what follows stays, if the two meet. */
+export function withFirst<T extends { items: { id: string }[]; cursor: string | null; total: number }>(
+  old: T,
+  first: T,
+): T {
+  const ids = new Set(first.items.map((one) => one.id));
+  const last = first.items.at(-1)?.id ?? "";
+  if (!old.items.some((one) => ids.has(one.id))) return first;
+  return {
+    ...old,
+    total: first.total,
+    items: [...first.items, ...old.items.filter((one) => !ids.has(one.id) && one.id < last)],
+  };
+}

@@ -149,3 +149,52 @@ def test_an_upload_goes_on_beside_other_pages(idle: Any, visit: Callable[..., An
     page.get_by_role("button", name="Open").click()
     page.get_by_text("Recording", exact=True).first.wait_for()
     assert newest(idle)["id"] in address(page)
+
+
+def test_an_upload_goes_on_after_a_reload(idle: Any, visit: Callable[..., Any], files: Path, tmp_path: Path) -> None:
+    desk = files / "desk.dat"
+    page = opened(visit, idle)
+    page.route("**/api/v1/uploads/*:complete", lambda route: None)
+    sent = desk.stat().st_size
+    page.route(  # the connection breaks after the first piece
+        "**/api/v1/uploads/*", lambda route: route.abort() if route.request.method == "PATCH" else route.continue_()
+    )
+    choose_files(page, desk, files / "desk.json")
+    page.get_by_role("button", name="Upload", exact=True).last.click()
+    page.get_by_text("It waits and goes on by itself").wait_for()
+    (begun,) = idle.http.get("uploads").json()["items"]
+    half = sent // 2
+    headers = {"content-type": "application/octet-stream", "upload-offset": "0"}
+    answer = idle.http.patch(f"uploads/{begun['id']}", content=desk.read_bytes()[:half], headers=headers)
+    assert answer.status_code == 200, answer.text
+    page.unroute_all(behavior="ignoreErrors")
+    page.reload()
+
+    left = page.locator(".panel:has(h2:text-is('Unfinished uploads')) li")
+    left.wait_for()
+    assert "desk.dat" in left.inner_text()
+    assert violations(page) == []
+    chosen = left.get_by_label("File of desk.dat, to go on")
+    (tmp_path / "desk.dat").write_bytes(b"x" * 10)
+    chosen.set_input_files(tmp_path / "desk.dat")
+    left.get_by_text(f"had {sent} bytes, and now it has 10").wait_for()
+    (tmp_path / "other.dat").write_bytes(desk.read_bytes())
+    chosen.set_input_files(tmp_path / "other.dat")
+    left.get_by_text("this is other.dat").wait_for()
+    chosen.set_input_files(desk)
+    left.wait_for(state="detached")
+    page.get_by_text("Uploaded desk.dat").wait_for()
+    made = newest(idle)
+    assert made["name"] == "desk.dat" and made["recording"]["frames"] == FRAMES
+    stored = idle.http.get(f"captures/{made['id']}/recording").content
+    assert stored == desk.read_bytes()
+    assert idle.http.get("uploads").json()["items"] == []
+
+
+def test_an_unfinished_upload_is_cancelled(idle: Any, visit: Callable[..., Any]) -> None:
+    answer = idle.http.post("uploads", json={"name": "left.dat", "bytes": 1000})
+    assert answer.status_code == 201, answer.text
+    page = visit(f"{idle.address}?page=captures")
+    page.get_by_role("button", name="Cancel the upload of left.dat").click()
+    until(lambda: idle.http.get("uploads").json()["items"] == [], "it is removed")
+    page.get_by_text("Unfinished uploads").wait_for(state="detached")

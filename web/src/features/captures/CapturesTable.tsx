@@ -15,6 +15,7 @@ import { CaptureBadge, Empty, ErrorMessage, JobBadge, JobReason, Loading } from 
 import { type Column, Table } from "../../shared/ui/Table";
 import { DeletedBar, ListControls, SelectionBar } from "./SelectionBar";
 import { removeWithUndo, restored } from "./remove";
+import { UnfinishedUploads } from "./UnfinishedUploads";
 import { UploadPanel } from "./UploadPanel";
 import { type Filter, type Order, useListing } from "./useListing";
 
@@ -71,6 +72,7 @@ export function CapturesTable(): JSX.Element {
           </ActionButton>
         )}
       </header>
+      <UnfinishedUploads />
       {uploads && <UploadPanel onClose={() => setUploads(false)} />}
       {selected.size > 0 && (
         <Bar

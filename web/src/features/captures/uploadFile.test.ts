@@ -16,6 +16,8 @@ const sending = (signal: AbortSignal): Sending => ({
   file: new File(["abc"], "desk.dat"),
   request: { name: "desk.dat", bytes: 3 },
   calibration: null,
+  begun: null,
+  onBegin: () => undefined,
   onProgress: () => undefined,
   onCheck: () => undefined,
   onWait: () => undefined,
@@ -75,4 +77,12 @@ it("is cancelled during a pause, at once", async () => {
   aborting.abort();
   expect(await made).toBe(aborting.signal.reason);
   expect(calls.removeUpload).toHaveBeenCalledWith("u");
+});
+
+it("goes on with an upload that was begun before", async () => {
+  vi.mocked(calls.sendChunk).mockResolvedValue(WHOLE);
+  const begun = { ...EMPTY, offset_bytes: 1 };
+  expect(await uploadFile({ ...sending(new AbortController().signal), begun })).toBe(CAPTURE);
+  expect(calls.createUpload).not.toHaveBeenCalled();
+  expect(vi.mocked(calls.sendChunk).mock.calls[0]?.slice(0, 2)).toEqual(["u", 1]);
 });

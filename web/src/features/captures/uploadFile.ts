@@ -11,8 +11,13 @@ const LONGEST_PAUSE_MS = 30_000;
 
 export interface Sending {
   file: File;
+  /** Of a new upload. */
   request: UploadRequest;
   calibration: File | null;
+  /** One that was begun earlier, to go on with; null: a new one. */
+  begun: Upload | null;
+  /** Told of the upload, before its first piece. */
+  onBegin: (upload: Upload) => void;
   /** Told after each piece. */
   onProgress: (sent: number) => void;
   /** Told when all bytes are there and the service checks them. */
@@ -24,10 +29,11 @@ export interface Sending {
 
 /** The capture that the file has become. An upload that is refused or cancelled is removed again. */
 export async function uploadFile(sending: Sending): Promise<Capture> {
-  const { file, request, calibration, onProgress, onCheck, onWait, signal } = sending;
+  const { file, request, calibration, begun, onBegin, onProgress, onCheck, onWait, signal } = sending;
   const patiently = <T>(ask: (again: boolean) => Promise<T>): Promise<T> => untilAnswered(ask, onWait, signal);
-  let upload = await calls.createUpload(request);
+  let upload = begun ?? (await calls.createUpload(request));
   try {
+    onBegin(upload);
     if (calibration !== null) await patiently(() => calls.sendCalibration(upload.id, calibration));
     while (upload.offset_bytes < upload.bytes) {
       upload = await patiently((again) => sentPiece(upload, file, again, signal));

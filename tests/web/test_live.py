@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from browsing import Studied, choose, finished, until
+from browsing import Studied, choose, finished, until, violations
 from virtual_camera.host import CameraSettings
 from virtual_camera.rig import VirtualCameras
 
@@ -106,6 +106,43 @@ def test_a_capture_without_end_is_stopped(daemon: Callable[..., Any], visit: Cal
     )
     page.get_by_role("button", name="Stop").click()
     page.locator("[data-grade]").wait_for()
+
+
+def test_two_cameras_at_once_are_watched_and_started_apart(
+    daemon: Callable[..., Any], visit: Callable[..., Any]
+) -> None:
+    sources = ["sim:?width=160&height=100&pace=0.05", "sim:?width=96&height=64&pace=0.02"]
+    one = daemon("--device", sources[0], "--device", sources[1], "--no-capture")
+    page = visit(one.address)
+    page.get_by_label("Reconstruct").uncheck()
+    start = page.get_by_role("button", name="Start")
+    for source, name in zip(sources, ("wide", "narrow"), strict=True):
+        page.get_by_label("Device").select_option(source)
+        page.get_by_label("Name", exact=True).fill(name)
+        start.click()
+        until(lambda name=name: name in [c["name"] for c in one.http.get("captures").json()["items"]], "it has begun")
+        until(start.is_disabled, "its camera is in use")
+    running = page.locator(".panel:has(h2:text-is('Captures that run')) li")
+    until(lambda: running.count() == 2, "both are listed")
+    image = page.locator(".picture img")
+    rate = page.locator("dl.stats div:has(dt:text-is('Rate')) dd").first
+    for name, width in (("wide", 160), ("narrow", 96), ("wide", 160)):
+        running.get_by_role("link", name=name, exact=True).click()
+        until(lambda width=width: image.evaluate("image => image.naturalWidth") == width, f"the picture of {name}")
+        until(lambda: re.search(r"\d\s*k?Hz$", rate.inner_text()), "the rate of frames")
+        for _ in range(10):
+            page.wait_for_timeout(100)
+            assert image.evaluate("image => image.naturalWidth") == width, "no picture of the other one"
+        ids = {each["name"]: each["id"] for each in one.http.get("captures").json()["items"]}
+        before = one.http.get(f"captures/{ids[name]}").json()["counters"]["received"]
+        until(lambda before=before: received(page) >= before, f"the frames of {name}")
+        assert received(page) <= one.http.get(f"captures/{ids[name]}").json()["counters"]["received"]
+    assert violations(page) == []
+    page.get_by_role("button", name="Stop").click()
+    until(lambda: running.count() == 1 and "narrow" in running.inner_text(), "the other one goes on")
+    page.locator("[data-grade]").wait_for()
+    page.get_by_label("Device").select_option(sources[0])
+    until(start.is_enabled, "the first camera is free")
 
 
 def test_what_is_not_recorded_leaves_no_file(daemon: Callable[..., Any], visit: Callable[..., Any]) -> None:

@@ -52,7 +52,6 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
   const ofFile = kinds.find((kind) => kind.can_block && kind.takes_path);
   const written = other ?? (ofFile === undefined ? "" : `${ofFile.name}:`);
   const ids = useId();
-  const running = capture !== null && isAcquiring(capture);
   const refining = capture?.state === "finishing";
   const [options, setOptions] = useState<Record<string, string>>({});
   const selected = chosen ?? devices[0]?.source ?? OTHER;
@@ -60,7 +59,13 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
   const kind = kinds.find((one) => isOfKind(source, one));
   const device = devices.find((one) => one.source === selected) ?? null;
   const denied = useDenied("operate");
-  const fixed = running || denied !== null;
+  const text = withOptions(source, options);
+  const inUse = useService((state) =>
+    Object.values(state.captures).some(
+      (one) => isAcquiring(one) && (one.id === device?.capture_id || one.source === text || one.source === source),
+    ),
+  );
+  const fixed = inUse || denied !== null;
 
   const act = async (action: () => Promise<Capture>): Promise<void> => {
     setBusy(true);
@@ -75,7 +80,6 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
   const start = (event: SubmitEvent): void => {
     event.preventDefault();
     adjust({ capture: null, reconstruction: null, frame: null });
-    const text = withOptions(source, options);
     void act(() => startCapture(planOf({ source: text, length, amount, name, record, reconstruct })));
   };
 
@@ -86,7 +90,7 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
         <select
           id={`${ids}-source`}
           value={selected}
-          disabled={fixed}
+          disabled={denied !== null}
           onChange={(event) => {
             setChosen(event.target.value);
             setOptions({});
@@ -193,8 +197,8 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
           <ActionButton
             type="submit"
             className="primary"
-            disabled={running || busy}
-            title={running ? "The device is in use: stop this capture first" : undefined}
+            disabled={inUse || busy}
+            title={inUse ? "The device is in use: stop its capture first" : undefined}
           >
             <Icon name="start" /> Start
           </ActionButton>

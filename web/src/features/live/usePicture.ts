@@ -28,7 +28,7 @@ export function usePicture(
   moment: number | null,
 ): Picture | null {
   const pushed = useService((state) =>
-    state.previewOf === capture?.id && PUSHED.includes(kind) ? state.previews[kind] : undefined,
+    capture !== null && PUSHED.includes(kind) ? state.previews[capture.id]?.[kind] : undefined,
   );
   const [answered, setAnswered] = useState<{ key: string; over: boolean; picture: Picture | null } | null>(null);
   const id = capture?.id ?? null;

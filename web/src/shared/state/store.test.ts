@@ -5,12 +5,14 @@ import type { Capture, Message, Reconstruction } from "../api/types";
 import { ApiError } from "../api/http";
 import { progressText } from "./capture";
 import * as notifying from "./notifying";
+import { poses } from "./poses";
 import {
   isAcquiring,
   newestCapture,
   newestReconstruction,
   handleMessage,
   refresh,
+  storeCapture,
   activeJobs,
   useService,
   errorText,
@@ -94,11 +96,34 @@ it("follows a device that comes and goes", () => {
   expect(useService.getState().devices).toEqual([{ id: "usb0", state: "lost" }]);
 });
 
-it("forgets the pictures of the capture before", () => {
-  handleMessage(message("preview", { kind: "rate", image: "1" }, { capture_id: "a" }));
-  handleMessage(message("preview", { kind: "interval", image: "2" }, { capture_id: "b" }));
-  expect(Object.keys(useService.getState().previews)).toEqual(["interval"]);
-  expect(useService.getState().previewOf).toBe("b");
+it("keeps pictures, poses and rates of cameras that run at the same time apart", () => {
+  const picture = (id: string, image: string): void =>
+    handleMessage(message("preview", { kind: "interval", image }, { capture_id: id }));
+  for (const id of ["m", "n", "o", "a", "b"]) picture(id, id);
+  picture("a", "newer");
+  const { previews } = useService.getState();
+  expect(previews["a"]?.["interval"]?.image).toBe("newer");
+  expect(previews["b"]?.["interval"]?.image).toBe("b");
+  expect(Object.keys(previews)).toEqual(["n", "o", "b", "a"]); // not of all captures of a long day
+
+  for (const frame of [1, 2, 3]) {
+    handleMessage(message("pose", { frame }, { capture_id: "a" }));
+    handleMessage(message("pose", { frame: 10 * frame }, { capture_id: "b" }));
+  }
+  expect(poses.after("a", 1).map((one) => one.frame)).toEqual([2, 3]);
+  expect(poses.newest("b")?.frame).toBe(30);
+
+  const at = (next_frame: number): Capture["counters"] => ({ next_frame }) as Capture["counters"];
+  const clock = vi.spyOn(performance, "now");
+  [0, 1000, 2000].forEach((now, tick) => {
+    clock.mockReturnValue(now);
+    for (const [id, hz] of Object.entries({ a: 20_000, b: 400 }))
+      storeCapture(capture(id, { state: "streaming", counters: at(hz * tick) }));
+  });
+  expect(useService.getState().rates).toEqual({ a: 20_000, b: 400 });
+  storeCapture(capture("a", { state: "complete", counters: at(50_000) }));
+  expect(useService.getState().rates).toEqual({ b: 400 });
+  clock.mockRestore();
 });
 
 it("puts what the service says into sentences for a person", () => {

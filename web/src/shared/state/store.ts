@@ -13,6 +13,8 @@ const NEWEST = 20;
 /** Polling interval of REST without a WebSocket. */
 const POLL_MS = 2000;
 const SYSTEM_MS = 10_000;
+/** Captures whose live pictures are kept. */
+const PICTURED = 4;
 
 export interface ServiceState {
   link: ConnectionState;
@@ -26,14 +28,12 @@ export interface ServiceState {
   captures: Record<string, Capture>;
   reconstructions: Record<string, Reconstruction>;
   system: System | null;
-  /** Newest picture of each kind that came over the socket. */
-  previews: Record<string, Preview>;
-  /** Capture that `previews` show. */
-  previewOf: string | null;
+  /** Newest picture of each kind that came over the socket, by capture; of the last ones that sent some. */
+  previews: Record<string, Record<string, Preview>>;
   /** Newest scene of each reconstruction. */
   scenes: Record<string, SceneEvent>;
-  /** Frames a second, from the counters of the capture that runs. */
-  rateHz: number | null;
+  /** Frames a second, by capture, from the counters of those that run. */
+  rates: Record<string, number>;
 }
 
 export const useService = create<ServiceState>(() => ({
@@ -46,9 +46,8 @@ export const useService = create<ServiceState>(() => ({
   reconstructions: {},
   system: null,
   previews: {},
-  previewOf: null,
   scenes: {},
-  rateHz: null,
+  rates: {},
 }));
 
 const { setState: set, getState: get } = useService;
@@ -83,25 +82,31 @@ export const activeJobs = (jobs: Record<string, Reconstruction>): Reconstruction
     .filter((job) => !isEnded(job))
     .sort((a, b) => (a.queue_place ?? 0) - (b.queue_place ?? 0) || (a.id < b.id ? -1 : 1));
 
-let counted: { id: string; frames: number; atMs: number } | null = null;
+/** Captures whose frames are received, the oldest first. */
+export const acquiringCaptures = (captures: Record<string, Capture>): Capture[] =>
+  Object.values(captures)
+    .filter((one) => one.deleted_at === null && isAcquiring(one))
+    .sort((a, b) => (a.id < b.id ? -1 : 1));
 
-/** The acquisition rate, smoothed over about a second. */
-function measureRate(capture: Capture): number | null {
+const counted = new Map<string, { frames: number; atMs: number }>();
+
+/** The rates with the acquisition rate of a capture, smoothed over about a second; without it while that is not known. */
+function measuredRates(rates: Record<string, number>, capture: Capture): Record<string, number> {
   const frames = capture.counters?.next_frame;
+  const before = counted.get(capture.id);
   if (frames === undefined || capture.state !== "streaming") {
-    counted = null;
-    return null;
+    counted.delete(capture.id);
+    return capture.id in rates ? without(rates, capture.id) : rates;
   }
   const now = performance.now();
-  if (counted === null || counted.id !== capture.id || frames < counted.frames) {
-    counted = { id: capture.id, frames, atMs: now };
-    return null;
+  if (before === undefined || frames < before.frames) {
+    counted.set(capture.id, { frames, atMs: now });
+    return capture.id in rates ? without(rates, capture.id) : rates;
   }
-  const elapsed = (now - counted.atMs) / 1000;
-  if (elapsed < 0.5) return get().rateHz;
-  const rate = (frames - counted.frames) / elapsed;
-  counted = { id: capture.id, frames, atMs: now };
-  return rate;
+  const elapsed = (now - before.atMs) / 1000;
+  if (elapsed < 0.5) return rates;
+  counted.set(capture.id, { frames, atMs: now });
+  return { ...rates, [capture.id]: (frames - before.frames) / elapsed };
 }
 
 /**
@@ -132,10 +137,7 @@ function merged<T extends { id: string }>(
 export function storeCapture(capture: Capture): void {
   set((state) => ({
     captures: { ...state.captures, [capture.id]: capture },
-    rateHz:
-      newestCapture({ ...state.captures, [capture.id]: capture })?.id === capture.id
-        ? measureRate(capture)
-        : state.rateHz,
+    rates: measuredRates(state.rates, capture),
   }));
 }
 
@@ -188,13 +190,14 @@ export function handleMessage(message: Message): void {
       }
       return;
     case "preview":
-      set((state) => ({
-        previews: {
-          ...(state.previewOf === message.capture_id ? state.previews : {}),
-          [message.data.kind]: message.data,
-        },
-        previewOf: message.capture_id,
-      }));
+      if (message.capture_id !== null) {
+        const id = message.capture_id;
+        set(({ previews }) => {
+          const others = Object.entries(without(previews, id)).slice(1 - PICTURED);
+          const own = { ...previews[id], [message.data.kind]: message.data };
+          return { previews: Object.fromEntries([...others, [id, own]]) };
+        });
+      }
       return;
     case "log":
     case "lost":

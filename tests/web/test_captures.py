@@ -47,6 +47,12 @@ def test_a_capture_is_found_and_looked_at(studied: Studied, visit: Callable[...,
     assert studied.capture_id in address(page)
     for plot in ("Pose σ", "χ²", "Loss", "PSNR estimate", "Spike rate", "Flicker"):
         page.locator(f"figure.plot:has(figcaption:has-text('{plot}')) canvas").wait_for()
+    page.get_by_role("radio", name="Work").check()
+    over = page.get_by_role("img", name=re.compile(r"^Loss over seconds of work\. .*From .+ to .+"))
+    over.wait_for()
+    assert page.locator("figure.plot:has(figcaption:has-text('Flicker'))").count() == 0, "light knows no work"
+    page.get_by_role("radio", name="Capture", exact=True).check()
+    page.get_by_role("img", name=re.compile(r"^Loss over time")).wait_for()
     page.get_by_text("No frames are missing").wait_for()
     assert f"steps\n{STEPS}" in page.locator(".panel:has(h2:text-is('Options used'))").inner_text()
     page.locator("summary").filter(has_text="Log").click()

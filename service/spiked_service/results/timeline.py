@@ -31,12 +31,13 @@ _MOMENT = np.dtype(
         *((name, "f8") for name in _MEANS),
         ("psnr_db", "f8"),
         ("splats", "f8"),
+        ("work_s", "f8"),
     ]
 )
 
 Moments = NDArray[Any]
 """Structured array [n]: camera time in seconds since the start of the capture, frame, index into `STATES`, fit of the
-pose, mean spikes per pixel and frame, and figures of the map; NaN where a value is not known."""
+pose, mean spikes per pixel and frame, figures of the map, and seconds of work; NaN where a value is not known."""
 
 
 class Missing(BaseModel):
@@ -58,9 +59,21 @@ class Closure(BaseModel):
     later_s: float
 
 
+class Progress(BaseModel):
+    """The map after so much work, also after the last frame."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    work_s: float
+    loss: float
+    psnr_db: float | None = None
+    splats: int
+
+
 class _Line(BaseModel):
     gap: Missing | None = None
     closure: Closure | None = None
+    progress: Progress | None = None
 
 
 @dataclass
@@ -70,6 +83,8 @@ class Timeline:
     moments: Moments = field(default_factory=lambda: np.zeros(0, _MOMENT))
     gaps: list[Missing] = field(default_factory=list)
     closures: list[Closure] = field(default_factory=list)
+    progress: list[Progress] = field(default_factory=list)
+    """Over the seconds of work."""
 
     @classmethod
     def read(cls, path: Path) -> "Timeline":
@@ -84,10 +99,11 @@ class Timeline:
         rows = []
         for line in lines.splitlines():
             try:
-                if line.startswith((b'{"gap"', b'{"closure"')):
+                if line.startswith((b'{"gap"', b'{"closure"', b'{"progress"')):
                     other = _Line.model_validate_json(line)
                     self.gaps += [other.gap] if other.gap else []
                     self.closures += [other.closure] if other.closure else []
+                    self.progress += [other.progress] if other.progress else []
                 else:
                     rows.append(_moment(orjson.loads(line)))
             except (ValidationError, ValueError, KeyError, TypeError):
@@ -96,14 +112,14 @@ class Timeline:
             self.moments = np.concatenate([self.moments, np.array(rows, _MOMENT)])
 
     def between(self, from_s: float | None, to_s: float | None) -> "Timeline":
-        """What lies in from_s <= time < to_s, with all closures."""
+        """What lies in from_s <= time < to_s, with all closures and all progress."""
         begin, end = -np.inf if from_s is None else from_s, np.inf if to_s is None else to_s
         times = self.moments["time_s"]
         gaps = self.gaps
         if len(times) and times[-1] > 0:
             rate_hz = self.moments["frame"][-1] / times[-1]
             gaps = [one for one in gaps if one.first < end * rate_hz and one.first + one.count > begin * rate_hz]
-        return Timeline(self.moments[(times >= begin) & (times < end)], gaps, self.closures)
+        return Timeline(self.moments[(times >= begin) & (times < end)], gaps, self.closures, self.progress)
 
     def reduced(self, points: int) -> "Timeline":
         """At most `points` moments: the worst state, means, and the last frame and counts of so many neighbours.
@@ -122,7 +138,7 @@ class Timeline:
                 total = np.add.reduceat(np.where(known, moments[name], 0), starts, dtype=np.float64)
                 last[name] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
             moments = last
-        return Timeline(moments, _joined(self.gaps, points), self.closures)
+        return Timeline(moments, _joined(self.gaps, points), self.closures, _some(self.progress, points))
 
     def states_at(self, frames: NDArray[np.int64]) -> NDArray[np.bytes_]:
         """The tracking state at each of the frames [n]; empty if unknown."""
@@ -154,7 +170,7 @@ class Timelines:
             self._known[path] = end + len(whole), (tail + whole)[-_TAIL_BYTES:], timeline
             if len(self._known) > _KEPT:
                 self._known.popitem(last=False)
-            return Timeline(timeline.moments, list(timeline.gaps), list(timeline.closures))
+            return Timeline(timeline.moments, list(timeline.gaps), list(timeline.closures), list(timeline.progress))
 
 
 def known(values: Iterable[float]) -> list[float | None]:
@@ -164,8 +180,14 @@ def known(values: Iterable[float]) -> list[float | None]:
 
 def _moment(line: dict[str, Any]) -> tuple[float | int, ...]:
     state = STATES.index(State(line["state"]))
-    others = (line.get(name) for name in (*_MEANS, "psnr_db", "splats"))
+    others = (line.get(name) for name in (*_MEANS, "psnr_db", "splats", "work_s"))
     return float(line["time_s"]), int(line["frame"]), state, *(np.nan if one is None else float(one) for one in others)
+
+
+def _some(progress: Sequence[Progress], most: int) -> list[Progress]:
+    """At most so many, the last one among them."""
+    step = max(1, -(-len(progress) // most))
+    return list(progress[::-1][::step][::-1])
 
 
 def _joined(gaps: Sequence[Missing], most: int) -> list[Missing]:

@@ -18,8 +18,9 @@ NAME = "timeline.jsonl"
 class TimelineWriter:
     """Starts a timeline; a kill leaves at most one incomplete line. Raises SceneError if the disk is full."""
 
-    def __init__(self, folder: Path, views: int = 0, frames: int = 0) -> None:
-        """Of the timeline in the folder the first `views` moments stay, and gaps before frame `frames`."""
+    def __init__(self, folder: Path, views: int = 0, frames: int = 0, work_s: float = 0.0) -> None:
+        """Of the timeline in the folder the first `views` moments stay, gaps before frame `frames`, and progress up to
+        `work_s`."""
         path = folder / NAME
         lines = path.read_bytes().splitlines(keepends=True) if views and path.exists() else []
         try:
@@ -30,29 +31,32 @@ class TimelineWriter:
         self._states: list[State] = []
         self._closures: set[tuple[float, float]] = set()
         for line in lines:
-            self._keep(line, views, frames)
+            self._keep(line, views, frames, work_s)
 
     @property
     def moments(self) -> int:
         """Number of moments."""
         return len(self._frames)
 
-    def _keep(self, line: bytes, views: int, frames: int) -> None:
+    def _keep(self, line: bytes, views: int, frames: int, work_s: float) -> None:
         try:
             found = json.loads(line)
         except ValueError:
             return  # a kill left it incomplete
         if "closure" in found:
             return  # the reconstructor knows its closed loops, and `closed` adds them again
-        if "gap" in found and found["gap"]["first"] < frames:
+        if "progress" in found:
+            if found["progress"]["work_s"] <= work_s:
+                self._add(found)
+        elif "gap" in found and found["gap"]["first"] < frames:
             self._add(found)
         elif "gap" not in found and len(self._frames) < views:
             self._frames.append(int(found["frame"]))
             self._states.append(State(found["state"]))
             self._add(found)
 
-    def tracked(self, view: Tracked, status: Status, psnr_db: float | None) -> None:
-        """Add a line for a tracked view, with the current figures of the map."""
+    def tracked(self, view: Tracked, status: Status, psnr_db: float | None, work_s: float) -> None:
+        """Add a line for a tracked view, with the current figures of the map and the seconds of work so far."""
         self._frames.append(int(view.time))
         self._states.append(view.state)
         self._add(
@@ -67,8 +71,15 @@ class TimelineWriter:
                 "loss": status.loss,
                 "psnr_db": psnr_db,
                 "splats": status.splats,
+                "work_s": work_s,
             }
         )
+
+    def progress(self, status: Status, psnr_db: float | None, work_s: float) -> None:
+        """Add a line for the map after so much work, if there is a map."""
+        if status.loss is not None:
+            figures = {"work_s": work_s, "loss": status.loss, "psnr_db": psnr_db, "splats": status.splats}
+            self._add({"progress": figures})
 
     def lost(self, first: int, count: int, cause: str) -> None:
         """Add a line for lost frames."""

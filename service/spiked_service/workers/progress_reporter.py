@@ -38,6 +38,8 @@ _PUBLISH_SHARE = 0.1
 """Largest share of the time spent on publishing: trajectories of minutes take seconds to write."""
 _STATUS_S = 0.2
 """Interval of status events, seconds."""
+_PROGRESS_S = 1.0
+"""Interval of the progress of the map in the timeline, seconds of work."""
 
 
 class ProgressReporter:
@@ -55,9 +57,9 @@ class ProgressReporter:
         if not resumed:
             (command.folder / REPORT).unlink(missing_ok=True)
         views = len(reconstructor.views)
-        self._timeline = TimelineWriter(command.folder, views, reconstructor.frames)
+        self._timeline = TimelineWriter(command.folder, views, reconstructor.frames, reconstructor.work_s)
         self._channel = channel
-        self._sent_s = self._published_s = -np.inf
+        self._sent_s = self._published_s = self._noted_s = -np.inf
         self._seen = 0
         self._tracked = self._timeline.moments
         versions = self._publisher.versions if resumed else []
@@ -85,11 +87,12 @@ class ProgressReporter:
             return
         status = self._reconstructor.status()
         for view in new:
-            self._timeline.tracked(view, status, _psnr_db(status.loss))
+            self._timeline.tracked(view, status, _psnr_db(status.loss), self._reconstructor.work_s)
             if view.rotation is not None and view.centre is not None:
                 self._channel.try_send(PoseEstimated(pose=self._pose(view, status, latency_frames)))
 
     def progress(self, status: Status) -> None:
+        self.tracked(None)  # views that the end of the tracking has added
         now_s = time.monotonic()
         if status.state is not self._state:
             _log.info(
@@ -106,7 +109,14 @@ class ProgressReporter:
             self._pause_s = max(_PUBLISH_S, (time.monotonic() - now_s) / _PUBLISH_SHARE)
         if now_s - self._sent_s > _STATUS_S:
             self._timeline.closed(self._reconstructor.closures())
+            self._note_progress(status, _PROGRESS_S)
             self._send_status(status)
+
+    def _note_progress(self, status: Status, least_s: float = 0.0) -> None:
+        work_s = self._reconstructor.work_s
+        if work_s - self._noted_s > least_s:
+            self._noted_s = work_s
+            self._timeline.progress(status, _psnr_db(status.loss), work_s)
 
     def frames_skipped(self, skipped: int) -> None:
         """Publish the live result of a capture that is reconstructed again from its recording."""
@@ -131,6 +141,7 @@ class ProgressReporter:
         self._timeline.closed(self._reconstructor.closures())
         self._least_poses = 0
         status = self._reconstructor.status()
+        self._note_progress(status)
         self._publish(status, tolerance=0.0, every_frame=True)
         shown = self._best(cut_short)
         self._poses = self._poses if shown is None else shown.poses

@@ -278,9 +278,16 @@ def test_not_a_number_is_refused(service: Any, job: str) -> None:
 
 def test_a_timeline_and_a_log(service: Any, job: str) -> None:
     timeline = service.client.timeline(job)
-    lengths = {len(values) for name, values in timeline.model_dump().items() if name not in ("gaps", "closures")}
+    lengths = {
+        len(values) for name, values in timeline.model_dump().items() if name not in ("gaps", "closures", "work")
+    }
     assert lengths == {len(timeline.frame)} and len(timeline.frame) > 5
+    work = timeline.work
+    assert len(work.work_s) == len(work.loss) == len(work.psnr_db) == len(work.splats) >= 1
+    assert work.work_s == sorted(work.work_s) and timeline.work_s == sorted(timeline.work_s)
+    assert work.work_s[-1] > timeline.work_s[-1], "the refinement follows the last view"
     coarse = service.client.timeline(job, points=3)
+    assert len(coarse.work.work_s) <= 3 and coarse.work.work_s[-1] == work.work_s[-1]
     assert len(coarse.frame) <= 3 and coarse.frame[-1] == timeline.frame[-1]
     part = service.client.timeline(job, from_s=timeline.time_s[2], to_s=timeline.time_s[4])
     assert part.frame == timeline.frame[2:4]

@@ -24,6 +24,7 @@ from spiked_service.api.schemas.reconstructions import (
     TimelineOut,
     VersionOut,
     VersionsOut,
+    WorkOut,
 )
 from spiked_service.api.sources import Sources
 from spiked_service.captures.camera_profiles import CameraProfiles
@@ -178,12 +179,18 @@ def reconstruction_record_routes(rows: ReconstructionRepository, route_class: ty
 
 def _timeline(timeline: Timeline) -> TimelineOut:
     moments = timeline.moments
-    values = {name: known(moments[name].tolist()) for name in ("chi2", "sigma_px", "rate", "loss", "psnr_db")}
+    values = {name: known(moments[name].tolist()) for name in ("chi2", "sigma_px", "rate", "loss", "psnr_db", "work_s")}
     return TimelineOut(
         time_s=moments["time_s"].tolist(),
         frame=moments["frame"].tolist(),
         state=[STATES[one] for one in moments["state"]],
         splats=[None if one is None else int(one) for one in known(moments["splats"].tolist())],
+        work=WorkOut(
+            work_s=[one.work_s for one in timeline.progress],
+            loss=[one.loss for one in timeline.progress],
+            psnr_db=[one.psnr_db for one in timeline.progress],
+            splats=[one.splats for one in timeline.progress],
+        ),
         gaps=[GapOut(first=gap.first, count=gap.count, cause=gap.cause) for gap in timeline.gaps],
         closures=[ClosureOut(earlier_s=one.earlier_s, later_s=one.later_s) for one in timeline.closures],
         **values,

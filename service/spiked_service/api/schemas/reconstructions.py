@@ -323,6 +323,15 @@ class ClosureOut(Out):
     later_s: float
 
 
+class WorkOut(Out):
+    """The map over the seconds of work, after the last frame, too; arrays of the same length."""
+
+    work_s: list[float]
+    loss: list[float]
+    psnr_db: list[float | None]
+    splats: list[int]
+
+
 class TimelineOut(Out):
     """How a reconstruction went, arrays of the same length; null where a value is not known."""
 
@@ -335,5 +344,7 @@ class TimelineOut(Out):
     loss: list[float | None]
     psnr_db: list[float | None]
     splats: list[int | None]
+    work_s: list[float | None] = Field(description="Seconds of work when the view was tracked.")
+    work: WorkOut
     gaps: list[GapOut]
     closures: list[ClosureOut] = Field(description="In the order in which they were closed.")

@@ -7,7 +7,7 @@ import uPlot from "uplot";
 
 import type { Gap } from "../../shared/api/types";
 import { colour, useDark } from "../../shared/state/theme";
-import type { Column } from "./series";
+import type { Axis, Column } from "./series";
 
 const HEIGHT = 112;
 const SYNC = uPlot.sync("captures");
@@ -28,12 +28,13 @@ export interface PlotProps {
   names: readonly string[];
   /** Seconds, begin and end of what is missing. */
   gaps: readonly [number, number][];
+  axis: Axis;
 }
 
 export const gapSpans = (gaps: readonly Gap[], frameRateHz: number): [number, number][] =>
   gaps.map((gap) => [gap.first / frameRateHz, (gap.first + gap.count) / frameRateHz]);
 
-export function Plot({ title, unit, hint, log, data, names, gaps }: PlotProps): JSX.Element {
+export function Plot({ title, unit, hint, log, data, names, gaps, axis: over }: PlotProps): JSX.Element {
   const box = useRef<HTMLDivElement>(null);
   const dark = useDark();
   useEffect(() => {
@@ -50,7 +51,7 @@ export function Plot({ title, unit, hint, log, data, names, gaps }: PlotProps): 
         // eslint-disable-next-line @typescript-eslint/no-unsafe-enum-assignment -- see LINEAR
         scales: { x: { time: false }, y: { distr: log ? LOGARITHMIC : LINEAR } },
         axes: [
-          { ...axis, size: 24, values: (_, ticks) => ticks.map((t) => `${Number((1000 * t).toPrecision(6))} ms`) },
+          { ...axis, size: 24, values: (_, ticks) => ticks.map(over === "work" ? seconds : milliseconds) },
           {
             ...axis,
             size: 58,
@@ -61,7 +62,15 @@ export function Plot({ title, unit, hint, log, data, names, gaps }: PlotProps): 
           },
         ],
         series: [
-          { label: "t", value: (_, t) => ((t as number | null) === null ? "–" : `${(1000 * t).toFixed(2)} ms`) },
+          {
+            label: "t",
+            value: (_, t) =>
+              (t as number | null) === null
+                ? "–"
+                : over === "work"
+                  ? `${t.toFixed(1)} s`
+                  : `${(1000 * t).toFixed(2)} ms`,
+          },
           ...names.map((name, i) => ({
             label: name,
             stroke: strokes[i] ?? colour("ink"),
@@ -91,18 +100,24 @@ export function Plot({ title, unit, hint, log, data, names, gaps }: PlotProps): 
       SYNC.unsub(plot);
       plot.destroy();
     };
-  }, [data, names, gaps, log, unit, dark]);
+  }, [data, names, gaps, log, unit, dark, over]);
   return (
     <figure className="plot">
       <figcaption title={hint}>
         {title} {unit !== "" && <span className="dim">{unit}</span>}
       </figcaption>
-      <div ref={box} role="img" aria-label={`${title} over time. ${hint}. ${summary(data[1] ?? [], unit)}`} />
+      <div
+        ref={box}
+        role="img"
+        aria-label={`${title} over ${over === "work" ? "seconds of work" : "time"}. ${hint}. ${summary(data[1] ?? [], unit)}`}
+      />
     </figure>
   );
 }
 
 const known = (column: Column): number => column.filter((value) => value !== null).length;
+const milliseconds = (t: number): string => `${Number((1000 * t).toPrecision(6))} ms`;
+const seconds = (t: number): string => `${Number(t.toPrecision(6))} s`;
 const isPower = (x: number): boolean => Math.abs(Math.log10(x) - Math.round(Math.log10(x))) < 1e-6;
 
 const short = (x: number): string =>

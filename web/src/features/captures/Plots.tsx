@@ -1,16 +1,24 @@
-/** Plots of a reconstruction over capture time, optionally compared with another. */
+/** Plots of a reconstruction over capture time or over its work, optionally compared with another. */
 
-import { type JSX, useEffect, useMemo } from "react";
+import { type JSX, useEffect, useMemo, useState } from "react";
 
 import { timeline as fetchTimeline } from "../../shared/api/calls";
 import type { Capture, Reconstruction, Timeline } from "../../shared/api/types";
 import { isEnded } from "../../shared/state/store";
 import { useFetch } from "../../shared/state/useFetch";
-import { Empty, Loading, Panel, ErrorMessage } from "../../shared/ui/parts";
+import { Empty, Loading, Panel, ErrorMessage, Segmented } from "../../shared/ui/parts";
 import { gapSpans, Plot, type PlotProps } from "./Plot";
-import { type Column, flicker, isKnown, joined, PLOTS } from "./series";
+import { along, type Axis, type Column, flicker, hasWork, isKnown, joined, PLOTS } from "./series";
 
 const LIVE_MS = 2000;
+const AXES: readonly { value: Axis; label: string; hint: string }[] = [
+  { value: "capture", label: "Capture", hint: "Time of the capture" },
+  {
+    value: "work",
+    label: "Work",
+    hint: "Seconds that the reconstruction worked, the refinement after the last frame, too",
+  },
+];
 /** Points of a plot: several for each pixel, so that zooming in shows more. */
 const POINTS = 5000;
 
@@ -38,15 +46,22 @@ export function Plots({
     };
   }, [ended, again]);
 
+  const [axis, setAxis] = useState<Axis>("capture");
   const rateHz = capture.sensor?.frame_rate_hz ?? null;
   const ownName = nameOf(job);
   const otherName = other === null ? "" : nameOf(other);
   const plots = useMemo(
-    () => (own.value === null ? [] : plotsOf(own.value, ownName, beside.value, otherName, rateHz)),
-    [own.value, beside.value, ownName, otherName, rateHz],
+    () => (own.value === null ? [] : plotsOf(own.value, ownName, beside.value, otherName, rateHz, axis)),
+    [own.value, beside.value, ownName, otherName, rateHz, axis],
   );
   return (
-    <Panel title="Over time">
+    <Panel
+      title="Over time"
+      aside={
+        own.value !== null &&
+        hasWork(own.value) && <Segmented label="Plotted over" value={axis} choices={AXES} onChange={setAxis} />
+      }
+    >
       {own.problem !== null && <ErrorMessage text={own.problem} again={own.again} />}
       {own.value === null && own.loading && <Loading what="the timeline" />}
       {own.value !== null && plots.length === 0 && <Empty icon="live" title="No measurements yet" />}
@@ -66,15 +81,16 @@ function plotsOf(
   beside: Timeline | null,
   besideName: string,
   rateHz: number | null,
+  axis: Axis,
 ): PlotProps[] {
-  const gaps = rateHz === null ? [] : gapSpans(own.gaps, rateHz);
+  const gaps = rateHz === null || axis === "work" ? [] : gapSpans(own.gaps, rateHz);
   const plot = (
     spec: { title: string; unit: string; hint: string; log: boolean },
-    of: (timeline: Timeline) => Column,
+    of: (timeline: Timeline) => [number[], Column],
   ): PlotProps[] => {
-    const first = of(own);
+    const [times, first] = of(own);
     if (!isKnown(first)) return [];
-    const second = beside === null ? null : of(beside);
+    const [otherTimes, second] = beside === null ? [[], null] : of(beside);
     const compared = second !== null && isKnown(second);
     return [
       {
@@ -84,21 +100,24 @@ function plotsOf(
         log: spec.log,
         gaps,
         names: compared ? [ownName, besideName] : [spec.title],
-        data: compared ? joined([own.time_s, beside?.time_s ?? []], [first, second]) : [own.time_s, first],
+        axis,
+        data: compared ? joined([times, otherTimes], [first, second]) : [times, first],
       },
     ];
   };
   return [
-    ...PLOTS.flatMap((spec) => plot(spec, (timeline) => timeline[spec.key])),
-    ...plot(
-      {
-        title: "Flicker",
-        unit: "%",
-        log: false,
-        hint: "Deviation of the spike rate from its mean over 10 ms, in percent",
-      },
-      flicker,
-    ),
+    ...PLOTS.flatMap((spec) => plot(spec, (timeline) => along(timeline, spec.key, axis))),
+    ...(axis === "work"
+      ? []
+      : plot(
+          {
+            title: "Flicker",
+            unit: "%",
+            log: false,
+            hint: "Deviation of the spike rate from its mean over 10 ms, in percent",
+          },
+          (timeline) => [timeline.time_s, flicker(timeline)],
+        )),
   ];
 }
 

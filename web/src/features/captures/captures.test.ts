@@ -2,7 +2,7 @@ import { describe, expect, it } from "vitest";
 
 import type { Timeline } from "../../shared/api/types";
 import { fieldsOf, optionsOf, valuesOf, withOptions } from "../../shared/ui/options";
-import { flicker, joined } from "./series";
+import { along, flicker, hasWork, joined } from "./series";
 import { thinned } from "./thinned";
 import { withFirst } from "./useListing";
 import { merged } from "../live/Histogram";
@@ -112,5 +112,33 @@ describe("a new first page of the list", () => {
   it("replaces a list that it does not meet", () => {
     const first = list(["i", "h"], "h", 9);
     expect(withFirst(list(["c", "b"], "b", 5), first)).toBe(first);
+  });
+});
+
+describe("plots over seconds of work", () => {
+  const timeline = {
+    time_s: [0.1, 0.2, 0.3],
+    work_s: [null, 2, 3],
+    chi2: [1, 2, 3],
+    loss: [0.3, 0.2, 0.1],
+    work: { work_s: [2, 3, 9], loss: [0.3, 0.2, 0.01], psnr_db: [5, 7, 20], splats: [1, 2, 3] },
+  } as unknown as Timeline;
+
+  it("show the map after the last frame, and views where their work is known", () => {
+    expect(along(timeline, "loss", "capture")).toEqual([timeline.time_s, timeline.loss]);
+    expect(along(timeline, "loss", "work")).toEqual([
+      [2, 3, 9],
+      [0.3, 0.2, 0.01],
+    ]);
+    expect(along(timeline, "chi2", "work")).toEqual([
+      [2, 3],
+      [2, 3],
+    ]);
+  });
+
+  it("are not offered where no work was noted", () => {
+    expect(hasWork(timeline)).toBe(true);
+    const old = { work_s: [null, null], work: { work_s: [] } } as unknown as Timeline;
+    expect(hasWork(old)).toBe(false);
   });
 });

@@ -38,6 +38,21 @@ export const PLOTS: readonly PlotSpec[] = [
 
 export type Column = (number | null)[];
 
+/** What plots are over: the time of the capture, or the seconds that the reconstruction worked. */
+export type Axis = "capture" | "work";
+
+/** A series over one of the axes; the map goes on after the last frame, which only work shows. */
+export function along(timeline: Timeline, key: PlotSpec["key"], axis: Axis): [number[], Column] {
+  if (axis === "capture") return [timeline.time_s, timeline[key]];
+  if (key === "loss" || key === "psnr_db") return [timeline.work.work_s, timeline.work[key]];
+  const known = timeline.work_s.flatMap((work, row) => (work === null ? [] : [[work, row] as const]));
+  return [known.map(([work]) => work), known.map(([, row]) => timeline[key][row] ?? null)];
+}
+
+/** Whether the work was noted, which releases before this one did not. */
+export const hasWork = (timeline: Timeline): boolean =>
+  timeline.work.work_s.length > 0 || timeline.work_s.some((work) => work !== null);
+
 /** Two timelines on one time axis: the sorted times of both, and the values of each, null where it has none. */
 export function joined(times: readonly (readonly number[])[], values: readonly Column[]): [number[], ...Column[]] {
   const all = [...new Set(times.flat())].sort((a, b) => a - b);

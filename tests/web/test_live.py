@@ -162,6 +162,30 @@ def test_what_is_not_recorded_leaves_no_file(daemon: Callable[..., Any], visit: 
     assert finished(one.http, capture["id"])["recording"] is None
 
 
+def test_a_picture_that_is_on_its_way_is_not_called_missing(
+    daemon: Callable[..., Any], visit: Callable[..., Any]
+) -> None:
+    one = daemon("--device", "sim:?width=160&height=100", "--no-capture")
+    plan = {"source": "sim:?width=160&height=100", "frames": 100, "reconstruct": False}
+    finished(one.http, one.http.post("captures", json=plan).json()["id"])
+    page = visit("about:blank")
+    held: list[Any] = []
+
+    def hold(route: Any) -> None:
+        held.append(route)
+
+    page.route("**/preview?*", hold)
+    page.goto(one.address)
+    page.get_by_text("Loading the picture").wait_for()
+    assert page.get_by_text("It was not recorded").count() == 0
+    until(lambda: held or page.wait_for_timeout(100), "it is asked for")
+    for route in held:
+        route.continue_()
+    page.unroute_all(behavior="ignoreErrors")
+    page.locator(".picture img").wait_for()
+    assert page.get_by_text("Loading the picture").count() == 0
+
+
 def test_what_is_refused_is_said(daemon: Callable[..., Any], visit: Callable[..., Any]) -> None:
     page = visit(daemon("--device", "sim:", "--no-capture").address)
     page.get_by_label("Device").select_option(label="Another source…")

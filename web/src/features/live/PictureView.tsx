@@ -7,7 +7,7 @@ import type { Capture, PreviewKind, Stats } from "../../shared/api/types";
 import { count } from "../../shared/state/format";
 import { isFinished } from "../../shared/state/store";
 import { Icon } from "../../shared/ui/icons";
-import { Empty, Segmented } from "../../shared/ui/parts";
+import { Empty, Loading, Segmented } from "../../shared/ui/parts";
 import { SETTLED_MS } from "./asking";
 import { Histogram } from "./Histogram";
 import { RegionOverlay, RegionPanel } from "./RegionTool";
@@ -95,7 +95,9 @@ export function PictureView({ capture }: { capture: Capture | null }): JSX.Eleme
         </label>
       </header>
       <div className="frame">
-        {picture === null ? (
+        {picture === undefined && capture !== null && isFinished(capture) && capture.state !== "failed" ? (
+          <Loading what="the picture" />
+        ) : picture == null ? (
           <NoPicture capture={capture} kind={kind} moment={moment} />
         ) : (
           <div className="stack">
@@ -128,7 +130,7 @@ export function PictureView({ capture }: { capture: Capture | null }): JSX.Eleme
           onFrame={(frame) => setMoment({ id: capture.id, frame })}
         />
       )}
-      {capture !== null && sensor !== null && picture !== null && (
+      {capture !== null && sensor !== null && picture != null && (
         <RegionPanel
           capture={capture.id}
           sensor={sensor}

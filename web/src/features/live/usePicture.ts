@@ -20,13 +20,16 @@ const PERIOD_MS = 300;
 /** Kinds sent over the WebSocket; others are rendered on request. */
 const PUSHED: readonly PreviewKind[] = ["interval", "rate"];
 
-/** `moment`: the frame to show of a capture that has ended; null: its middle. */
+/**
+ * `moment`: the frame to show of a capture that has ended; null: its middle. Returns null where there is no picture, and
+ * undefined until that is known.
+ */
 export function usePicture(
   capture: Capture | null,
   kind: PreviewKind,
   gain: number,
   moment: number | null,
-): Picture | null {
+): Picture | null | undefined {
   const pushed = useService((state) =>
     capture !== null && PUSHED.includes(kind) ? state.previews[capture.id]?.[kind] : undefined,
   );
@@ -78,6 +81,6 @@ export function usePicture(
   // Until the first stored picture has come, the last live one stays.
   const fresh = answered?.key === key && (answered.over === over || pushed === undefined);
   if (!served && fresh) return answered.picture;
-  if (pushed === undefined) return null;
+  if (pushed === undefined) return undefined;
   return { url: `data:image/webp;base64,${pushed.image}`, frame: pushed.frame, gained: false };
 }

@@ -31,6 +31,20 @@ class BitOrder(StrEnum):
     msb = "msb"
 
 
+class BoardScaleRequest(BaseModel):
+    """
+    A ChArUco board of known size.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    revision: Annotated[int, Field(description="The one that this replaces; 409 if it is not.")]
+    board: Annotated[str, Field(description="Squares of the board, COLUMNSxROWS.")]
+    square_m: Annotated[float, Field(description="Side of a square.")]
+    dictionary: Annotated[str, Field(description="Markers of the board: one of OpenCV's sets.")] = "4x4_100"
+
+
 class BoxModel(BaseModel):
     """
     A box along the axes of the scene, in its unit.
@@ -132,6 +146,19 @@ class CaptureChange(BaseModel):
     metadata: dict[Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.:/-]{1,64}$")], str] | None = None
 
 
+class CaptureSort(StrEnum):
+    """
+    By what captures are listed.
+    """
+
+    started = "started"
+    name = "name"
+    length = "length"
+    size = "size"
+    verdict = "verdict"
+    reconstruction = "reconstruction"
+
+
 class CaptureState(StrEnum):
     """
     State of a capture.
@@ -194,10 +221,10 @@ class DiskOut(BaseModel):
     recording_s: Annotated[
         float,
         Field(
-            description="How long a recording there is room for, of the camera that runs at the rate that it states, or of a USB camera if none runs."
+            description="How long a recording there is room for, of the cameras that run at the rates that they state, or of a USB camera if none runs; `GET doctor` says the same."
         ),
     ]
-    recording_of: Annotated[str, Field(description="That camera.")]
+    recording_of: Annotated[str, Field(description="These cameras.")]
 
 
 class EditedOut(BaseModel):
@@ -465,6 +492,18 @@ class Mosaic(StrEnum):
     GBRG = "GBRG"
 
 
+class MosaicChoice(StrEnum):
+    """
+    A mosaic, or detection from the pixels.
+    """
+
+    auto = "auto"
+    RGGB = "RGGB"
+    BGGR = "BGGR"
+    GRBG = "GRBG"
+    GBRG = "GBRG"
+
+
 class NoiseModel(BaseModel):
     """
     Noise, defects and light of the simulated camera `sim:`; it wins over the options of the source's text.
@@ -704,6 +743,10 @@ class PointOut(BaseModel):
         float | None,
         Field(description="The same in metres; null while the scale is not known."),
     ]
+    depth_m_sigma: Annotated[
+        float | None,
+        Field(description="Standard deviation of depth_m by that of the scale alone; null: not known."),
+    ]
     position: Annotated[
         list[float] | None,
         Field(description="Of the surface, in the axes of the scene; null as depth."),
@@ -860,6 +903,10 @@ class ScaleRequest(BaseModel):
         extra="ignore",
     )
     revision: Annotated[int, Field(description="The one that this replaces; 409 if it is not.")]
+    version: Annotated[
+        int | None,
+        Field(description="Version that it was measured in; 409 for one of an earlier run. Default: the newest."),
+    ] = None
     metres_per_unit: float | None = None
     sigma: Annotated[float | None, Field(description="Relative standard deviation, if known.")] = None
     up: Annotated[list[float] | None, Field(description="Of any length but zero.")] = None
@@ -872,6 +919,8 @@ class ScaleSource(StrEnum):
 
     length = "length"
     tag = "tag"
+    board = "board"
+    baseline = "baseline"
 
 
 class SceneFormat(StrEnum):
@@ -919,7 +968,33 @@ class SettingOut(BaseModel):
         bool,
         Field(description="Whether `configuration:reload` brings a new value into effect."),
     ]
+    editable: Annotated[
+        bool,
+        Field(description="Whether `PATCH configuration` changes it; others are changed in the file."),
+    ]
+    option: Annotated[
+        dict[str, Any],
+        Field(description="JSON Schema: type, limits, default, meaning."),
+    ]
     doc: str
+
+
+class SettingsChange(BaseModel):
+    """
+    New values of settings.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    values: Annotated[
+        dict[str, bool | int | float | str | None],
+        Field(
+            description="By the names of `GET configuration`; null removes a setting from the file: its default.",
+            max_length=64,
+            min_length=1,
+        ),
+    ]
 
 
 class SettingsOut(BaseModel):
@@ -931,6 +1006,15 @@ class SettingsOut(BaseModel):
         extra="ignore",
     )
     items: list[SettingOut]
+    file: Annotated[str, Field(description="The file that `PATCH configuration` changes.")]
+    needs_restart: Annotated[
+        list[str],
+        Field(description="Settings whose value in the file takes effect after a restart."),
+    ]
+    problem: Annotated[
+        str | None,
+        Field(description="Why the file as it is now cannot be loaded; null if it can be."),
+    ]
 
 
 class SimilarityOut(BaseModel):
@@ -1071,27 +1155,6 @@ class Task(StrEnum):
     localise = "localise"
 
 
-class TimelineOut(BaseModel):
-    """
-    How a reconstruction went, arrays of the same length; null where a value is not known.
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    time_s: Annotated[list[float], Field(description="Since the start of the capture.")]
-    frame: list[int]
-    state: list[State]
-    chi2: list[float | None]
-    sigma_px: list[float | None]
-    rate: Annotated[list[float | None], Field(description="Mean spikes a pixel and frame.")]
-    loss: list[float | None]
-    psnr_db: list[float | None]
-    splats: list[int | None]
-    gaps: list[GapOut]
-    closures: Annotated[list[ClosureOut], Field(description="In the order in which they were closed.")]
-
-
 class TokenOut(BaseModel):
     """
     A token, without its secret.
@@ -1107,6 +1170,26 @@ class TokenOut(BaseModel):
         Scope,
         Field(description="read: look and download; operate: change captures, too; admin: set-up, too."),
     ]
+    created_by: Annotated[
+        str | None,
+        Field(description="The token that it was created with; null: by `spiked token`."),
+    ]
+
+
+class TokenRequest(BaseModel):
+    """
+    A token to be made.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    name: Annotated[str, Field(description="Of its user or device.")]
+    scope: Scope
+    days: Annotated[
+        float | None,
+        Field(description="Until it expires; null: when the token of this request does, if that expires."),
+    ] = None
 
 
 class TokensOut(BaseModel):
@@ -1152,6 +1235,26 @@ class TrajectoryOut(BaseModel):
         list[State | None],
         Field(description="State of the tracking then; null where it is not known."),
     ]
+
+
+class UpRequest(BaseModel):
+    """
+    What up is found by: gravity at a frame, points of the floor, or neither: the floor is found.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    revision: Annotated[int, Field(description="The one that this replaces; 409 if it is not.")]
+    gravity: Annotated[
+        list[float] | None,
+        Field(description="In the axes of the camera: x right, y down, z forward."),
+    ] = None
+    frame: Annotated[
+        int | None,
+        Field(description="Of gravity: the pose nearest to it is used. Default: the first."),
+    ] = None
+    points: Annotated[list[list[float]] | None, Field(description="Of the floor, in the scene.")] = None
 
 
 class UploadOut(BaseModel):
@@ -1238,32 +1341,18 @@ class VerdictOut(BaseModel):
     reasons: Annotated[list[str], Field(description="Why it is not good, the worst first.")]
 
 
-class VersionOut(BaseModel):
+class WorkOut(BaseModel):
     """
-    A published version of a scene and its trajectory.
-    """
-
-    model_config = ConfigDict(
-        extra="ignore",
-    )
-    version: int
-    at: AwareDatetime
-    splats: int
-    poses: int
-    white: float
-    scene_bytes: Annotated[int, Field(description="Size of the PLY file.")]
-    psnr_db: float | None
-
-
-class VersionsOut(BaseModel):
-    """
-    The versions that are kept, oldest first.
+    The map over the seconds of work, after the last frame, too; arrays of the same length.
     """
 
     model_config = ConfigDict(
         extra="ignore",
     )
-    items: list[VersionOut]
+    work_s: list[float]
+    loss: list[float]
+    psnr_db: list[float | None]
+    splats: list[int]
 
 
 class ZmqOut(BaseModel):
@@ -1522,6 +1611,31 @@ class LocaliseRequest(BaseModel):
     priority: Annotated[int, Field(description="Higher ones run earlier; live captures go before all.")] = 0
 
 
+class NewTokenOut(BaseModel):
+    """
+    A new token.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    name: str
+    created_at: AwareDatetime
+    expires_at: AwareDatetime | None
+    scope: Annotated[
+        Scope,
+        Field(description="read: look and download; operate: change captures, too; admin: set-up, too."),
+    ]
+    created_by: Annotated[
+        str | None,
+        Field(description="The token that it was created with; null: by `spiked token`."),
+    ]
+    secret: Annotated[
+        str,
+        Field(description="The token itself, which is not shown again: only its hash is kept."),
+    ]
+
+
 class ProfileModel(BaseModel):
     """
     What is known of one camera; options of a source or request win over it.
@@ -1587,7 +1701,16 @@ class ReconstructionOptions(BaseModel):
     model_config = ConfigDict(
         extra="ignore",
     )
-    steps: Annotated[int, Field(description="Gradient steps of the refinement after the last frame.")] = 2000
+    seconds: Annotated[
+        float | None,
+        Field(
+            description="Time budget in seconds of work: reduces the steps, and at last the frames that are read; of a live reconstruction it is that of the refinement. Without it all steps are done."
+        ),
+    ] = None
+    steps: Annotated[
+        int,
+        Field(description="Gradient steps of the refinement after the last frame; its time grows with them."),
+    ] = 2000
     seed: Annotated[int, Field(description="Same input, options and seed: same result.")] = 0
     window_frames: Annotated[
         int | None,
@@ -1598,6 +1721,12 @@ class ReconstructionOptions(BaseModel):
         Field(description="Threads of the rasteriser; all cores if not given."),
     ] = None
     max_views: Annotated[int, Field(description="Views kept for mapping; beyond it older ones thin out.")] = 400
+    most_splats: Annotated[
+        int,
+        Field(
+            description="Most splats of the map, which has no more than follow from the size of the picture. Ten times as many make a step about five times as long."
+        ),
+    ] = 250000
     memory_mb: Annotated[
         int,
         Field(description="MiB of images held in memory; the others are built anew from the recording."),
@@ -1624,6 +1753,22 @@ class ReconstructionOptions(BaseModel):
     intrinsics: Annotated[
         IntrinsicsOption | None,
         Field(description="Optics, where neither the capture nor its recording says them, or to overrule them."),
+    ] = None
+    fov: Annotated[
+        float | None,
+        Field(
+            description="The same as a horizontal field of view in degrees of square pixels; a distortion that is known stays. Without any optics they are estimated."
+        ),
+    ] = None
+    mosaic: Annotated[
+        MosaicChoice | None,
+        Field(
+            description="Colour mosaic of the upright image, where the recording states another or none; auto: detect it from the pixels of the recording."
+        ),
+    ] = None
+    flipped: Annotated[
+        bool | None,
+        Field(description="Rows come bottom-up; false: top-down; as the recording states if not given."),
     ] = None
 
 
@@ -1672,6 +1817,14 @@ class ReconstructionOut(BaseModel):
     ]
     priority: int
     options: ReconstructionOptions
+    poses_from: Annotated[
+        str,
+        Field(description="Given poses: the id of their reconstruction, or `file`; empty: estimated."),
+    ]
+    calibration_from: Annotated[
+        str,
+        Field(description="Device of its calibration; empty: that of the recording, if any."),
+    ]
     created_at: AwareDatetime
     started_at: AwareDatetime | None
     ended_at: AwareDatetime | None
@@ -1733,6 +1886,20 @@ class ReconstructionRequest(BaseModel):
         Field(
             description="A finished reconstruction of the same place: its map is extended by the recording, and the result is in its frame of reference."
         ),
+    ] = None
+    poses: Annotated[
+        str | None,
+        Field(
+            description="Known camera-to-world poses as the text of a TUM file, in seconds since the start of the capture: the map is fitted to them, and they are not changed. Poses between them are interpolated."
+        ),
+    ] = None
+    poses_of: Annotated[
+        str | None,
+        Field(description="Another reconstruction of the capture, whose newest path is taken as known poses."),
+    ] = None
+    calibration_of: Annotated[
+        str | None,
+        Field(description="A device whose calibration corrects the rates, instead of that of the recording."),
     ] = None
 
 
@@ -1813,13 +1980,19 @@ class ScaleOut(BaseModel):
     ]
     source: Annotated[
         ScaleSource | None,
-        Field(description="What the scale rests on: a known length, or AprilTags."),
+        Field(description="What the scale rests on: a known length, AprilTags, a board, or two cameras."),
     ]
     up: Annotated[
         list[float] | None,
         Field(description="Direction in the scene, of length 1; null: -y is taken for up."),
     ]
     version: Annotated[int | None, Field(description="Version of the scene that it was measured in.")]
+    since: Annotated[
+        int,
+        Field(
+            description="Versions up to this one are of an earlier run, whose unit of length is another one: the scale is not theirs, and cannot be measured in them."
+        ),
+    ]
 
 
 class SensorOut(BaseModel):
@@ -1919,6 +2092,32 @@ class TagScaleOut(BaseModel):
     tags: list[FoundTagOut]
 
 
+class TimelineOut(BaseModel):
+    """
+    How a reconstruction went, arrays of the same length; null where a value is not known.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    time_s: Annotated[list[float], Field(description="Since the start of the capture.")]
+    frame: list[int]
+    state: list[State]
+    chi2: list[float | None]
+    sigma_px: list[float | None]
+    rate: Annotated[list[float | None], Field(description="Mean spikes a pixel and frame.")]
+    loss: list[float | None]
+    psnr_db: list[float | None]
+    splats: list[int | None]
+    work_s: Annotated[
+        list[float | None],
+        Field(description="Seconds of work when the view was tracked."),
+    ]
+    work: WorkOut
+    gaps: list[GapOut]
+    closures: Annotated[list[ClosureOut], Field(description="In the order in which they were closed.")]
+
+
 class UploadProfile(BaseModel):
     """
     The profile of the camera that a recording is of.
@@ -1966,6 +2165,40 @@ class UploadProfile(BaseModel):
     note: str = ""
 
 
+class VersionOut(BaseModel):
+    """
+    A published version of a scene and its trajectory.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    version: int
+    at: AwareDatetime
+    splats: int
+    poses: int
+    white: float
+    scene_bytes: Annotated[int, Field(description="Size of the PLY file.")]
+    psnr_db: float | None
+    intrinsics: Annotated[
+        IntrinsicsModel | None,
+        Field(
+            description="Of the camera, as it was given or as the reconstruction found it, with its lens; null: not known."
+        ),
+    ]
+
+
+class VersionsOut(BaseModel):
+    """
+    The versions that are kept, oldest first.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    items: list[VersionOut]
+
+
 class ViewRequest(BaseModel):
     """
     One camera gives a picture; several, or a path, give a ZIP of pictures.
@@ -2002,6 +2235,24 @@ class ViewRequest(BaseModel):
             description="Value shown as white in all formats but EXR. If not given: for color the scene's own, for alpha 1, for depth the largest of the picture. The header X-White says what was used."
         ),
     ] = None
+
+
+class BoardScaleOut(BaseModel):
+    """
+    The scale by a board.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    scale: ScaleOut
+    square: Annotated[float, Field(description="Side of a square, in the unit of the scene.")]
+    views: int
+    corners: Annotated[int, Field(description="Of the board, that were used.")]
+    error_px: Annotated[
+        float,
+        Field(description="Root mean square error of its corners, px of the pictures."),
+    ]
 
 
 class CalibratedOut(BaseModel):
@@ -2060,11 +2311,17 @@ class CaptureOut(BaseModel):
         str | None,
         Field(description="Id of the group of captures that were started together."),
     ]
+    ring: Annotated[
+        str | None,
+        Field(
+            description="Name of the shared memory with the newest frames, for programs on the service's machine; null when the capture does not run."
+        ),
+    ]
 
 
 class CapturePage(BaseModel):
     """
-    Captures, newest first.
+    Captures, newest first or in the order that was asked for.
     """
 
     model_config = ConfigDict(
@@ -2075,6 +2332,7 @@ class CapturePage(BaseModel):
         str | None,
         Field(description="To be given as `cursor` for those that follow; null: there are no more."),
     ]
+    total: Annotated[int, Field(description="Captures on all pages.")]
 
 
 class CaptureRequest(BaseModel):

@@ -185,7 +185,7 @@ export interface paths {
         };
         /**
          * List Captures
-         * @description Captures, newest first.
+         * @description Captures, newest first unless another order is asked for. All pages are asked for with the same order.
          *
          *     Scope of a token: `read`.
          */
@@ -1076,6 +1076,28 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/api/v1/captures/{capture_id}/recording/video": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /**
+         * Get Recording Video
+         * @description The recording in slow motion, an MP4; pictures whose frames were lost are black. Made in a worker process.
+         *
+         *     Scope of a token: `read`.
+         */
+        get: operations["get_recording_video_api_v1_captures__capture_id__recording_video_get"];
+        put?: never;
+        post?: never;
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
     "/api/v1/reconstructions/{reconstruction_id}:clean": {
         parameters: {
             query?: never;
@@ -1174,6 +1196,50 @@ export interface paths {
          *     Scope of a token: `operate`.
          */
         post: operations["scale_by_tag_api_v1_reconstructions__reconstruction_id__scale_tag_post"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/reconstructions/{reconstruction_id}/scale:board": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        get?: never;
+        put?: never;
+        /**
+         * Scale By A Board
+         * @description Find a ChArUco board of known size in the scene, and store the scale that it gives.
+         *
+         *     Scope of a token: `operate`.
+         */
+        post: operations["scale_by_a_board_api_v1_reconstructions__reconstruction_id__scale_board_post"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/reconstructions/{reconstruction_id}/scale:up": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        get?: never;
+        put?: never;
+        /**
+         * Find Up
+         * @description Store which way is up: by gravity at a frame, by points of the floor, or by the floor, which is found.
+         *
+         *     Scope of a token: `operate`.
+         */
+        post: operations["find_up_api_v1_reconstructions__reconstruction_id__scale_up_post"];
         delete?: never;
         options?: never;
         head?: never;
@@ -1503,7 +1569,16 @@ export interface paths {
         delete?: never;
         options?: never;
         head?: never;
-        patch?: never;
+        /**
+         * Change Configuration
+         * @description Change settings in the file that the service was started with, and reload it. An error changes nothing.
+         *
+         *     Limits, retention, logs, workers and the choice of the renderer can be changed. Addresses, tokens, certificates,
+         *     folders and devices are changed on the machine of the service only.
+         *
+         *     Scope of a token: `admin`.
+         */
+        patch: operations["change_configuration_api_v1_configuration_patch"];
         trace?: never;
     };
     "/api/v1/configuration:reload": {
@@ -1537,14 +1612,45 @@ export interface paths {
         };
         /**
          * List Tokens
-         * @description Names and dates of the tokens; `spiked token` creates and revokes them.
+         * @description Names, scopes and dates of the tokens.
          *
          *     Scope of a token: `admin`.
          */
         get: operations["list_tokens_api_v1_tokens_get"];
         put?: never;
-        post?: never;
+        /**
+         * Create Token
+         * @description Make a token; this answer is the only one that has it.
+         *
+         *     Only who brings a token of scope `admin` may, even where none is required: the first is made by `spiked token
+         *     create`. A token ends no later than the one that it was made with.
+         *
+         *     Scope of a token: `admin`.
+         */
+        post: operations["create_token_api_v1_tokens_post"];
         delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
+    "/api/v1/tokens/{name}": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        get?: never;
+        put?: never;
+        post?: never;
+        /**
+         * Revoke Token
+         * @description Revoke a token, and end what it has opened, within a second. Who may: see `POST tokens`.
+         *
+         *     Scope of a token: `admin`.
+         */
+        delete: operations["revoke_token_api_v1_tokens__name__delete"];
         options?: never;
         head?: never;
         patch?: never;
@@ -1641,6 +1747,62 @@ export interface components {
          * @enum {string}
          */
         BitOrder: "lsb" | "msb";
+        /**
+         * BoardScaleOut
+         * @description The scale by a board.
+         */
+        BoardScaleOut: {
+            scale: components["schemas"]["ScaleOut"];
+            /**
+             * Square
+             * @description Side of a square, in the unit of the scene.
+             */
+            square: number;
+            /** Views */
+            views: number;
+            /**
+             * Corners
+             * @description Of the board, that were used.
+             */
+            corners: number;
+            /**
+             * Error Px
+             * @description Root mean square error of its corners, px of the pictures.
+             */
+            error_px: number;
+        };
+        /**
+         * BoardScaleRequest
+         * @description A ChArUco board of known size.
+         * @example {
+         *       "board": "9x6",
+         *       "revision": 0,
+         *       "square_m": 0.03
+         *     }
+         */
+        BoardScaleRequest: {
+            /**
+             * Revision
+             * @description The one that this replaces; 409 if it is not.
+             */
+            revision: number;
+            /**
+             * Board
+             * @description Squares of the board, COLUMNSxROWS.
+             */
+            board: string;
+            /**
+             * Square M
+             * @description Side of a square.
+             */
+            square_m: number;
+            /**
+             * Dictionary
+             * @description Markers of the board: one of OpenCV's sets.
+             * @default 4x4_100
+             */
+            dictionary?: string;
+        };
         /**
          * BoxModel
          * @description A box along the axes of the scene, in its unit.
@@ -1999,10 +2161,15 @@ export interface components {
              * @description Id of the group of captures that were started together.
              */
             group: string | null;
+            /**
+             * Ring
+             * @description Name of the shared memory with the newest frames, for programs on the service's machine; null when the capture does not run.
+             */
+            ring: string | null;
         };
         /**
          * CapturePage
-         * @description Captures, newest first.
+         * @description Captures, newest first or in the order that was asked for.
          */
         CapturePage: {
             /** Items */
@@ -2013,6 +2180,11 @@ export interface components {
              * @example null
              */
             next_cursor: string | null;
+            /**
+             * Total
+             * @description Captures on all pages.
+             */
+            total: number;
         };
         /**
          * CaptureRequest
@@ -2101,6 +2273,12 @@ export interface components {
             /** @description If the source does not know its own. */
             intrinsics?: components["schemas"]["IntrinsicsModel"] | null;
         } & (unknown & unknown & unknown & unknown);
+        /**
+         * CaptureSort
+         * @description By what captures are listed.
+         * @enum {string}
+         */
+        CaptureSort: "started" | "name" | "length" | "size" | "verdict" | "reconstruction";
         /**
          * CaptureState
          * @description State of a capture.
@@ -2303,12 +2481,12 @@ export interface components {
             total_bytes: number;
             /**
              * Recording S
-             * @description How long a recording there is room for, of the camera that runs at the rate that it states, or of a USB camera if none runs.
+             * @description How long a recording there is room for, of the cameras that run at the rates that they state, or of a USB camera if none runs; `GET doctor` says the same.
              */
             recording_s: number;
             /**
              * Recording Of
-             * @description That camera.
+             * @description These cameras.
              * @example 400x250 at 20 kHz
              */
             recording_of: string;
@@ -2889,6 +3067,39 @@ export interface components {
          */
         Mosaic: "RGGB" | "BGGR" | "GRBG" | "GBRG";
         /**
+         * MosaicChoice
+         * @description A mosaic, or detection from the pixels.
+         * @enum {string}
+         */
+        MosaicChoice: "auto" | "RGGB" | "BGGR" | "GRBG" | "GBRG";
+        /**
+         * NewTokenOut
+         * @description A new token.
+         */
+        NewTokenOut: {
+            /** Name */
+            name: string;
+            /**
+             * Created At
+             * Format: date-time
+             */
+            created_at: string;
+            /** Expires At */
+            expires_at: string | null;
+            /** @description read: look and download; operate: change captures, too; admin: set-up, too. */
+            scope: components["schemas"]["Scope"];
+            /**
+             * Created By
+             * @description The token that it was created with; null: by `spiked token`.
+             */
+            created_by: string | null;
+            /**
+             * Secret
+             * @description The token itself, which is not shown again: only its hash is kept.
+             */
+            secret: string;
+        };
+        /**
          * NoiseModel
          * @description Noise, defects and light of the simulated camera `sim:`; it wins over the options of the source's text.
          * @example {
@@ -3218,6 +3429,11 @@ export interface components {
              */
             depth_m: number | null;
             /**
+             * Depth M Sigma
+             * @description Standard deviation of depth_m by that of the scale alone; null: not known.
+             */
+            depth_m_sigma: number | null;
+            /**
              * Position
              * @description Of the surface, in the axes of the scene; null as depth.
              */
@@ -3403,8 +3619,13 @@ export interface components {
          */
         ReconstructionOptions: {
             /**
+             * Seconds
+             * @description Time budget in seconds of work: reduces the steps, and at last the frames that are read; of a live reconstruction it is that of the refinement. Without it all steps are done.
+             */
+            seconds?: number | null;
+            /**
              * Steps
-             * @description Gradient steps of the refinement after the last frame.
+             * @description Gradient steps of the refinement after the last frame; its time grows with them.
              * @default 2000
              */
             steps?: number;
@@ -3431,6 +3652,12 @@ export interface components {
              */
             max_views?: number;
             /**
+             * Most Splats
+             * @description Most splats of the map, which has no more than follow from the size of the picture. Ten times as many make a step about five times as long.
+             * @default 250000
+             */
+            most_splats?: number;
+            /**
              * Memory Mb
              * @description MiB of images held in memory; the others are built anew from the recording.
              * @default 512
@@ -3455,6 +3682,18 @@ export interface components {
             loss?: components["schemas"]["LossName"] | null;
             /** @description Optics, where neither the capture nor its recording says them, or to overrule them. */
             intrinsics?: components["schemas"]["IntrinsicsOption"] | null;
+            /**
+             * Fov
+             * @description The same as a horizontal field of view in degrees of square pixels; a distortion that is known stays. Without any optics they are estimated.
+             */
+            fov?: number | null;
+            /** @description Colour mosaic of the upright image, where the recording states another or none; auto: detect it from the pixels of the recording. */
+            mosaic?: components["schemas"]["MosaicChoice"] | null;
+            /**
+             * Flipped
+             * @description Rows come bottom-up; false: top-down; as the recording states if not given.
+             */
+            flipped?: boolean | null;
         };
         /**
          * ReconstructionOut
@@ -3513,6 +3752,16 @@ export interface components {
             /** Priority */
             priority: number;
             options: components["schemas"]["ReconstructionOptions"];
+            /**
+             * Poses From
+             * @description Given poses: the id of their reconstruction, or `file`; empty: estimated.
+             */
+            poses_from: string;
+            /**
+             * Calibration From
+             * @description Device of its calibration; empty: that of the recording, if any.
+             */
+            calibration_from: string;
             /**
              * Created At
              * Format: date-time
@@ -3608,7 +3857,22 @@ export interface components {
              * @description A finished reconstruction of the same place: its map is extended by the recording, and the result is in its frame of reference.
              */
             map?: string | null;
-        };
+            /**
+             * Poses
+             * @description Known camera-to-world poses as the text of a TUM file, in seconds since the start of the capture: the map is fitted to them, and they are not changed. Poses between them are interpolated.
+             */
+            poses?: string | null;
+            /**
+             * Poses Of
+             * @description Another reconstruction of the capture, whose newest path is taken as known poses.
+             */
+            poses_of?: string | null;
+            /**
+             * Calibration Of
+             * @description A device whose calibration corrects the rates, instead of that of the recording.
+             */
+            calibration_of?: string | null;
+        } & unknown;
         /**
          * RecordingOut
          * @description What lies on disk of a capture.
@@ -3776,7 +4040,7 @@ export interface components {
              * @description Relative standard deviation of metres_per_unit; null: not known.
              */
             sigma: number | null;
-            /** @description What the scale rests on: a known length, or AprilTags. */
+            /** @description What the scale rests on: a known length, AprilTags, a board, or two cameras. */
             source: components["schemas"]["ScaleSource"] | null;
             /**
              * Up
@@ -3788,6 +4052,11 @@ export interface components {
              * @description Version of the scene that it was measured in.
              */
             version: number | null;
+            /**
+             * Since
+             * @description Versions up to this one are of an earlier run, whose unit of length is another one: the scale is not theirs, and cannot be measured in them.
+             */
+            since: number;
         };
         /**
          * ScaleRequest
@@ -3795,7 +4064,8 @@ export interface components {
          * @example {
          *       "metres_per_unit": 2.11,
          *       "revision": 0,
-         *       "sigma": 0.004
+         *       "sigma": 0.004,
+         *       "version": 12
          *     }
          * @example {
          *       "revision": 1,
@@ -3812,6 +4082,11 @@ export interface components {
              * @description The one that this replaces; 409 if it is not.
              */
             revision: number;
+            /**
+             * Version
+             * @description Version that it was measured in; 409 for one of an earlier run. Default: the newest.
+             */
+            version?: number | null;
             /** Metres Per Unit */
             metres_per_unit?: number | null;
             /**
@@ -3834,7 +4109,7 @@ export interface components {
          * @description What a scale rests on.
          * @enum {string}
          */
-        ScaleSource: "length" | "tag";
+        ScaleSource: "length" | "tag" | "board" | "baseline";
         /**
          * SceneFormat
          * @description How a scene is written.
@@ -3889,8 +4164,39 @@ export interface components {
              * @description Whether `configuration:reload` brings a new value into effect.
              */
             reloadable: boolean;
+            /**
+             * Editable
+             * @description Whether `PATCH configuration` changes it; others are changed in the file.
+             */
+            editable: boolean;
+            /**
+             * Option
+             * @description JSON Schema: type, limits, default, meaning.
+             */
+            option: {
+                [key: string]: unknown;
+            };
             /** Doc */
             doc: string;
+        };
+        /**
+         * SettingsChange
+         * @description New values of settings.
+         * @example {
+         *       "values": {
+         *         "log_level": "info",
+         *         "retention_days": 30
+         *       }
+         *     }
+         */
+        SettingsChange: {
+            /**
+             * Values
+             * @description By the names of `GET configuration`; null removes a setting from the file: its default.
+             */
+            values: {
+                [key: string]: boolean | number | string | null;
+            };
         };
         /**
          * SettingsOut
@@ -3899,6 +4205,21 @@ export interface components {
         SettingsOut: {
             /** Items */
             items: components["schemas"]["SettingOut"][];
+            /**
+             * File
+             * @description The file that `PATCH configuration` changes.
+             */
+            file: string;
+            /**
+             * Needs Restart
+             * @description Settings whose value in the file takes effect after a restart.
+             */
+            needs_restart: string[];
+            /**
+             * Problem
+             * @description Why the file as it is now cannot be loaded; null if it can be.
+             */
+            problem: string | null;
         };
         /**
          * SimilarityOut
@@ -4187,6 +4508,12 @@ export interface components {
             psnr_db: (number | null)[];
             /** Splats */
             splats: (number | null)[];
+            /**
+             * Work S
+             * @description Seconds of work when the view was tracked.
+             */
+            work_s: (number | null)[];
+            work: components["schemas"]["WorkOut"];
             /** Gaps */
             gaps: components["schemas"]["GapOut"][];
             /**
@@ -4211,6 +4538,33 @@ export interface components {
             expires_at: string | null;
             /** @description read: look and download; operate: change captures, too; admin: set-up, too. */
             scope: components["schemas"]["Scope"];
+            /**
+             * Created By
+             * @description The token that it was created with; null: by `spiked token`.
+             */
+            created_by: string | null;
+        };
+        /**
+         * TokenRequest
+         * @description A token to be made.
+         * @example {
+         *       "days": 90,
+         *       "name": "display",
+         *       "scope": "read"
+         *     }
+         */
+        TokenRequest: {
+            /**
+             * Name
+             * @description Of its user or device.
+             */
+            name: string;
+            scope: components["schemas"]["Scope"];
+            /**
+             * Days
+             * @description Until it expires; null: when the token of this request does, if that expires.
+             */
+            days?: number | null;
         };
         /**
          * TokensOut
@@ -4259,6 +4613,72 @@ export interface components {
              */
             states: (components["schemas"]["State"] | null)[];
         };
+        /**
+         * UpRequest
+         * @description What up is found by: gravity at a frame, points of the floor, or neither: the floor is found.
+         * @example {
+         *       "revision": 0
+         *     }
+         * @example {
+         *       "frame": 100,
+         *       "gravity": [
+         *         0.1,
+         *         9.7,
+         *         0.9
+         *       ],
+         *       "revision": 0
+         *     }
+         * @example {
+         *       "points": [
+         *         [
+         *           0.1,
+         *           1.2,
+         *           3
+         *         ],
+         *         [
+         *           0.9,
+         *           1.2,
+         *           3.1
+         *         ],
+         *         [
+         *           0.2,
+         *           1.3,
+         *           4
+         *         ]
+         *       ],
+         *       "revision": 0
+         *     }
+         */
+        UpRequest: {
+            /**
+             * Revision
+             * @description The one that this replaces; 409 if it is not.
+             */
+            revision: number;
+            /**
+             * Gravity
+             * @description In the axes of the camera: x right, y down, z forward.
+             */
+            gravity?: [
+                number,
+                number,
+                number
+            ] | null;
+            /**
+             * Frame
+             * @description Of gravity: the pose nearest to it is used. Default: the first.
+             */
+            frame?: number | null;
+            /**
+             * Points
+             * @description Of the floor, in the scene.
+             */
+            points?: [
+                number,
+                number,
+                number
+            ][] | null;
+        } & unknown;
         /**
          * UploadOut
          * @description How far an upload is.
@@ -4535,6 +4955,8 @@ export interface components {
             scene_bytes: number;
             /** Psnr Db */
             psnr_db: number | null;
+            /** @description Of the camera, as it was given or as the reconstruction found it, with its lens; null: not known. */
+            intrinsics: components["schemas"]["IntrinsicsModel"] | null;
         };
         /**
          * VersionsOut
@@ -4626,6 +5048,20 @@ export interface components {
              */
             white?: number | null;
         } & (unknown & unknown & unknown & unknown & unknown & unknown);
+        /**
+         * WorkOut
+         * @description The map over the seconds of work, after the last frame, too; arrays of the same length.
+         */
+        WorkOut: {
+            /** Work S */
+            work_s: number[];
+            /** Loss */
+            loss: number[];
+            /** Psnr Db */
+            psnr_db: (number | null)[];
+            /** Splats */
+            splats: number[];
+        };
         /**
          * ZmqOut
          * @description Addresses of the ZeroMQ sockets, on this machine.
@@ -5598,6 +6034,14 @@ export interface operations {
                 group?: string | null;
                 /** @description Captures with this tag. */
                 tag?: string | null;
+                /** @description Captures with this verdict. */
+                grade?: components["schemas"]["Grade"] | null;
+                /** @description Captures that are, or are not, to be kept. */
+                keep?: boolean | null;
+                /** @description By which all captures are sorted, not only those of a page. */
+                sort?: components["schemas"]["CaptureSort"];
+                /** @description The newest, largest or last first. */
+                descending?: boolean;
             };
             header?: never;
             path?: never;
@@ -7086,6 +7530,8 @@ export interface operations {
                 white?: number | null;
                 /** @description Without the distortion of the lens: of a recorded frame, or of the scene. */
                 undistorted?: boolean;
+                /** @description Reconstruction by the optics of whose newest version a recorded image is undistorted. Default: those of the capture. */
+                optics_of?: string | null;
                 /** @description Takes precedence over Accept; the default is PNG. */
                 format?: components["schemas"]["ImageFormat"] | null;
             };
@@ -7524,6 +7970,10 @@ export interface operations {
                     ETag?: string;
                     /** @description Its version. */
                     "X-Scene-Version"?: number;
+                    /** @description Metres for the unit of its lengths, where known. */
+                    "X-Metres-Per-Unit"?: number;
+                    /** @description Relative standard deviation of that, where known. */
+                    "X-Scale-Sigma"?: number;
                     [name: string]: unknown;
                 };
                 content: {
@@ -7642,6 +8092,10 @@ export interface operations {
                     ETag?: string;
                     /** @description Its version. */
                     "X-Scene-Version"?: number;
+                    /** @description Metres for the unit of its lengths, where known. */
+                    "X-Metres-Per-Unit"?: number;
+                    /** @description Relative standard deviation of that, where known. */
+                    "X-Scale-Sigma"?: number;
                     [name: string]: unknown;
                 };
                 content: {
@@ -7772,6 +8226,10 @@ export interface operations {
                     ETag?: string;
                     /** @description Its version. */
                     "X-Scene-Version"?: number;
+                    /** @description Metres for the unit of its lengths, where known. */
+                    "X-Metres-Per-Unit"?: number;
+                    /** @description Relative standard deviation of that, where known. */
+                    "X-Scale-Sigma"?: number;
                     [name: string]: unknown;
                 };
                 content: {
@@ -7902,6 +8360,10 @@ export interface operations {
                 headers: {
                     /** @description Its version. */
                     "X-Scene-Version"?: number;
+                    /** @description Metres for the unit of its lengths, where known. */
+                    "X-Metres-Per-Unit"?: number;
+                    /** @description Relative standard deviation of that, where known. */
+                    "X-Scale-Sigma"?: number;
                     [name: string]: unknown;
                 };
                 content: {
@@ -9397,6 +9859,10 @@ export interface operations {
                     ETag?: string;
                     /** @description Its version. */
                     "X-Scene-Version"?: number;
+                    /** @description Metres for the unit of its lengths, where known. */
+                    "X-Metres-Per-Unit"?: number;
+                    /** @description Relative standard deviation of that, where known. */
+                    "X-Scale-Sigma"?: number;
                     [name: string]: unknown;
                 };
                 content: {
@@ -9515,6 +9981,10 @@ export interface operations {
                     ETag?: string;
                     /** @description Its version. */
                     "X-Scene-Version"?: number;
+                    /** @description Metres for the unit of its lengths, where known. */
+                    "X-Metres-Per-Unit"?: number;
+                    /** @description Relative standard deviation of that, where known. */
+                    "X-Scale-Sigma"?: number;
                     [name: string]: unknown;
                 };
                 content: {
@@ -9645,6 +10115,10 @@ export interface operations {
                     ETag?: string;
                     /** @description Its version. */
                     "X-Scene-Version"?: number;
+                    /** @description Metres for the unit of its lengths, where known. */
+                    "X-Metres-Per-Unit"?: number;
+                    /** @description Relative standard deviation of that, where known. */
+                    "X-Scale-Sigma"?: number;
                     [name: string]: unknown;
                 };
                 content: {
@@ -9775,6 +10249,10 @@ export interface operations {
                 headers: {
                     /** @description Its version. */
                     "X-Scene-Version"?: number;
+                    /** @description Metres for the unit of its lengths, where known. */
+                    "X-Metres-Per-Unit"?: number;
+                    /** @description Relative standard deviation of that, where known. */
+                    "X-Scale-Sigma"?: number;
                     [name: string]: unknown;
                 };
                 content: {
@@ -10309,10 +10787,20 @@ export interface operations {
                 resolution?: number;
                 /** @description Length of a video. */
                 seconds?: number;
+                /** @description Pictures a second of a video. */
+                fps?: number;
+                /** @description Pixels of a video. Default: of the sensor. */
+                width?: number | null;
+                /** @description Pixels of a video. Default: of the sensor. */
+                height?: number | null;
+                /** @description A video follows the recorded path without its tremor, or as it is. */
+                along?: "smooth" | "recorded";
                 /** @description Poses that a video goes through instead of along the path: x,y,z,qw,qx,qy,qz of each, separated by semicolons; camera to world, OpenCV axes. */
                 through?: string | null;
                 /** @description In metres, with up along -y; 404 while the scale is not known. */
                 metric?: boolean;
+                /** @description Frames that key views are of, in place of `views`; may be given again. */
+                frame?: number[] | null;
             };
             header?: never;
             path: {
@@ -10470,10 +10958,20 @@ export interface operations {
                 resolution?: number;
                 /** @description Length of a video. */
                 seconds?: number;
+                /** @description Pictures a second of a video. */
+                fps?: number;
+                /** @description Pixels of a video. Default: of the sensor. */
+                width?: number | null;
+                /** @description Pixels of a video. Default: of the sensor. */
+                height?: number | null;
+                /** @description A video follows the recorded path without its tremor, or as it is. */
+                along?: "smooth" | "recorded";
                 /** @description Poses that a video goes through instead of along the path: x,y,z,qw,qx,qy,qz of each, separated by semicolons; camera to world, OpenCV axes. */
                 through?: string | null;
                 /** @description In metres, with up along -y; 404 while the scale is not known. */
                 metric?: boolean;
+                /** @description Frames that key views are of, in place of `views`; may be given again. */
+                frame?: number[] | null;
             };
             header?: never;
             path: {
@@ -10515,6 +11013,149 @@ export interface operations {
                     "model/gltf-binary": string;
                     "video/mp4": string;
                     "text/html": string;
+                };
+            };
+            /** @description The content has not changed. */
+            304: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The range lies outside the file. */
+            416: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    get_recording_video_api_v1_captures__capture_id__recording_video_get: {
+        parameters: {
+            query?: {
+                /** @description Seconds of video for a second of recording. Default: a video of 10 s. */
+                slower?: number | null;
+                /** @description Pictures a second of a video. */
+                fps?: number;
+                /** @description Frames of a picture. */
+                window?: number;
+                /** @description Add the pictures before and after to each, moved along the motion: less noise. */
+                compensate?: boolean;
+                /** @description First time, seconds since the start of the capture. */
+                from_s?: number | null;
+                /** @description End time, not included, in seconds. */
+                to_s?: number | null;
+            };
+            header?: never;
+            path: {
+                capture_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description The file. */
+            200: {
+                headers: {
+                    /** @description Changes with the content. */
+                    ETag?: string;
+                    [name: string]: unknown;
+                };
+                content: {
+                    "video/mp4": string;
+                };
+            };
+            /** @description The requested range. */
+            206: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "video/mp4": string;
                 };
             };
             /** @description The content has not changed. */
@@ -11192,6 +11833,244 @@ export interface operations {
                 };
                 content: {
                     "application/json": components["schemas"]["TagScaleOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It conflicts with the current state. */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    scale_by_a_board_api_v1_reconstructions__reconstruction_id__scale_board_post: {
+        parameters: {
+            query?: never;
+            header?: {
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
+                "idempotency-key"?: string;
+            };
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["BoardScaleRequest"];
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["BoardScaleOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It conflicts with the current state. */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    find_up_api_v1_reconstructions__reconstruction_id__scale_up_post: {
+        parameters: {
+            query?: never;
+            header?: {
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
+                "idempotency-key"?: string;
+            };
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["UpRequest"];
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["ScaleOut"];
                 };
             };
             /** @description The request is malformed. */
@@ -12929,6 +13808,93 @@ export interface operations {
             };
         };
     };
+    change_configuration_api_v1_configuration_patch: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["SettingsChange"];
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["ReloadedOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
     reload_configuration_api_v1_configuration_reload_post: {
         parameters: {
             query?: never;
@@ -13050,6 +14016,185 @@ export interface operations {
             };
             /** @description The scope of the token does not allow it. */
             403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    create_token_api_v1_tokens_post: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["TokenRequest"];
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            201: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["NewTokenOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    revoke_token_api_v1_tokens__name__delete: {
+        parameters: {
+            query?: never;
+            header?: never;
+            path: {
+                name: string;
+            };
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            204: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content?: never;
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
                 headers: {
                     [name: string]: unknown;
                 };

@@ -35,6 +35,7 @@ def main(out: Path, true_scene: Path, true_path: Path) -> None:
     rasteriser = Rasteriser(found.camera)
     print(
         f"{len(found.scene)} splats, {cleaned.floaters} floaters, {cleaned.split} split, {cleaned.shrunk} shrunk, "
+        f"{cleaned.large} left, "
         f"{len(cleaned.scene)} at the end"
     )
     for name, scene in (("before", found.scene), ("removed", removed.scene), ("split, too", cleaned.scene)):

@@ -123,7 +123,9 @@ class Cleaned:
     split: int
     """Splats that were larger than a quarter of the scene, and were replaced by several."""
     shrunk: int
-    """Splats so large that no view sees, and those beyond the number that can be replaced: they were made smaller."""
+    """Splats so large that no view sees: they were made smaller."""
+    large: int
+    """Splats that stay so large: as several they would be too many (`spiked.splitting`)."""
 
 
 def clean(
@@ -142,7 +144,7 @@ def clean(
     they are not known, and if nothing would be left.
     """
     kept = scene if box is None else scene.select(box.contains(scene))
-    outside, outlined, floaters, split, shrunk = len(scene) - len(kept), 0, 0, 0, 0
+    outside, outlined, floaters, split, shrunk, large = len(scene) - len(kept), 0, 0, 0, 0, 0
     if outline is not None:
         chosen = outline.contains(kept)
         outlined, kept = int(chosen.sum()), kept.select(~chosen)
@@ -160,8 +162,8 @@ def clean(
     if removal is not None and removal.split and camera is not None:
         span = removal.span(kept)
         done = split_large(kept, removal.span_share * span, path, camera, span, _part(progress, 1 - SEEN, SEEN))
-        kept, split, shrunk = done.scene, done.split, done.shrunk
-    return Cleaned(kept, outside, outlined, floaters, split, shrunk)
+        kept, split, shrunk, large = done.scene, done.split, done.shrunk, done.left
+    return Cleaned(kept, outside, outlined, floaters, split, shrunk, large)
 
 
 def _part(progress: Callable[[float], None] | None, share: float, begin: float) -> Callable[[float], None] | None:

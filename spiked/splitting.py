@@ -37,7 +37,7 @@ FAINT = 1 / 255
 BUDGET = 0.25
 """Most pieces over the splats of the scene, and ..."""
 LEAST_BUDGET = 10_000
-"""... the number that is always allowed. What is left then is made smaller, the least visible first."""
+"""... the number that is always allowed. What would be more stays as it is: made smaller, it would leave a hole."""
 STEPS = 400
 """Gradient steps, every second one on the path itself (decision 46)."""
 PIXELS = 130_000
@@ -62,7 +62,9 @@ class Split:
     split: int
     """Splats that were replaced by several."""
     shrunk: int
-    """Splats that were made smaller: no view sees them, or there were too many."""
+    """Splats that were made smaller: no view sees them."""
+    left: int
+    """Splats that stay as they are: they would be too many, as the sky far behind a small scene would."""
 
 
 def split_large(
@@ -75,32 +77,33 @@ def split_large(
 ) -> Split:
     """Replace splats of a standard deviation above `largest`.
 
-    What they show within `reach` of the scene's median stays, seen from `path` by `camera`; both lengths are in the
-    scene's unit.
+    What they show within `reach` of the scene's median stays, seen from `path` by `camera`, and behind it what is in
+    the same directions; both lengths are in the scene's unit.
     """
     large = np.flatnonzero(np.exp(scene.log_scales).max(axis=1) > largest)
-    if not len(large):
-        return Split(scene, 0, 0)
+    if not len(large) or largest <= 0:
+        return Split(scene, 0, 0, 0)
     rasteriser, shared = _rasteriser(camera), _Grid(PIECE * largest, largest, np.median(scene.means, axis=0), reach)
     filled, rows = _fullest(scene, large, path, rasteriser)
-    left, replaced, pieces = max(int(BUDGET * len(scene)), LEAST_BUDGET), [], []
+    budget, replaced, pieces = max(int(BUDGET * len(scene)), LEAST_BUDGET), [], []
     for n in np.argsort(-filled):
         if filled[n] <= 0:
             break
-        found = shared.pieces(scene, int(large[n]), path.rotations[rows[n]], path.centres[rows[n]])
-        if len(found) > left:
-            continue
-        left -= len(found)
-        replaced.append(large[n])
-        pieces.append(found)
-    kept = scene.select(np.setdiff1d(np.arange(len(scene)), replaced))
-    made = replace(kept, log_scales=np.minimum(kept.log_scales, np.float32(np.log(largest))))
+        found = shared.pieces(scene, int(large[n]), path.rotations[rows[n]], path.centres[rows[n]], budget)
+        if len(found):
+            budget -= len(found)
+            replaced.append(large[n])
+            pieces.append(found)
+    unseen = large[filled <= 0]
+    scales = scene.log_scales.copy()
+    scales[unseen] = np.minimum(scales[unseen], np.float32(np.log(largest)))
+    made = replace(scene, log_scales=scales).select(np.setdiff1d(np.arange(len(scene)), replaced))
     first = len(made)
     for some in pieces:
         made = made.join(some)
     if pieces:
         _fit(made, first, scene, largest, path, rasteriser, progress)
-    return Split(made, len(replaced), len(large) - len(replaced))
+    return Split(made, len(replaced), len(unseen), len(large) - len(replaced) - len(unseen))
 
 
 def _rasteriser(camera: Camera) -> Rasteriser:
@@ -132,16 +135,21 @@ class _Grid:
     middle: Doubles
     reach: float
 
-    def pieces(self, scene: Scene, n: int, rotation: Doubles, centre: Doubles) -> Scene:
-        """The pieces of a splat, for a view from a pose, camera to world."""
+    def pieces(self, scene: Scene, n: int, rotation: Doubles, centre: Doubles, most: int) -> Scene:
+        """The pieces of a splat, for a view from a pose, camera to world; none if they would be more than `most`."""
         own = rotation.T @ rotation_of(scene.quats[n])
         deviations = np.exp(scene.log_scales[n].astype(np.float64))
         mean = rotation.T @ (scene.means[n] - centre)
         # What a renderer sees of it: moving along a ray changes nothing.
         across = np.array([[1, 0, -mean[0] / mean[2]], [0, 1, -mean[1] / mean[2]]]) @ own * deviations
         axes, widths, _ = np.linalg.svd(across)
-        middle = (rotation.T @ (self.middle - centre) - mean)[:2] @ axes
-        (u, u_share), (v, v_share) = (self._line(widths[k], middle[k]) for k in (0, 1))
+        towards = rotation.T @ (self.middle - centre)
+        further = mean[2] / towards[2] if towards[2] > 0 else 1.0
+        middle, reach = (further * towards - mean)[:2] @ axes, self.reach * max(1.0, further)
+        spans = [self._span(widths[k], middle[k], reach) for k in (0, 1)]
+        if np.prod([max(last - first, 0.0) for first, last in spans]) > most:
+            return scene.select(np.zeros(0, np.int64))
+        (u, u_share), (v, v_share) = (self._line(widths[k], *spans[k]) for k in (0, 1))
         at = np.stack(np.meshgrid(u, v, indexing="ij"), -1).reshape(-1, 2)
         hides = -np.log1p(-np.minimum(scene.opacities[n] * np.outer(u_share, v_share).ravel(), 1 - 1e-6))
         opacities = 1 - np.exp(-hides / np.sqrt(2 * np.pi) ** int((widths > self.largest).sum()))
@@ -159,14 +167,24 @@ class _Grid:
             opacity_logits=np.log(opacities / (1 - opacities)).astype(np.float32),
         )
 
-    def _line(self, width: float, middle: float) -> tuple[Doubles, Doubles]:
-        """Places of the pieces along an axis from the mean of a splat of that deviation, and its share there."""
+    def _span(self, width: float, middle: float, reach: float) -> tuple[float, float]:
+        """Numbers of the first piece along an axis of a splat of that deviation, and of the one after the last."""
         if width <= self.largest:
-            return np.zeros(1), np.ones(1)
-        spread = np.sqrt(width**2 - self.deviation**2)
-        low, high = max(-REACH * spread, middle - self.reach), min(REACH * spread, middle + self.reach)
-        places = self.deviation * np.arange(np.floor(low / self.deviation), np.ceil(high / self.deviation) + 1)
-        return places, np.exp(-0.5 * (places / spread) ** 2)
+            return 0.0, 1.0
+        low, high = (REACH * sign * self._spread(width) for sign in (-1, 1))
+        low, high = max(low, middle - reach), min(high, middle + reach)
+        return float(np.floor(low / self.deviation)), float(np.ceil(high / self.deviation)) + 1
+
+    def _line(self, width: float, first: float, last: float) -> tuple[Doubles, Doubles]:
+        """Places of the pieces from the mean of the splat, and its share there."""
+        places = self.deviation * np.arange(first, last)
+        if width <= self.largest:
+            return places, np.ones(len(places))
+        return places, np.exp(-0.5 * (places / self._spread(width)) ** 2)
+
+    def _spread(self, width: float) -> float:
+        """Standard deviation of the places of the pieces."""
+        return float(np.sqrt(width**2 - self.deviation**2))
 
 
 def _fit(
@@ -199,6 +217,6 @@ def _fit(
         adam.step(
             made.arrays()[:4], gradients.arrays()[:4], (means * depth, *others), pieces & (gradients.radius_px > 0)
         )
-        np.minimum(made.log_scales, most, out=made.log_scales)
+        np.minimum(made.log_scales[first:], most, out=made.log_scales[first:])
         if progress is not None:
             progress((step + 1) / STEPS)

@@ -75,14 +75,47 @@ def test_large_splats_become_several_that_show_the_same(room: RoomMap) -> None:
         assert error < 0.1 * effect, (row, error / effect)
 
 
+def test_a_large_splat_far_behind_the_scene_is_kept(room: RoomMap) -> None:
+    row = len(room.path) // 2
+    rotation, centre = room.path.rotations[row], room.path.centres[row]
+    far = 5 * float(np.median(((room.scene.means - centre) @ rotation)[:, 2]))
+    sky = replace(
+        room.scene.select(np.zeros(2, np.int64)),
+        means=np.asarray(np.array([[0, 0, far], [0.5 * far, 0, far]]) @ rotation.T + centre, np.float32),
+        quats=np.tile(np.asarray(quaternion(rotation), np.float32), (2, 1)),
+        log_scales=np.log(np.array([[far, far, 1], [0.3 * far, 0.3 * far, 1]])).astype(np.float32),
+        opacity_logits=np.full(2, 3, np.float32),
+    )
+    scene = room.scene.select(np.arange(0, len(room.scene), 40)).join(sky)
+    split = split_large(scene, 1.0, room.path, CAMERA, 6.0)
+    assert (split.split, split.left) == (2, 0)
+    rasteriser, pose = Rasteriser(CAMERA), (rotation[None], centre[None])
+    wanted, got = (rasteriser.forward(one, *pose).alpha.copy() for one in (scene, split.scene))
+    assert np.abs(wanted - got).mean() < 0.05 * wanted.mean()
+
+
 def test_a_scene_of_nothing_but_large_splats_keeps_to_a_budget(room: RoomMap) -> None:
     scene = with_large_splats(room)
     few = scene.select(np.arange(len(scene) - 2000, len(scene)))
     many = few.join(few.select(np.full(400, len(few) - 3, np.int64)))
     split = split_large(many, 0.1, room.path, CAMERA, 3.0)
-    assert split.shrunk > 0 and split.split > 0
+    assert split.left > 0 and split.split > 0
     assert len(split.scene) <= len(many) + LEAST_BUDGET
-    assert np.exp(split.scene.log_scales.max()) <= 0.1001
+    assert (np.exp(split.scene.log_scales).max(axis=1) > 0.1001).sum() == split.left
+
+
+def test_a_sky_that_would_be_millions_stays(room: RoomMap) -> None:
+    few = room.scene.select(np.arange(0, len(room.scene), 40))
+    row = len(room.path) // 2
+    rotation, centre = room.path.rotations[row], room.path.centres[row]
+    sky = replace(
+        few.select(np.zeros(1, np.int64)),
+        means=np.asarray(np.array([[0, 0, 1e6]]) @ rotation.T + centre, np.float32),
+        log_scales=np.full((1, 3), np.log(1e6), np.float32),
+    )
+    split = split_large(few.join(sky), 1.0, room.path, CAMERA, 6.0)
+    assert (split.split, split.shrunk, split.left) == (0, 0, 1)
+    np.testing.assert_array_equal(split.scene.log_scales, few.join(sky).log_scales)
 
 
 def test_a_box_cuts(room: RoomMap) -> None:

@@ -246,7 +246,11 @@ class EditedOut(BaseModel):
     ]
     shrunk: Annotated[
         int,
-        Field(description="Splats so large that were made smaller: no view sees them, or they are too many."),
+        Field(description="Splats so large that were made smaller: no view sees them."),
+    ]
+    large: Annotated[
+        int,
+        Field(description="Splats that stay so large: as several they would be too many."),
     ]
 
 

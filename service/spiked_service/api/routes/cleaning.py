@@ -55,6 +55,7 @@ def cleaning_routes(rows: ReconstructionRepository, results: Results, route_clas
             floaters=found.floaters,
             split=found.split,
             shrunk=found.shrunk,
+            large=found.large,
         )
 
     @router.post(":revert", responses=problems(404, 409, 507))
@@ -68,7 +69,14 @@ def cleaning_routes(rows: ReconstructionRepository, results: Results, route_clas
             lambda publisher: _published_again(publisher, earlier, folder, body.version),
         )
         return EditedOut(
-            version=published.version, splats=published.splats, outside=0, outlined=0, floaters=0, split=0, shrunk=0
+            version=published.version,
+            splats=published.splats,
+            outside=0,
+            outlined=0,
+            floaters=0,
+            split=0,
+            shrunk=0,
+            large=0,
         )
 
     return router

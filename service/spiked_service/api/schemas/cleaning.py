@@ -85,4 +85,5 @@ class EditedOut(Out):
     outlined: int = Field(description="Splats that lay inside the outline.")
     floaters: int = Field(description="Splats that were removed as floaters.")
     split: int = Field(description="Splats larger than a quarter of the scene that were replaced by several.")
-    shrunk: int = Field(description="Splats so large that were made smaller: no view sees them, or they are too many.")
+    shrunk: int = Field(description="Splats so large that were made smaller: no view sees them.")
+    large: int = Field(description="Splats that stay so large: as several they would be too many.")

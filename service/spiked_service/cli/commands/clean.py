@@ -59,7 +59,7 @@ def clean(
             lambda share: bar.update(task, completed=share),
         )
     counts = {"outside": cleaned.outside, "floaters": cleaned.floaters}
-    counts |= {"split": cleaned.split, "shrunk": cleaned.shrunk}
+    counts |= {"split": cleaned.split, "shrunk": cleaned.shrunk, "large": cleaned.large}
     report = json.loads((map_folder / "report.json").read_bytes()) | {"splats": len(cleaned.scene), "cleaned": counts}
     with outputs.writing("--out", out), replacing(out) as making:
         shutil.copyfile(map_folder / "trajectory.tum", making / "trajectory.tum")
@@ -71,6 +71,7 @@ def clean(
         (making / "report.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
     output.print(
         f"{out}: {len(cleaned.scene)} of {len(found.scene)} splats; removed {cleaned.outside} outside and "
-        f"{cleaned.floaters} floaters, split {cleaned.split} large ones, made {cleaned.shrunk} smaller",
+        f"{cleaned.floaters} floaters, split {cleaned.split} large ones, made {cleaned.shrunk} smaller, "
+        f"left {cleaned.large}",
         markup=False,
     )

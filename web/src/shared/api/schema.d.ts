@@ -2552,9 +2552,14 @@ export interface components {
             split: number;
             /**
              * Shrunk
-             * @description Splats so large that were made smaller: no view sees them, or they are too many.
+             * @description Splats so large that were made smaller: no view sees them.
              */
             shrunk: number;
+            /**
+             * Large
+             * @description Splats that stay so large: as several they would be too many.
+             */
+            large: number;
         };
         /**
          * ExportFormatOut

@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from spiked.pose import Array, exp_so3, log_so3
 
@@ -20,6 +21,12 @@ _BASIS = {
     3: np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0,
 }
 """Weights of the degree + 1 knots as polynomials of u in [0, 1): row k holds the coefficients of 1, u, u^2, ..."""
+
+
+DENSE_KNOTS = 1000
+"""Knots up to which a spline is fitted by dense least squares, exact for any times; beyond, that takes gigabytes."""
+SMOOTH = 1e-4
+"""Weight of a second difference of knots beside a weight of 1 for each pose: it decides where no pose is near."""
 
 
 @dataclass(frozen=True)
@@ -124,16 +131,12 @@ class Spline:
         spline = cls(
             first, spacing, interpolate_rotations(s, rotations, knots), np.zeros((count, 3)), degree, time_warp
         )
-        basis = spline.basis_matrix(t)
-        guess = _interpolate_linear(s, centres, knots)
-        smooth = 1e-4 * np.diff(np.eye(count), 2, axis=0)
-        lhs = np.vstack([basis, smooth])
-        rhs = np.vstack([centres - basis @ guess, np.zeros((count - 2, 3))])
-        spline.centres = guess + np.linalg.lstsq(lhs, rhs, rcond=None)[0]
+        steps = _DenseSteps(spline, t) if count <= DENSE_KNOTS else _BandedSteps(spline, t)
+        spline.centres = _interpolate_linear(s, centres, knots)
+        spline.centres = spline.centres + steps.towards(centres - spline.poses(t)[1])
         for _ in range(3):
             error = log_so3(rotations @ spline.poses(t)[0].swapaxes(-1, -2))
-            step = np.linalg.lstsq(lhs, np.vstack([error, np.zeros((count - 2, 3))]), rcond=None)[0]
-            spline.rotations = exp_so3(step) @ spline.rotations
+            spline.rotations = exp_so3(steps.towards(error)) @ spline.rotations
         return spline
 
     @property
@@ -185,6 +188,43 @@ class Spline:
     def move(self, rotation: Array, centre: Array) -> "Spline":
         """The spline with knots perturbed: R <- Exp(rotation) R, c <- c + centre; both [knots, 3]."""
         return replace(self, rotations=exp_so3(rotation) @ self.rotations, centres=self.centres + centre)
+
+
+class _DenseSteps:
+    """Steps [knots, 3] of a spline's knots that come nearest to steps at times, by least squares."""
+
+    def __init__(self, spline: Spline, times: Array) -> None:
+        count = len(spline.rotations)
+        self._lhs = np.vstack([spline.basis_matrix(times), SMOOTH * np.diff(np.eye(count), 2, axis=0)])
+        self._none = np.zeros((count - 2, 3))
+
+    def towards(self, steps: Array) -> Array:
+        """For steps [m, 3] at the times."""
+        return np.asarray(np.linalg.lstsq(self._lhs, np.vstack([steps, self._none]), rcond=None)[0])
+
+
+class _BandedSteps:
+    """The same by normal equations, which are banded: time and memory in proportion to the knots."""
+
+    def __init__(self, spline: Spline, times: Array) -> None:
+        self._first, self._weights = spline.locate(times)
+        self._count, size = len(spline.rotations), spline.degree + 1
+        bands = np.zeros((max(size, 3), self._count))  # row d is the d-th diagonal below the main one
+        for a in range(size):
+            for b in range(a, size):
+                np.add.at(bands[b - a], self._first + a, self._weights[:, a] * self._weights[:, b])
+        bend = SMOOTH * np.array([1.0, -2.0, 1.0])
+        for a in range(3):
+            for b in range(a, 3):
+                bands[b - a, a : self._count - 2 + a] += bend[a] * bend[b]
+        self._factor = cholesky_banded(bands, lower=True)
+
+    def towards(self, steps: Array) -> Array:
+        """For steps [m, 3] at the times."""
+        right = np.zeros((self._count, 3))
+        for a in range(self._weights.shape[1]):
+            np.add.at(right, self._first + a, self._weights[:, a, None] * steps)
+        return np.asarray(cho_solve_banded((self._factor, True), right))
 
 
 def interpolate_rotations(times: Array, rotations: Array, at: Array) -> Array:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from spiked.pose import exp_so3, log_so3
-from spiked.spline import Spline
+from spiked.spline import DENSE_KNOTS, Spline
 
 
 def wavy(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -26,3 +26,25 @@ def test_the_path_continues_at_constant_velocity_outside() -> None:
     spline = Spline.fit(times, np.tile(np.eye(3), (10, 1, 1)), times[:, None] * [1.0, 0, 0], 4)
     assert spline.begin <= 0 and spline.end >= 9
     np.testing.assert_allclose(spline.poses([0.0, 9.0])[1][:, 0], [0, 9], atol=1e-3)
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_long_paths_are_fitted_as_short_ones(degree: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    times = np.sort(np.random.default_rng(0).uniform(0, 2000, 1500))
+    times = times[(times < 700) | (times > 800)]  # a gap of twelve knots
+    rotations, centres = wavy(times)
+    dense = Spline.fit(times, rotations, centres, 8, degree)
+    monkeypatch.setattr("spiked.spline.DENSE_KNOTS", 0)
+    banded = Spline.fit(times, rotations, centres, 8, degree)
+    np.testing.assert_allclose(banded.centres, dense.centres, atol=1e-6)
+    np.testing.assert_allclose(banded.rotations, dense.rotations, atol=1e-6)
+
+
+def test_a_path_of_a_minute_at_20_khz_is_fitted() -> None:
+    times = np.arange(0, 1_200_000, 4) + 0.5
+    rotations, centres = wavy(times / 400)
+    spline = Spline.fit(times, rotations, centres, 8)
+    assert len(spline.centres) > 100 * DENSE_KNOTS
+    got_rotations, got_centres = spline.poses(times[::1000])
+    np.testing.assert_allclose(got_centres, centres[::1000], atol=1e-5)
+    np.testing.assert_allclose(got_rotations, rotations[::1000], atol=1e-5)

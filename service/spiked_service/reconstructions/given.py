@@ -7,17 +7,16 @@ from pathlib import Path
 from spiked.calibration import Calibration
 from spiked.errors import ConfigurationError, SceneError
 from spiked.poses import PoseFile
+from spiked.recon.given_poses import LEAST_POSES, GivenPoses
 from spiked.trajectory import Trajectory
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.results.versions import newest, pose_file
 from spiked_service.store.catalogue import StoreError
 from spiked_service.store.folder import DataFolder
-from spiked_service.store.rows import ReconstructionRow
+from spiked_service.store.rows import CaptureRow, ReconstructionRow
 
 FROM_FILE = "file"
 """`ReconstructionRow.poses_from` of poses that came with the request."""
-_LEAST_POSES = 2
-"""Poses between which others are interpolated."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +32,10 @@ class Given:
     calibration: Path | None = None
     """... and its calibration."""
 
-    def put(self, row: ReconstructionRow, folder: DataFolder, rows: ReconstructionRepository) -> ReconstructionRow:
-        """Write it into the folder of a job; the row that says so.
+    def put(
+        self, row: ReconstructionRow, folder: DataFolder, rows: ReconstructionRepository, capture: CaptureRow
+    ) -> ReconstructionRow:
+        """Write it into the folder of a job of that capture; the row that says so.
 
         Raises UnknownIdError, ConfigurationError for poses that cannot be used, CalibrationError, and StoreError.
         """
@@ -42,7 +43,7 @@ class Given:
             if self.poses is not None or self.poses_of is not None or self.calibration is not None:
                 folder.reconstruction(row.id).mkdir(parents=True, exist_ok=True)
             if self.poses is not None:
-                _write_poses(self.poses, folder.given_poses(row.id))
+                _write_poses(self.poses, folder.given_poses(row.id), capture)
                 row = replace(row, poses_from=FROM_FILE)
             elif self.poses_of is not None:
                 _path_of(self.poses_of, row.capture_id, folder, rows).write_tum(folder.given_poses(row.id))
@@ -56,14 +57,15 @@ class Given:
         return row
 
 
-def _write_poses(text: str, path: Path) -> None:
+def _write_poses(text: str, path: Path, capture: CaptureRow) -> None:
     path.write_text(text, encoding="utf-8")
     try:
-        count = len(Trajectory.read_tum(path))
+        poses = Trajectory.read_tum(path)
     except SceneError as error:
         raise ConfigurationError(f"{error}".replace(str(path), "the poses")) from error
-    if count < _LEAST_POSES:
-        raise ConfigurationError(f"the poses are {count}: at least {_LEAST_POSES} are needed")
+    given = GivenPoses(poses, 1.0 if capture.sensor is None else capture.sensor.frame_rate_hz)
+    if capture.sensor is not None and capture.recording is not None:
+        given.check(capture.recording.first_frame + capture.recording.frames)
 
 
 def _path_of(reconstruction_id: str, capture_id: str, folder: DataFolder, rows: ReconstructionRepository) -> Trajectory:
@@ -71,7 +73,7 @@ def _path_of(reconstruction_id: str, capture_id: str, folder: DataFolder, rows: 
     if row.capture_id != capture_id:
         raise ConfigurationError(f"reconstruction {row.id} is of another capture: its path is not that of this one")
     published = newest(folder.reconstruction(row.id))
-    if published is None or published.poses < _LEAST_POSES:
+    if published is None or published.poses < LEAST_POSES:
         raise ConfigurationError(f"reconstruction {row.id} has no path")
     poses = PoseFile(pose_file(folder.reconstruction(row.id), published))
     return poses.trajectory(range(len(poses)))

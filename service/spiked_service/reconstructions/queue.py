@@ -140,14 +140,17 @@ class Reconstructions:
             maps=tuple(MapRef(map_id) for map_id in map_ids),
             part=part,
         )
-        with self._lock:
-            check(row, self._catalogue, self.rows)
-            try:
-                added = self.rows.add((given or Given()).put(self.rows.pin_maps(row), self._folder, self.rows))
-            except BaseException:
-                self._folder.remove(self._folder.reconstruction(row.id))
-                raise
-            self._wake.notify_all()
+        check(row, self._catalogue, self.rows)
+        try:
+            # Before the lock: a path of a minute is a large file, and captures that begin and end wait for the lock.
+            row = (given or Given()).put(row, self._folder, self.rows, self._catalogue.captures.get(capture_id))
+            with self._lock:
+                check(row, self._catalogue, self.rows)
+                added = self.rows.add(self.rows.pin_maps(row))
+                self._wake.notify_all()
+        except BaseException:
+            self._folder.remove(self._folder.reconstruction(row.id))
+            raise
         return added
 
     def change(self, reconstruction_id: str, **edit: Unpack[ReconstructionEdit]) -> ReconstructionRow:

@@ -35,7 +35,8 @@ def whole_file(path: Path) -> Iterator[Path]:
         return
     part = path.with_name(_part_name())
     try:
-        part.touch(exist_ok=False)
+        # No wider than it will be: what is written may be a secret.
+        part.touch(path.stat().st_mode & 0o777 if path.exists() else 0o666, exist_ok=False)
         with _amount_told(part):
             yield part
             _sync(part)

@@ -11,6 +11,8 @@ from spiked_service.events.bus import Bus, Topic
 from spiked_service.events.payloads import LogPayload
 from spiked_service.settings.settings import LogFormat, LogLevel
 
+AUDIT = "spiked.audit"
+"""Logger of what requests change in settings and tokens."""
 _QUIET = ("uvicorn.access", "uvicorn.error", "asyncio", "websockets")
 """What they have to say below a warning is said better by our own lines."""
 
@@ -60,6 +62,8 @@ def configure_logs(level: LogLevel, format: LogFormat, bus: Bus | None = None) -
 def set_level(level: LogLevel) -> None:
     """The least important line written from now on."""
     logging.getLogger().setLevel(level.upper())
+    # Who changed settings and tokens is written at any level: a request can change the level.
+    logging.getLogger(AUDIT).setLevel(logging.INFO)
 
 
 def logger(name: str, **known: object) -> structlog.stdlib.BoundLogger:

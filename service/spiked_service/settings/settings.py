@@ -30,6 +30,8 @@ NOT_SETTINGS = frozenset(
     {"SPIKED_CONFIG", "SPIKED_CLIENT_TOKEN", "SPIKED_ADDRESS", "SPIKED_SPLAT_TRANSFORM", "SPIKED_FUZZ_SECONDS"}
 )
 """Environment variables with our prefix that say something else: to examples, the page's build, and tests."""
+_PASSED_ON: set[str] = set()
+"""Switches that `pass_on` has put into the environment of this process: they were not set in it."""
 _SWITCHES = ("render", "simd")
 """Settings that compiled modules and workers read from the environment, where an empty one is as good as none."""
 MIB = 1 << 20
@@ -303,9 +305,12 @@ def load_settings(flags: Mapping[str, object] | None = None, file: Path | None =
 def pass_on(settings: Settings) -> None:
     """Put what compiled modules and worker processes read from the environment into it."""
     for name in _SWITCHES:
-        value = getattr(settings, name)
-        if value is not None:
-            os.environ[_PREFIX + name.upper()] = value
+        value, variable = getattr(settings, name), _PREFIX + name.upper()
+        if value is None or os.environ.get(variable) == value:
+            continue
+        if variable not in os.environ:
+            _PASSED_ON.add(name)
+        os.environ[variable] = value
 
 
 def setting(text: str) -> tuple[str, str]:
@@ -332,6 +337,7 @@ def _from_environment() -> dict[str, Any]:
         values = EnvSettingsSource(Settings)()
     except SettingsError as error:
         raise ConfigurationError(f"the environment: {error}") from error
+    values = {name: value for name, value in values.items() if name not in _PASSED_ON}
     return {name: value for name, value in values.items() if value or name not in _SWITCHES}
 
 

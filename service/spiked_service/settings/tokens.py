@@ -20,6 +20,8 @@ from spiked.errors import ConfigurationError
 from spiked_service.settings.settings import Settings
 
 _FILE = "tokens.json"
+_OF_SETTINGS = "settings"
+"""Name of the holder of the token of the settings, which is not stored."""
 _PREFIX = "spiked_"
 """So that a scanner of repositories and logs recognises one."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -101,7 +103,7 @@ class Tokens:
             if hmac.compare_digest(token.sha256, digest) and not token.expired(now):
                 found = Holder(token.name, token.scope)
         if self._extra is not None and hmac.compare_digest(self._extra, digest):
-            found = found or Holder("settings", Scope.ADMIN)
+            found = found or Holder(_OF_SETTINGS, Scope.ADMIN)
         return found
 
     def create(
@@ -109,7 +111,8 @@ class Tokens:
     ) -> str:
         """A new token; this is the only time that it is seen. Raises ConfigurationError for a name that is taken.
 
-        One that is created `by` another token ends no later than that one.
+        One that is created `by` another token ends no later than that one. Raises ConfigurationError, too, if that was
+        revoked or has expired since it was asked for its name.
         """
         if not _NAME.fullmatch(name):
             raise ConfigurationError(f"{name!r} cannot name a token: use letters, digits, '.', '-' and '_'")
@@ -119,7 +122,7 @@ class Tokens:
             if any(token.name == name for token in tokens):
                 raise ConfigurationError(f"there is a token {name} already; revoke it first, or take another name")
             ends = [] if lifetime is None else [now + lifetime]
-            ends += [token.expires_at for token in tokens if token.name == by and token.expires_at is not None]
+            ends += self._end_of(by, tokens, now)
             until = min(ends, default=None)
             tokens.append(
                 StoredToken(
@@ -127,6 +130,15 @@ class Tokens:
                 )
             )
         return secret
+
+    def _end_of(self, by: str | None, tokens: list[StoredToken], now: datetime) -> list[datetime]:
+        """When the token ends with which another one is created; empty: never."""
+        if by is None:
+            return []
+        makers = [token for token in tokens if token.name == by and not token.expired(now)]
+        if not makers and not (by == _OF_SETTINGS and self._extra is not None):
+            raise ConfigurationError(f"the token {by}, which this is asked for with, is not valid any more")
+        return [token.expires_at for token in makers if token.expires_at is not None]
 
     def revoke(self, name: str) -> None:
         """A running service refuses it from its next request on. Raises ConfigurationError if there is none."""

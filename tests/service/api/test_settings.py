@@ -1,8 +1,10 @@
 """Settings and tokens that are changed over HTTP: what is written, what is refused, and who may."""
 
 import json
+import os
 import stat
 from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +12,11 @@ import httpx
 import pytest
 from spiked_service.settings.editing import EDITABLE, edited
 from spiked_service.settings.reload import ReloadableSettings
-from spiked_service.settings.settings import Settings
+from spiked_service.settings.settings import Settings, pass_on
 from spiked_service.settings.tokens import Scope, Tokens
 
 from spiked.errors import ConfigurationError
+from spiked.whole_files import whole_file
 
 FILE = """# of the laboratory
 limit_renders = 3  # the GPU is shared
@@ -199,6 +202,21 @@ def test_a_token_ends_no_later_than_the_one_it_was_made_with(three: Three) -> No
     )
 
 
+def test_a_token_that_was_revoked_meanwhile_makes_none(tmp_path: Path) -> None:
+    tokens = Tokens(tmp_path)
+    tokens.create("week", timedelta(days=7))
+    tokens.revoke("week")
+    with pytest.raises(ConfigurationError, match="week, which this is asked for with, is not valid any more"):
+        tokens.create("for-ever", by="week")
+    tokens.create("ended", timedelta(days=-1))
+    with pytest.raises(ConfigurationError, match="not valid any more"):
+        tokens.create("for-ever", by="ended")
+    with pytest.raises(ConfigurationError, match="not valid any more"):
+        tokens.create("for-ever", by="settings")
+    assert Tokens(tmp_path, "the token of the settings").create("made", by="settings")
+    assert [token.name for token in tokens.all()] == ["ended", "made"]
+
+
 def test_without_a_token_nobody_makes_one_even_on_loopback(daemon: Callable[..., Any], tmp_path: Path) -> None:
     tokens = Tokens(tmp_path / "data")
     reader, admin = tokens.create("reader", scope=Scope.READ), tokens.create("admin")
@@ -211,8 +229,9 @@ def test_without_a_token_nobody_makes_one_even_on_loopback(daemon: Callable[...,
     assert one.http.post("tokens", json=body, headers={"Authorization": f"Bearer {admin}"}).status_code == 201
 
 
-def test_changes_are_logged_with_who_made_them(three: Three) -> None:
+def test_changes_are_logged_with_who_made_them_at_any_level(three: Three) -> None:
     admin = three.http(Scope.ADMIN)
+    assert admin.patch("configuration", json={"values": {"log_level": "error"}}).status_code == 200
     headers = {"Authorization": admin.headers["authorization"]}
     with httpx.stream("GET", f"{three.one.address}api/v1/events?topics=log", headers=headers, timeout=60) as answer:
         lines = answer.iter_lines()
@@ -221,3 +240,27 @@ def test_changes_are_logged_with_who_made_them(three: Three) -> None:
         told = next(line for line in lines if "token created" in line)
     data = json.loads(told.removeprefix("data: "))["data"]
     assert (data["token"], data["caller"]) == ("display", "admin-1")
+
+
+def test_what_is_passed_on_to_workers_is_no_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("spiked_service.settings.settings._PASSED_ON", set())
+    monkeypatch.delenv("SPIKED_RENDER", raising=False)
+    file = tmp_path / "spiked.toml"
+    file.write_text('render = "cpu"\n')
+    settings = ReloadableSettings({}, file)
+    monkeypatch.setenv("SPIKED_RENDER", "")  # so that what is passed on is taken back after this test
+    monkeypatch.delenv("SPIKED_RENDER")
+    pass_on(settings.now)
+    assert os.environ["SPIKED_RENDER"] == "cpu"
+    assert settings.change({"render": "cuda"}).waiting == ["render"]
+    assert 'render = "cuda"' in file.read_text()
+
+
+def test_the_file_is_never_wider_than_it_was(tmp_path: Path) -> None:
+    file = tmp_path / "spiked.toml"
+    file.write_text('token = "secret of the laboratory"\n')
+    file.chmod(0o600)
+    with whole_file(file) as part:
+        assert stat.S_IMODE(part.stat().st_mode) == 0o600
+        part.write_text("")
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600

@@ -13,14 +13,14 @@ from spiked_service.api.auth.security import Caller
 from spiked_service.api.problems import ForbiddenError, problems
 from spiked_service.api.routes.options import whole
 from spiked_service.api.schemas.base import In, example
-from spiked_service.events.logging import logger
+from spiked_service.events.logging import AUDIT, logger
 from spiked_service.settings.editing import EDITABLE
 from spiked_service.settings.reload import ReloadableSettings
 from spiked_service.settings.settings import MOST_DAYS, SettingOrigin, Settings, field, own_file, reloadable
 from spiked_service.settings.tokens import Scope, Tokens
 from spiked_service.store.catalogue import UnknownIdError
 
-_log = logger("spiked.audit")
+_log = logger(AUDIT)
 _LONGEST_NAME = 64
 """Characters of a token's name."""
 TokenName = Annotated[str, Field(pattern=rf"^[A-Za-z0-9][A-Za-z0-9._-]{{0,{_LONGEST_NAME - 1}}}$")]

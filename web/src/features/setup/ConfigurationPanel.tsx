@@ -84,7 +84,7 @@ function Form({
     // The form leaves defaults out; null removes a setting from the file.
     const wanted = free.map((item) => [item.key, values[item.key] ?? null] as const);
     const isChanged = ([key, value]: readonly [string, unknown]): boolean =>
-      (value ?? properties[key]?.default ?? null) !== (initial[key] ?? null);
+      (value ?? properties[key]?.default ?? null) !== (initial[key] ?? null) || found.needs_restart.includes(key);
     const changes = Object.fromEntries(wanted.filter(isChanged));
     if (Object.keys(changes).length === 0) toast("Nothing has changed");
     else await onChange(changes);

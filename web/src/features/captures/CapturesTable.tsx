@@ -129,7 +129,7 @@ export function CapturesTable(): JSX.Element {
                 <span className="dim" role="status">
                   {count(shown.length)} of {count(listed.total)}
                 </span>
-                {listed.cursor !== null && <MoreButton onMore={more} />}
+                {listed.cursor !== null && <MoreButton waits={problem !== null} onMore={more} />}
               </p>
             }
           >
@@ -160,15 +160,15 @@ function sortingBy(sort: CaptureSort, order: Order, onOrder: (order: Order) => v
   };
 }
 
-/** Fetches more when it comes into view, or is pressed. */
-function MoreButton({ onMore }: { onMore: () => void }): JSX.Element {
+/** Fetches more when it comes into view, unless it waits, or is pressed. */
+function MoreButton({ waits, onMore }: { waits: boolean; onMore: () => void }): JSX.Element {
   const button = useRef<HTMLButtonElement>(null);
   const latest = useRef(onMore);
   useEffect(() => {
     latest.current = onMore;
   });
   useEffect(() => {
-    if (button.current === null) return;
+    if (button.current === null || waits) return; // after an error it is pressed
     const watch = new IntersectionObserver((seen) => seen.some((one) => one.isIntersecting) && latest.current());
     watch.observe(button.current);
     return () => watch.disconnect();

@@ -1,4 +1,4 @@
-/** Which file an upload is of, for a page that is loaded again: the service knows the name and the size only. */
+/** Which file an upload is of, for a page that is loaded again: the service knows its size only. */
 
 import type { Upload } from "../../shared/api/types";
 
@@ -23,7 +23,7 @@ function keep(files: Record<string, Remembered>): void {
   try {
     localStorage.setItem(KEY, JSON.stringify(files));
   } catch {
-    // It is then compared by name and size only.
+    // Uploads do not go on after the page is loaded again.
   }
 }
 
@@ -33,15 +33,17 @@ export const rememberFile = (id: string, file: File, calibration: boolean): void
 export const forgetFile = (id: string): void =>
   keep(Object.fromEntries(Object.entries(remembered()).filter(([key]) => key !== id)));
 
-/** Why a file is not the one that an upload was begun with, as far as that is known; null if nothing says so. */
+/** Why a file is not the one that an upload was begun with; null if it is. */
 export function whyNot(upload: Upload, file: File): string | null {
   const known = remembered()[upload.id];
-  const name = known?.file ?? upload.name;
+  // Another file of the same name and size would make a recording of two halves.
+  if (known === undefined) return "This browser did not begin the upload, and cannot tell its file: cancel it here.";
+  const name = known.file;
   if (file.name !== name) return `The upload was begun with ${name}, and this is ${file.name}.`;
   if (file.size !== upload.bytes) return `${name} had ${upload.bytes} bytes, and now it has ${file.size}.`;
-  if (known !== undefined && file.lastModified !== known.modified)
+  if (file.lastModified !== known.modified)
     return `${name} was changed since the upload was begun: cancel it, and upload the file anew.`;
-  if (known?.calibration === true && upload.offset_bytes === 0)
+  if (known.calibration && upload.offset_bytes === 0)
     return "Its calibration may not have been sent: cancel it, and upload the files anew.";
   return null;
 }

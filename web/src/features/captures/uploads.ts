@@ -54,7 +54,7 @@ export async function upload(
   useUploads.setState(({ uploads }) => ({ uploads: [...uploads, began] }));
   let uploadId = begun?.id ?? null;
   try {
-    return await uploadFile({
+    const made = await uploadFile({
       file,
       request,
       calibration,
@@ -71,11 +71,12 @@ export async function upload(
       onWait: (error) => change({ waits: errorText(error) }),
       signal: aborting.signal,
     });
+    if (uploadId !== null) forgetFile(uploadId);
+    return made;
   } catch (error) {
     if (aborting.signal.aborted) return null;
     throw error;
   } finally {
-    if (uploadId !== null) forgetFile(uploadId);
     useUploads.setState(({ uploads }) => ({ uploads: uploads.filter((one) => one.id !== id) }));
   }
 }

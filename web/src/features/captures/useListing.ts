@@ -58,6 +58,7 @@ export function useListing(q: string, filter: Filter, { sort, descending }: Orde
     const wanted = { q, filter, sort, descending };
     const fetchAll = async (): Promise<void> => {
       // The same list, fetched again, is as long as it was.
+      const known = newestOf(Object.keys(useService.getState().captures));
       const shown = now.current !== null && isSame(now.current, wanted) ? now.current.items.length : 0;
       let found = await page(wanted, Math.min(MOST, Math.max(PAGE, shown)));
       while (found.items.length < shown && found.cursor !== null && current) {
@@ -66,7 +67,7 @@ export function useListing(q: string, filter: Filter, { sort, descending }: Orde
       }
       if (!current) return;
       setListed(found);
-      setUpTo(newestOf(Object.keys(useService.getState().captures)));
+      setUpTo(known);
       setProblem(null);
     };
     const timer = setTimeout(
@@ -102,13 +103,12 @@ export function useListing(q: string, filter: Filter, { sort, descending }: Orde
     const before = listed;
     setBusy(true);
     page(before, PAGE, listed.cursor)
-      .then((found) =>
+      .then((found) => {
+        setProblem(null);
         setListed((old) =>
-          old === null || !isSame(old, before) || old.cursor !== before.cursor
-            ? old
-            : { ...found, items: [...old.items, ...found.items] },
-        ),
-      )
+          old === null || !isSame(old, before) || old.cursor !== before.cursor ? old : withMore(old, found),
+        );
+      })
       .catch((error: unknown) => setProblem(errorText(error)))
       .finally(() => setBusy(false));
   };
@@ -139,6 +139,12 @@ async function page(wanted: Wanted, limit: number, cursor?: string): Promise<Lis
     ...(cursor === undefined ? {} : { cursor }),
   });
   return { q, filter, sort, descending, items: found.items, cursor: found.next_cursor, total: found.total };
+}
+
+/** The list with its next page; what was sorted elsewhere since the first one was fetched is not repeated. */
+export function withMore<T extends { items: { id: string }[] }>(old: T, next: T): T {
+  const ids = new Set(old.items.map((one) => one.id));
+  return { ...next, items: [...old.items, ...next.items.filter((one) => !ids.has(one.id))] };
 }
 
 /** The list with a new first page of it; what follows stays, if the two meet. */

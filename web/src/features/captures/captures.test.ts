@@ -1,10 +1,11 @@
 import { describe, expect, it } from "vitest";
 
-import type { Timeline } from "../../shared/api/types";
+import type { Timeline, Upload } from "../../shared/api/types";
 import { fieldsOf, optionsOf, valuesOf, withOptions } from "../../shared/ui/options";
 import { along, flicker, hasWork, joined } from "./series";
 import { thinned } from "./thinned";
-import { withFirst } from "./useListing";
+import { rememberFile, whyNot } from "./rememberedFiles";
+import { withFirst, withMore } from "./useListing";
 import { merged } from "../live/Histogram";
 
 const SCHEMA = {
@@ -112,6 +113,28 @@ describe("a new first page of the list", () => {
   it("replaces a list that it does not meet", () => {
     const first = list(["i", "h"], "h", 9);
     expect(withFirst(list(["c", "b"], "b", 5), first)).toBe(first);
+  });
+});
+
+it("shows a capture once that was sorted elsewhere between two pages", () => {
+  const list = (ids: string[]): { items: { id: string }[] } => ({ items: ids.map((id) => ({ id })) });
+  expect(withMore(list(["a", "b"]), list(["b", "c"]))).toEqual(list(["a", "b", "c"]));
+});
+
+describe("the file of an upload that goes on", () => {
+  const file = new File(["spikes"], "garden.dat", { lastModified: 5 });
+  const upload = { id: "u", name: "Garden", bytes: file.size, offset_bytes: 3 } as unknown as Upload;
+
+  it("is not told in a browser that did not begin it", () => {
+    expect(whyNot(upload, file)).toMatch("did not begin");
+  });
+
+  it("is that of the same name, size and time, whatever the capture is called", () => {
+    rememberFile("u", file, false);
+    expect(whyNot(upload, file)).toBeNull();
+    expect(whyNot(upload, new File(["spikes"], "room.dat", { lastModified: 5 }))).toMatch("was begun with garden.dat");
+    expect(whyNot(upload, new File(["spike"], "garden.dat", { lastModified: 5 }))).toMatch("bytes");
+    expect(whyNot(upload, new File(["spikes"], "garden.dat", { lastModified: 6 }))).toMatch("was changed");
   });
 });
 

@@ -8,6 +8,7 @@ from types import ModuleType
 
 from spiked.errors import ConfigurationError
 from spiked.export.source import ExportOptions, ExportSource
+from spiked.sensor import Sensor
 from spiked.whole_files import whole_file, whole_folder
 
 __all__ = ["ExportKind"]
@@ -31,6 +32,8 @@ class ExportKind:
     """Writes the file, or fills an empty folder, and says in a few words what is in it.
 
     Raises SpikedError for a source that lacks what the format needs, and OSError. It need not clean up."""
+    limit: Callable[[Sensor | None, ExportOptions], object] = lambda sensor, options: None
+    """Raises ConfigurationError for options that ask for too much."""
     packages: tuple[str, ...] = ()
     """Modules that only this format needs."""
     extra: str = "export"

@@ -8,25 +8,25 @@ from spiked.errors import ConfigurationError
 from spiked.export.kind import ExportKind
 from spiked.export.source import ExportOptions, ExportSource
 from spiked.pose import rotation_of
+from spiked.sensor import Sensor
 from spiked.trajectory import Trajectory
 from spiked.video import CameraPath, Mp4Writer, calm_path, recorded_path, scene_pictures, video_camera, waypoint_path
+from spiked.video.limits import check_size
 
 __all__ = ["KIND"]
 
-MOST_PICTURES = 36_000
-"""Of a video: twenty minutes at 30 a second. An export of a service is made while others wait for it."""
+
+def limit(sensor: Sensor | None, options: ExportOptions) -> int:
+    """The number of pictures. Raises ConfigurationError for a video that is too large."""
+    camera = video_camera(sensor, options.width, options.height)
+    return check_size(options.seconds, options.pictures_a_second, camera.width, camera.height)
 
 
 def write(source: ExportSource, file: Path, options: ExportOptions) -> str:
     """Write the file. Raises SceneError, ConfigurationError and OSError."""
     scene, camera = source.need_scene(), video_camera(source.need_sensor(), options.width, options.height)
     path = _path(source, options)
-    count = max(1, round(options.seconds * options.pictures_a_second))
-    if count > MOST_PICTURES:
-        raise ConfigurationError(
-            f"{options.seconds:g} s with {options.pictures_a_second:g} pictures a second are {count:,} pictures, more "
-            f"than {MOST_PICTURES:,}: make the video shorter, or give it fewer a second"
-        )
+    count = limit(source.sensor, options)
     with Mp4Writer(file, options.pictures_a_second) as video:
         for picture in scene_pictures(scene, path, camera, count, source.white):
             video.write(picture)
@@ -53,6 +53,7 @@ KIND = ExportKind(
     loses="everything but what the camera would have seen",
     suffix=".mp4",
     fill=write,
+    limit=limit,
     packages=("av",),
     extra="video",
     media_type="video/mp4",

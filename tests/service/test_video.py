@@ -3,13 +3,17 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
 import pytest
+from spiked_service.workers.messages import VideoCommand
+from spiked_service.workers.slow_motion import slow_motion_of
 
+from spiked.errors import ConfigurationError
 from spiked.pose import exp_so3
-from spiked.recording import RecordingWriter
+from spiked.recording import RecordingWriter, open_recording
 from spiked.scene import Scene
 from spiked.sensor import Sensor
 from spiked.simulate import Room, SimulatedCamera
@@ -92,3 +96,16 @@ def test_ten_seconds_are_the_default(tmp_path: Path) -> None:
     done = spiked("recording", tmp_path / "a.dat", "--fps", 5, "-o", tmp_path / "b.mp4")
     assert done.returncode == 0, done.stderr
     assert "50 pictures, 10 s, 200 times slower" in done.stdout
+
+
+@pytest.mark.parametrize("more", [{"window": 4096}, {"compensated": True}])
+def test_slow_motion_that_would_take_hours_is_refused(tmp_path: Path, more: dict[str, Any]) -> None:
+    sensor = Sensor(1000, 1000, 20_000.0)
+    with RecordingWriter(tmp_path / "large.dat", sensor) as writer:
+        writer.append(np.zeros((20, sensor.frame_bytes), np.uint8))
+    recording = open_recording(writer.path)
+    asked: dict[str, Any] = {"window": 16, "compensated": False, "begin_s": 0.0, "end_s": None}
+    command = VideoCommand(recording=writer.path, out=tmp_path / "a.mp4", slower=1e6, pictures_a_second=30.0, **asked)
+    assert len(slow_motion_of(command, recording).times_s(recording)) == 30_000
+    with pytest.raises(ConfigurationError, match="would take hours"):
+        slow_motion_of(command.model_copy(update=more), recording)

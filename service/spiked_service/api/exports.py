@@ -5,13 +5,16 @@ They are made in a worker process, and kept for further requests.
 
 import shutil
 import threading
+import time
 import zlib
 from pathlib import Path
 
+from anyio import from_thread
 from fastapi import Request, Response
 
 from spiked.errors import ConfigurationError, SpikedError
 from spiked.export import ExportKind, ExportOptions
+from spiked.recording import open_recording
 from spiked_service.api import files
 from spiked_service.api.problems import NothingError, NotReadyError
 from spiked_service.api.results import Result, Results
@@ -22,9 +25,16 @@ from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import CaptureRow, ReconstructionRow
 from spiked_service.workers.messages import ExportCommand, VideoCommand, WorkerError, WorkerEvent
 from spiked_service.workers.process import WorkerProcess
+from spiked_service.workers.slow_motion import slow_motion_of
 
 KEPT = 4
 """Files that are kept: somebody may resume a download or ask again."""
+LONGEST_S = 2 * 3600.0
+"""Time for an export, seconds: twice that of the largest video on two cores. Others wait for it."""
+LOOK_S = 0.5
+"""Interval at which it is seen whether the client still waits, seconds."""
+EXIT_S = 5.0
+"""Time for a worker to exit whose export is given up, seconds."""
 
 
 class Exports:
@@ -70,8 +80,9 @@ class Exports:
         number = result.published.version
         made = self._place / f"{row.id}-{number:06d}-{zlib.crc32(repr(known).encode()):08x}"
         if not made.exists():
+            kind.limit(result.sensor, options)
             try:
-                self._make(self._command(row, capture, title, result, kind, options, made))
+                self._make(self._command(row, capture, title, result, kind, options, made), request)
             except ConfigurationError as error:
                 if result.published.splats:
                     raise
@@ -104,19 +115,19 @@ class Exports:
         asked = (slower, fps, window, compensated, begin_s, end_s)
         made = self._place / f"{capture_id}-{zlib.crc32(repr((files.stamp(recording), asked)).encode()):08x}"
         if not made.exists():
-            self._make(
-                VideoCommand(
-                    capture_id=capture_id,
-                    recording=recording,
-                    out=made,
-                    slower=slower,
-                    pictures_a_second=fps,
-                    window=window,
-                    compensated=compensated,
-                    begin_s=begin_s,
-                    end_s=end_s,
-                )
+            command = VideoCommand(
+                capture_id=capture_id,
+                recording=recording,
+                out=made,
+                slower=slower,
+                pictures_a_second=fps,
+                window=window,
+                compensated=compensated,
+                begin_s=begin_s,
+                end_s=end_s,
             )
+            slow_motion_of(command, open_recording(recording))  # refuses what is too large
+            self._make(command, request)
         return files.ranged(request, made, f"{capture_id}-slow.mp4", "video/mp4")
 
     def _command(
@@ -148,7 +159,7 @@ class Exports:
             metric=result.frame is not None,
         )
 
-    def _make(self, command: ExportCommand | VideoCommand) -> None:
+    def _make(self, command: ExportCommand | VideoCommand, request: Request) -> None:
         """Run the worker to its end. Raises OverloadedError, DiskFullError and ConfigurationError."""
         if not self._making.acquire(blocking=False):
             raise OverloadedError("another export is being made; try again when it is ready")
@@ -156,15 +167,16 @@ class Exports:
             self._place.mkdir(exist_ok=True)
             self._tidy(KEPT - 1)
             try:
-                self._run(command)
+                self._run(command, request)
             except DiskFullError:
                 if not self._tidy(0):
                     raise
-                self._run(command)  # with the space of those that were kept
+                self._run(command, request)  # with the space of those that were kept
         finally:
             self._making.release()
 
-    def _run(self, command: ExportCommand | VideoCommand) -> None:
+    def _run(self, command: ExportCommand | VideoCommand, request: Request) -> None:
+        """Run the worker to its end, at most until the client has gone or for `LONGEST_S`."""
         errors: list[SpikedError] = []
         ended = threading.Event()
 
@@ -177,8 +189,18 @@ class Exports:
                 errors.append(ConfigurationError(reason))
             ended.set()
 
-        WorkerProcess(command, self._folder.path / "exports.log", on_event, on_exit)
-        ended.wait()
+        worker = WorkerProcess(command, self._folder.path / "exports.log", on_event, on_exit)
+        deadline_s = time.monotonic() + LONGEST_S
+        while not ended.wait(LOOK_S):
+            late = time.monotonic() > deadline_s
+            if not late and not from_thread.run(request.is_disconnected):
+                continue
+            worker.dismiss()
+            worker.kill_after(EXIT_S)
+            self._tidy(KEPT)  # of what it has begun
+            if late:
+                raise ConfigurationError(f"this was not ready after {LONGEST_S / 3600:g} hours: ask for less")
+            raise OverloadedError("the client has closed the connection, so the export was given up")
         if errors:
             raise errors[0]
 

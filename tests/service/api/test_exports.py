@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import av
+import httpx
 import pytest
 from plyfile import PlyData
+from waiting import until
 
 from spiked.client import CaptureOut
 from spiked.export import KINDS, find_kind
@@ -90,8 +92,28 @@ def test_a_video_has_the_wanted_size_rate_and_path(service: Any, job: str) -> No
     made = [service.http.get(f"{url}&along={along}", timeout=120) for along in ("smooth", "recorded")]
     assert [pictures_of(one.content) for one in made] == [(120, 90, 10, 20.0)] * 2
     assert made[0].content != made[1].content
-    long = service.http.get(f"reconstructions/{job}/exports/video?seconds=1200&fps=240", timeout=120)
-    assert long.status_code == 422 and "make the video shorter" in long.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ("seconds=1200&fps=240", "make the video shorter"),
+        ("width=4096&height=4096&seconds=0.1", "more than 9,437,184 pixels"),
+        ("width=1920&height=1080&seconds=1200", "make 17,361 at most, or smaller ones"),
+    ],
+)
+def test_a_video_that_would_take_hours_is_refused(service: Any, job: str, asked: str, said: str) -> None:
+    refused = service.http.get(f"reconstructions/{job}/exports/video?{asked}")
+    assert refused.status_code == 422 and said in refused.json()["detail"], refused.text
+
+
+def test_an_export_whose_client_has_gone_makes_way_for_others(service: Any, job: str) -> None:
+    url = f"reconstructions/{job}/exports"
+    with pytest.raises(httpx.ReadTimeout):
+        service.http.get(f"{url}/video?width=1000&height=800&seconds=1000&fps=30", timeout=3)
+    until(lambda: service.http.get(f"{url}/ply?views=7").status_code == 200, "another export is made", 15)
+    kept = Path(service.http.get("system").json()["data_folder"]) / "exports"
+    assert not [file for file in kept.iterdir() if file.name.startswith(".")], "what was begun is gone"
 
 
 def test_a_recording_is_sent_in_slow_motion(service: Any, done: CaptureOut) -> None:

@@ -41,9 +41,15 @@ ExpectedDepth = Annotated[bool, Query(description="Mean depth of what a pixel sh
 Resolution = Annotated[
     int, Query(ge=16, le=512, description="Voxels of a mesh along the longest side of the scene."), IN_DIGITS
 ]
-Seconds = Annotated[float, Query(ge=0.1, le=1200, description="Length of a video.")]
+Seconds = Annotated[
+    float, Query(ge=0.1, le=1200, description="Length of a video; 36,000 pictures of 1000 x 1000 at most.")
+]
 Fps = Annotated[float, Query(ge=1, le=240, description="Pictures a second of a video.")]
-Side = Annotated[int | None, Query(ge=16, le=8192, description="Pixels of a video. Default: of the sensor."), IN_DIGITS]
+Side = Annotated[
+    int | None,
+    Query(ge=16, le=8192, description="Pixels of a video, 4096 x 2304 at most. Default: of the sensor."),
+    IN_DIGITS,
+]
 Along = Annotated[
     Literal["smooth", "recorded"],
     Query(description="A video follows the recorded path without its tremor, or as it is."),
@@ -90,7 +96,7 @@ _VIDEO: dict[int | str, dict[str, Any]] = {
 }
 _DESCRIPTION = (
     "in a format of another program; `GET exports` lists them. The file is made in a worker process, which takes "
-    "seconds to minutes, and kept for a while; one is made at a time."
+    "seconds to minutes, and kept for a while. One is made at a time, and given up when its client hangs up."
 )
 
 

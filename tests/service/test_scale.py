@@ -61,6 +61,7 @@ def test_up_is_found_by_the_floor_gravity_and_points(tmp_path: Path) -> None:
     stored = read_scale(out)
     assert stored.metres_per_unit == 2.0 and stored.up is not None
     assert np.allclose(stored.up, [0, 0, 1], atol=1e-6)
+    assert "the nearest pose is at" in str(run(out, "--gravity", x, y, z, "--at", "99").exception)
     assert "write three points" in str(run(out, "--floor-points", "a,b,c").exception)
     assert "one of each" in str(run(out, "--floor", "--up", "0", "0", "1").exception)
 

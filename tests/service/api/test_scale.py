@@ -49,7 +49,7 @@ def test_a_scale_is_stored_once_and_answers_are_in_metres(service: Any, done: Ca
 
 def test_up_by_gravity_points_or_the_floor(service: Any, done: CaptureOut, job: str) -> None:
     http, url = service.http, f"reconstructions/{job}"
-    path = http.get(f"{url}/trajectory?step=50").json()
+    path = http.get(f"{url}/trajectory?step=51").json()
     revision = http.get(f"{url}/scale").json()["revision"]
     w, x, y, z = path["quaternions_wxyz"][1]
     down = [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]  # the camera's y axis
@@ -57,6 +57,8 @@ def test_up_by_gravity_points_or_the_floor(service: Any, done: CaptureOut, job: 
     found = http.post(f"{url}/scale:up", json=body)
     assert found.status_code == 200, found.text
     np.testing.assert_allclose(found.json()["up"], [-part for part in down], atol=1e-6)
+    far = http.post(f"{url}/scale:up", json=body | {"revision": revision + 1, "frame": 100_000})
+    assert far.status_code == 404 and "no pose within 30 ms of frame 100000" in far.json()["detail"], far.text
     points = [[0, 100, 0], [1, 100, 0], [0, 100, 1]]
     by_points = http.post(f"{url}/scale:up", json={"revision": revision + 1, "points": points}).json()
     np.testing.assert_allclose(by_points["up"], [0, -1, 0], atol=1e-9)

@@ -8,12 +8,13 @@ from spiked.board import Board
 from spiked.board_scale import scale_by_board
 from spiked.errors import ConfigurationError
 from spiked.frame_of_reference import FrameOfReference
+from spiked.recon.view_tracking import BRIDGED_S
 from spiked.render import Camera
 from spiked.scene import Scene
 from spiked.tag_scale import VIEWS, scale_by_tags
 from spiked.upright import find_floor, up_by_gravity, up_by_points
 from spiked_service.api.idempotency import IdempotencyKey
-from spiked_service.api.problems import ConflictError, problems
+from spiked_service.api.problems import ConflictError, NoPoseError, problems
 from spiked_service.api.results import Result, Results
 from spiked_service.api.schemas.scale import (
     BoardScaleOut,
@@ -132,11 +133,14 @@ def _stored(result: Result, revision: int, changes: dict[str, object]) -> ScaleO
 
 
 def _up(result: Result, body: UpRequest) -> np.ndarray:
-    """Raises SceneError if no floor is found, and ConfigurationError."""
+    """Raises SceneError if no floor is found, NoPoseError, and ConfigurationError."""
+    if body.gravity is not None:
+        poses, rate_hz = result.poses(), result.frame_rate_hz
+        row = 0 if body.frame is None else poses.nearest((body.frame + 0.5) / rate_hz, BRIDGED_S)
+        if row is None:
+            raise NoPoseError(f"there is no pose within {1000 * BRIDGED_S:g} ms of frame {body.frame} in this version")
+        return up_by_gravity(body.gravity, poses.trajectory(range(row, row + 1)).rotations[0])
     path = result.path(4 * VIEWS)
     if body.points is not None:
         return up_by_points(np.array(body.points), path.centres)
-    if body.gravity is None:
-        return find_floor(Scene.read_ply(result.scene), path).up
-    at_s = path.times_s[0] if body.frame is None else (body.frame + 0.5) / result.frame_rate_hz
-    return up_by_gravity(body.gravity, path.rotations[int(np.abs(path.times_s - at_s).argmin())])
+    return find_floor(Scene.read_ply(result.scene), path).up

@@ -12,6 +12,7 @@ from spiked.board import DICTIONARIES, Board
 from spiked.board_scale import scale_by_board
 from spiked.errors import ConfigurationError
 from spiked.frame_of_reference import FrameOfReference
+from spiked.recon.view_tracking import BRIDGED_S
 from spiked.tag_scale import TAG_FAMILIES, scale_by_tags
 from spiked.upright import find_floor, up_by_gravity, up_by_points
 from spiked.whole_files import whole_folder
@@ -47,7 +48,9 @@ _Gravity = Annotated[
     _DIRECTION | None,
     typer.Option(metavar="X Y Z", help="Gravity in the axes of the camera (y down, z forward) at --at."),
 ]
-_At = Annotated[float, typer.Option(help="Time of --gravity, seconds since frame 0.")]
+_At = Annotated[
+    float | None, typer.Option(help="Time of --gravity, seconds since frame 0. Default: of the first pose.")
+]
 _Floor = Annotated[bool, typer.Option("--floor", help="Up by the floor, which is found.")]
 _FloorPoints = Annotated[
     str | None, typer.Option(metavar="'X,Y,Z X,Y,Z X,Y,Z'", help="Up by three points of the floor in the scene.")
@@ -68,7 +71,7 @@ def scale(
     offset: _Offset = 0.0,
     up: _Up = None,
     gravity: _Gravity = None,
-    at: _At = 0.0,
+    at: _At = None,
     floor: _Floor = False,
     floor_points: _FloorPoints = None,
 ) -> None:
@@ -164,14 +167,18 @@ def _upright(
     found: MapFolder,
     up: _DIRECTION | None,
     gravity: _DIRECTION | None,
-    at_s: float,
+    at_s: float | None,
     floor: bool,
     floor_points: str | None,
 ) -> _DIRECTION | None:
     """Up by what is given; None if nothing is. Raises ConfigurationError and SceneError."""
     path = found.trajectory
     if gravity is not None:
-        row = int(np.abs(path.times_s - at_s).argmin())
+        row = 0 if at_s is None else int(np.abs(path.times_s - at_s).argmin())
+        if at_s is not None and abs(path.times_s[row] - at_s) > BRIDGED_S:
+            raise ConfigurationError(
+                f"--at {at_s:g}: the nearest pose is at {path.times_s[row]:g} s, more than {1000 * BRIDGED_S:g} ms away"
+            )
         x, y, z = up_by_gravity(gravity, path.rotations[row]).tolist()
     elif floor:
         by_floor = find_floor(found.scene, path)

@@ -578,6 +578,12 @@ def test_an_onlooker_has_no_place_and_no_source_waits_for_it(writer: RingWriter)
     assert not reader._segment.slot(0, 1).flags.writeable  # nothing in this process can write the ring through it
 
 
+def test_an_onlooker_makes_no_reader_with_a_place(writer: RingWriter) -> None:
+    reader = RingReader.watch(writer.name)
+    with pytest.raises(RingError, match="an onlooker of ring"):
+        reader.another(Policy.LOSSLESS, "late", 0)
+
+
 def test_a_reader_closed_twice_frees_only_its_own_place(writer: RingWriter) -> None:
     first = attach(writer)
     first.close()

@@ -101,6 +101,7 @@ class RingReader:
         self._counters.next_slot = self._slot_of(self._counters.next_entry, writer)
         self._start = self._counters.next_entry  # earlier frames were missed by attaching late and are no overrun
         self._owner = own_identity()
+        self._looks_on = consumer is None
         self._place = None if consumer is None else self._claim_place(consumer)
 
     @classmethod
@@ -129,7 +130,12 @@ class RingReader:
         return reader
 
     def another(self, policy: Policy, consumer: str, start_frame: int) -> "RingReader":
-        """One more reader of the same ring, whose name may have been removed meanwhile; see `attach`."""
+        """One more reader of the same ring, whose name may have been removed meanwhile; see `attach`.
+
+        Raises RingError if this one only looks on: its memory is read-only.
+        """
+        if self._looks_on:
+            raise RingError(f"an onlooker of ring {self._segment.name} cannot make a reader with a place: attach to it")
         return RingReader(self._segment, policy, consumer, start_frame)
 
     @property

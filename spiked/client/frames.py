@@ -50,8 +50,12 @@ class FrameBlock:
         return unpack(self.data, self._sensor)
 
     def intact(self) -> bool:
-        """Whether `data` was not overwritten up to now. Ask when you have used it: if not, forget what you computed."""
-        return self._frames.valid()
+        """Whether `data` was not overwritten up to now. Ask when you have used it: if not, forget what you computed.
+
+        The first answer, or taking the next block, decides whether the block counts as lost, as part of the next
+        block's `lost` and of the stream's: later answers change no count.
+        """
+        return self._frames.release() and self._frames.present()
 
 
 class FrameStream:

@@ -54,6 +54,10 @@ class Frames:
         """Whether the frames have not been overwritten up to now, or up to their release."""
         return self._reader._holds(self._slot) if self._intact is None else self._intact
 
+    def present(self) -> bool:
+        """Whether the ring still has the frames, also after their release."""
+        return self._reader._holds(self._slot)
+
     def release(self) -> bool:
         """Return the slot. True if the frames were intact until now; they then count as read.
 

@@ -70,6 +70,35 @@ def test_a_block_that_was_overwritten_while_it_was_used_says_so_and_counts_as_lo
         assert later.intact() and later.lost == later.first and stream.lost == later.first
 
 
+def test_a_block_says_that_it_was_overwritten_after_the_next_was_taken() -> None:
+    with RingWriter.create(SENSOR, slots=16) as writer:
+        stream = FrameStream(writer.name)
+        put(writer)
+        put(writer)
+        blocks = iter(stream)
+        first, _second = next(blocks), next(blocks)
+        assert first.intact()
+        for _ in range(40):
+            put(writer)
+        assert not first.intact()
+        stream.close()
+        assert not first.intact()
+
+
+def test_a_block_that_was_intact_counts_as_read_only() -> None:
+    with RingWriter.create(SENSOR, slots=16) as writer:
+        stream = FrameStream(writer.name)
+        put(writer)
+        blocks = iter(stream)
+        first = next(blocks)
+        assert first.intact()
+        for _ in range(40):
+            put(writer)
+        later = next(blocks)
+        assert later.lost == stream.lost == later.first - 8
+        assert not first.intact() and stream.lost == later.lost
+
+
 def test_a_ring_that_is_not_here_is_refused() -> None:
     with pytest.raises(RingError, match="there is no ring spiked-nowhere"):
         FrameStream("spiked-nowhere")

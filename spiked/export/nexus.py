@@ -12,6 +12,8 @@ import numpy as np
 from spiked.export.kind import ExportKind, optional
 from spiked.export.source import ExportOptions, ExportSource, optics_of
 from spiked.export.timeline import Timeline, read_timeline
+from spiked.export.views import Doubles
+from spiked.pose import quaternion
 from spiked.recording import Recording
 from spiked.scene import unit_quats
 from spiked.whole_files import KeptErrors
@@ -72,18 +74,23 @@ def _write_path(entry: Any, timeline: Timeline, source: ExportSource) -> None:
     path = _group(entry, "path", "NXdata")
     path.attrs.update({"signal": "position", "axes": ["time", "."]})
     _field(path, "time", source.path.times_s, "s")
-    _field(path, "position", timeline.centres, source.unit)
-    path["position"].attrs["long_name"] = "camera position in world axes, x y z"
-    path["quaternion"] = timeline.quats_xyzw[:, [3, 0, 1, 2]]
-    path["quaternion"].attrs["long_name"] = (
-        "camera-to-world rotation, w x y z; camera axes are x right, y down, z forward"
-    )
+    _write_poses(path, timeline.centres, timeline.quats_xyzw[:, [3, 0, 1, 2]], source.unit)
     _field(path, "stamp", timeline.stamps_ns, "ns")
     path["stamp"].attrs["start"] = "1970-01-01T00:00:00Z" if timeline.unix else "frame 0 of the capture"
 
 
+def _write_poses(group: Any, centres: Doubles, quats_wxyz: Doubles, unit: str) -> None:
+    """Positions [n, 3] and rotations [n, 4]."""
+    _field(group, "position", centres, unit)
+    group["position"].attrs["long_name"] = "camera position in world axes, x y z"
+    group["quaternion"] = quats_wxyz
+    group["quaternion"].attrs["long_name"] = (
+        "camera-to-world rotation, w x y z; camera axes are x right, y down, z forward"
+    )
+
+
 def _write_views(entry: Any, timeline: Timeline, source: ExportSource) -> None:
-    """Key views: NXdata of the depth maps over time, with pictures and the rows of their poses."""
+    """Key views: NXdata of the depth maps over time, with pictures and poses."""
     views = _group(entry, "key_views", "NXdata")
     views.attrs.update({"signal": "depth", "axes": ["time", ".", "."]})
     _field(views, "time", np.array([key.view.time_s for key in timeline.keys]), "s")
@@ -91,7 +98,13 @@ def _write_views(entry: Any, timeline: Timeline, source: ExportSource) -> None:
     views.create_dataset("depth", data=depth, chunks=(1, *depth.shape[1:]), **COMPRESSION)
     views["depth"].attrs.update({"units": source.unit, "long_name": "z along the camera's axis; 0: no surface"})
     views["pose"] = np.array([key.view.row for key in timeline.keys])
-    views["pose"].attrs["long_name"] = "row of the pose in path"
+    views["pose"].attrs["long_name"] = "row of path nearest in time"
+    _write_poses(
+        views,
+        np.stack([key.view.centre for key in timeline.keys]),
+        quaternion(np.stack([key.view.rotation for key in timeline.keys])),
+        source.unit,
+    )
     pictures = np.stack([key.pixels for key in timeline.keys])
     views.create_dataset("picture", data=pictures, chunks=(1, *pictures.shape[1:]), **COMPRESSION)
     views["picture"].attrs["long_name"] = f"linear, {'recorded' if timeline.recorded else 'rendered'}"

@@ -148,7 +148,7 @@ class ExportSource:
             rows = self.key_rows(options)
             return [KeyPose(row, float(path.times_s[row]), path.rotations[row], path.centres[row]) for row in rows]
         rate = self.need_sensor().frame_rate_hz
-        return [self._pose_at(frame, (frame + 0.5) / rate) for frame in options.frames]
+        return [self._pose_at(frame, (frame + 0.5) / rate) for frame in sorted(set(options.frames))]
 
     def _pose_at(self, frame: int, time_s: float) -> KeyPose:
         path = self.path
@@ -157,15 +157,21 @@ class ExportSource:
             return KeyPose(row, float(path.times_s[row]), path.rotations[row], path.centres[row])
         after = int(np.searchsorted(path.times_s, time_s))
         if not 0 < after < len(path) or path.times_s[after] - path.times_s[after - 1] > BRIDGED_S:
-            first, last = (time * self.need_sensor().frame_rate_hz - 0.5 for time in path.times_s[[0, -1]])
-            known = f"there are poses from {first:.0f} to {last:.0f}"
-            raise SceneError(f"frame {frame} of {self.name} has no pose; {known}")
+            raise self._no_pose(frame, after)
         begin, end = path.times_s[after - 1 : after + 1]
         share = (time_s - begin) / (end - begin)
         before = path.rotations[after - 1]
         turn = exp_so3(share * log_so3(before.T @ path.rotations[after]))
         centre = (1 - share) * path.centres[after - 1] + share * path.centres[after]
         return KeyPose(row, time_s, before @ turn, centre)
+
+    def _no_pose(self, frame: int, after: int) -> SceneError:
+        """Of a frame before this row of the path, which has none."""
+        inside, rate = 0 < after < len(self.path), self.need_sensor().frame_rate_hz
+        rows = (after - 1, after) if inside else (0, -1)
+        first, last = (round(float(self.path.times_s[row]) * rate - 0.5) for row in rows)
+        known = f"there are none between {first} and {last}" if inside else f"there are poses from {first} to {last}"
+        return SceneError(f"frame {frame} of {self.name} has no pose; {known}")
 
     @cached_property
     def white(self) -> float:

@@ -1,6 +1,7 @@
 """Depth maps, points and meshes: other programs' readers see the room where it is."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from spiked.errors import SceneError
 from spiked.export import ExportOptions, ExportSource, find_kind
 from spiked.simulate import Room
 from spiked.simulate.motion import hand_shake
+from spiked.trajectory import Trajectory
 
 from ..room_map import OPTICS, SENSOR
 
@@ -77,6 +79,19 @@ def height_of(depth: np.ndarray, rotation: np.ndarray, centre: np.ndarray) -> np
 def test_a_frame_without_a_pose_is_refused(source: ExportSource, tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="frame 999 of room has no pose; there are poses from 0 to 396"):
         find_kind("depth").write(source, tmp_path / "out", ExportOptions(frames=(999,)))
+
+
+def test_a_frame_inside_a_gap_is_refused_with_the_gap(source: ExportSource, tmp_path: Path) -> None:
+    path = source.path
+    late = np.where(np.arange(len(path)) < 50, 0.0, 0.1)
+    gap = replace(source, path=Trajectory(path.times_s + late, path.rotations, path.centres))
+    with pytest.raises(SceneError, match="frame 1000 of room has no pose; there are none between 196 and 2200"):
+        find_kind("depth").write(gap, tmp_path / "out", ExportOptions(frames=(1000,)))
+
+
+def test_frames_that_are_given_twice_and_in_any_order_are_taken_once_in_their_order(source: ExportSource) -> None:
+    times = [pose.time_s * SENSOR.frame_rate_hz for pose in source.key_poses(ExportOptions(frames=(203, 40, 203, 41)))]
+    assert np.allclose(times, [40.5, 41.5, 203.5])
 
 
 def test_points_lie_on_the_walls_and_look_inwards(source: ExportSource, tmp_path: Path) -> None:

@@ -170,6 +170,17 @@ def test_h5py_reads_spikes_poses_and_depth_and_convert_reads_the_spikes(source: 
     assert np.array_equal(open_recording(back).images(0, 50), source.recording.images(0, 50))
 
 
+def test_views_of_chosen_frames_have_their_own_poses(source: ExportSource, tmp_path: Path) -> None:
+    options = replace(OPTIONS, frames=(42, 203))
+    find_kind("nexus").write(source, tmp_path / "room.nxs", options)
+    with h5py.File(tmp_path / "room.nxs") as nexus:
+        views = nexus["entry/key_views"]
+        for row, pose in enumerate(source.key_poses(options)):
+            assert np.allclose(views["position"][row], pose.centre)
+            assert np.allclose(rotation_of(views["quaternion"][:])[row], pose.rotation)
+            assert not np.array_equal(views["position"][row], source.path.centres[pose.row])
+
+
 def test_stamps_are_unix_times_where_the_clock_is_known(source: ExportSource) -> None:
     assert source.recording is not None
     rate = source.recording.sensor.frame_rate_hz

@@ -40,6 +40,9 @@ SOLID = 0.5
 STRAIGHT = 0.02
 """Second extent of points over their first one below which they lie on a line."""
 
+NO_FLOOR = "no floor is seen in the scene: give three points of it, or the direction of up"
+"""What is said without one."""
+
 
 @dataclass(frozen=True)
 class Floor:
@@ -102,11 +105,19 @@ def find_floor(scene: Scene, path: Trajectory, seed: int = 0) -> Floor:
             best, most = on, cells
     for _ in range(3):
         if best is not None:
-            up, middle = up_by_points(points[best], path.centres), points[best].mean(axis=0)
+            up, middle = _up_of(points[best], path.centres), points[best].mean(axis=0)
             best = _on_floor(points, normals, path.centres, up, middle, thick)
     if best is None or _cells(points[best], up, CELL * thick) < LEAST_CELLS:
-        raise SceneError("no floor is seen in the scene: give three points of it, or the direction of up")
-    return Floor(up_by_points(points[best], path.centres), float(best.mean()))
+        raise SceneError(NO_FLOOR)
+    return Floor(_up_of(points[best], path.centres), float(best.mean()))
+
+
+def _up_of(points: Array, cameras: Array) -> Array:
+    """As `up_by_points`. Raises SceneError for points that span no plane: few splats may be on a floor by chance."""
+    try:
+        return up_by_points(points, cameras)
+    except ConfigurationError as error:
+        raise SceneError(NO_FLOOR) from error
 
 
 def _normals(points: Array) -> Array:

@@ -104,3 +104,21 @@ def test_a_scene_without_a_floor_says_so() -> None:
         find_floor(wall, room.path)
     with pytest.raises(SceneError, match="splats"):
         find_floor(Scene.empty(1), room.path)
+
+
+@pytest.mark.parametrize("splats", [17, 30, 60])
+def test_a_scene_of_few_splats_has_no_floor(splats: int) -> None:
+    room = room_map(2, (0.0,))
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        few = room.scene.select(rng.permutation(len(room.scene))[:splats])
+        with pytest.raises(SceneError, match="no floor is seen"):
+            find_floor(few, room.path)
+
+
+def test_splats_on_a_line_are_no_floor() -> None:
+    room = room_map(2, (0.0,))
+    line = room.scene.select(np.arange(400))
+    line.means[:] = np.linspace(-2, 2, 400, dtype=np.float32)[:, None] * [1, 0, 0]
+    with pytest.raises(SceneError, match="no floor is seen"):
+        find_floor(line, room.path)

@@ -11,6 +11,7 @@ from spiked_service.api.idempotency import IdempotencyKey
 from spiked_service.api.problems import problems
 from spiked_service.api.results import Results
 from spiked_service.api.schemas.cleaning import CleanRequest, EditedOut, RevertRequest
+from spiked_service.base.priority import behind_others
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.results.published import Published
 from spiked_service.results.scene_scale import forget_scale, put_scale_back, read_scale
@@ -32,17 +33,19 @@ def cleaning_routes(rows: ReconstructionRepository, results: Results, route_clas
 
         With floaters, splats larger than a quarter of the scene are replaced by smaller ones that show the same.
 
-        `:revert` undoes it.
+        `:revert` undoes it. With floaters it takes seconds to minutes: wait long enough for the answer.
         """
         result = results.of(rows.get(reconstruction_id), body.version)
         with results.downloads():
-            found = clean(
-                Scene.read_ply(result.scene),
-                result.path(_POSES),
-                result.camera,
-                None if body.box is None else body.box.box(),
-                FloaterRemoval(split=body.split) if body.floaters else None,
-                outline=None if body.outline is None else body.outline.outline(),
+            found = behind_others(
+                lambda: clean(
+                    Scene.read_ply(result.scene),
+                    result.path(_POSES),
+                    result.camera,
+                    None if body.box is None else body.box.box(),
+                    FloaterRemoval(split=body.split) if body.floaters else None,
+                    outline=None if body.outline is None else body.outline.outline(),
+                )
             )
         published = rows.publish_edit(
             reconstruction_id, body.version, lambda publisher: publisher.again(result.published, found.scene)

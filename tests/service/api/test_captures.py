@@ -386,3 +386,11 @@ def test_the_hash_of_a_recording(service: Any, done: CaptureOut) -> None:
     if done.recording.sha256 is not None:
         whole = service.http.get(f"captures/{done.id}/recording").content
         assert hashlib.sha256(whole).hexdigest() == done.recording.sha256
+
+
+@pytest.mark.parametrize("sort", ["started", "name"])
+def test_a_cursor_of_no_capture_is_answered_as_the_schema_says(service: Any, sort: str) -> None:
+    answer = service.http.get("captures", params={"sort": sort, "cursor": "01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10"})
+    declared = service.http.get(f"{service.daemon.address}openapi.json").json()["paths"]["/api/v1/captures"]["get"]
+    assert str(answer.status_code) in declared["responses"], answer.text
+    assert answer.status_code == (404 if sort == "name" else 200)

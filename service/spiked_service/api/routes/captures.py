@@ -30,7 +30,7 @@ def capture_routes(captures: Captures, sources: Sources, route_class: type[APIRo
         response.headers["Location"] = request.url_for("get_capture", capture_id=snapshot.row.id).path
         return CaptureOut.of(snapshot)
 
-    @router.get("", responses=problems())
+    @router.get("", responses=problems(404))
     def list_captures(
         limit: Limit = 50,
         cursor: Cursor = None,

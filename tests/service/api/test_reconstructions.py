@@ -109,10 +109,24 @@ def test_versions_tell_the_optics_that_they_were_made_with(service: Any, done: C
     preview = f"captures/{done.id}/preview?frame=100&undistorted=true"
     plain, straight = (service.http.get(preview + more).content for more in ("", f"&optics_of={job}"))
     assert (decoded(plain) != decoded(straight)).any(), "the lens is the one that the reconstruction found"
+    first, last = (
+        service.http.get(f"{preview}&optics_of={job}&optics_version={one['version']}").content
+        for one in (content["versions"][0], content["versions"][-1])
+    )
+    np.testing.assert_array_equal(decoded(first), decoded(plain), "the first version has its own lens")
+    np.testing.assert_array_equal(decoded(last), decoded(straight))
+    assert service.http.get(f"{preview}&optics_of={job}&optics_version=999").status_code == 404
     content["versions"][-1] |= {"intrinsics": None, "distortion": None}
     index.write_text(json.dumps(content))
     assert service.http.get(f"reconstructions/{job}/versions").json()["items"][-1]["intrinsics"] is None
     index.write_bytes(before)
+
+
+def test_a_picture_is_not_undistorted_by_the_optics_of_another_capture(service: Any, job: str) -> None:
+    other = service.capture(name="no reconstruction", reconstruct=False)
+    asked = {"frame": 0, "undistorted": True, "optics_of": job}
+    refused = service.http.get(f"captures/{other.id}/preview", params=asked)
+    assert (refused.status_code, "not of this one" in refused.text) == (422, True), refused.text
 
 
 def test_changes_since_a_state(service: Any, job: str, tmp_path: Any) -> None:

@@ -54,9 +54,14 @@ OpticsOf = Annotated[
     Query(
         min_length=1,
         max_length=64,
-        description="Reconstruction by the optics of whose newest version a recorded image is undistorted. Default: "
-        "those of the capture.",
+        description="Reconstruction of this capture by whose optics a recorded image is undistorted. Default: those of "
+        "the capture.",
     ),
+]
+OpticsVersion = Annotated[
+    int | None,
+    Query(ge=1, le=LARGEST_INTEGER, description="Version of `optics_of` that has these optics. Default: the newest."),
+    IN_DIGITS,
 ]
 Frames = Annotated[int, Query(ge=1, le=8192, description="Recorded frames to look at, around `frame`."), IN_DIGITS]
 Side = Annotated[
@@ -89,6 +94,7 @@ def preview_routes(
         white: White = None,
         undistorted: Undistorted = False,
         optics_of: OpticsOf = None,
+        optics_version: OpticsVersion = None,
         format: WishedImage = None,
         accept: Annotated[str, Header(include_in_schema=False)] = "",
     ) -> Response:
@@ -108,7 +114,10 @@ def preview_routes(
         window = _frame_window(captures, folder, capture_id, frame)
         lens = window.sensor.intrinsics if undistorted else None
         if undistorted and optics_of is not None:
-            lens = results.of(results.row(optics_of)).published.camera or lens
+            row = results.row(optics_of)
+            if row.capture_id != capture_id:
+                raise ConfigurationError(f"reconstruction {optics_of} is of capture {row.capture_id}, not of this one")
+            lens = results.of(row, optics_version).published.camera or lens
         return _recorded_preview(picture(window, kind, white, lens), gain, requested)
 
     @router.get("/thumbnail", responses=_THUMBNAIL, response_class=Response)

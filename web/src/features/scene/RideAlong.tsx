@@ -22,6 +22,7 @@ const LOOK_MS = 60;
 export function RideAlong({
   capture,
   jobId,
+  version,
   white,
   sensor,
   frame,
@@ -33,6 +34,8 @@ export function RideAlong({
   capture: Capture;
   /** The reconstruction, whose optics the picture has to have, too. */
   jobId: string;
+  /** Its version; undefined: the newest. */
+  version: number | undefined;
   /** Radiance of white in the scene. */
   white: number | undefined;
   sensor: Sensor;
@@ -44,7 +47,7 @@ export function RideAlong({
   onShare: (share: number) => void;
 }): JSX.Element {
   const image = useRef<HTMLImageElement>(null);
-  const observed = useObserved(capture.id, jobId, white, frame);
+  const observed = useObserved(capture.id, jobId, version, white, frame);
   const bar = useRef<HTMLDivElement>(null);
   useAspectFit(bar, sensor.width / sensor.height);
 
@@ -137,6 +140,7 @@ function useAspectFit(inside: { readonly current: HTMLElement | null }, aspect: 
 function useObserved(
   captureId: string,
   jobId: string,
+  version: number | undefined,
   white: number | undefined,
   frame: number | null,
 ): { url: string | null; missing: boolean } {
@@ -166,6 +170,7 @@ function useObserved(
           white,
           undistorted: true,
           optics_of: jobId,
+          optics_version: version,
         });
         show(URL.createObjectURL(await (await fetched(picture, ended.signal)).blob()));
         setMissing(false);
@@ -182,6 +187,6 @@ function useObserved(
       ended.abort();
       clearInterval(timer);
     };
-  }, [captureId, jobId, white]);
+  }, [captureId, jobId, version, white]);
   return { url, missing };
 }

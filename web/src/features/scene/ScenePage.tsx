@@ -207,6 +207,7 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
             <RideAlong
               capture={capture}
               jobId={job.id}
+              version={pinned?.version}
               white={(pinned ?? job).white ?? undefined}
               sensor={sensor}
               frame={path?.frames[row] ?? null}

@@ -293,6 +293,7 @@ export const address = {
       white?: number | undefined;
       undistorted?: boolean;
       optics_of?: string;
+      optics_version?: number | undefined;
     } = {},
   ): string => `${API}/captures/${id}/preview${query({ kind, ...extra })}`,
   /** A picture of what is known of each pixel; `file` makes it another one after a new calibration. */

@@ -84,6 +84,27 @@ def test_the_error_against_the_views_is_in_the_address(studied: Studied, visit: 
     until(lambda: "how=" not in address(other) and "ride=" not in address(other), "and gone with the ride")
 
 
+def test_a_reconstruction_that_is_awaited_or_gone_is_told(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit("about:blank")
+    held: list[Any] = []
+    of_jobs = re.compile(r"/reconstructions(/[\w-]+)?(\?.*)?$")
+    page.route(of_jobs, lambda route: held.append(route))
+    page.goto(f"{studied.address}?page=scene&capture={studied.capture_id}&reconstruction={studied.reconstruction_id}")
+    page.get_by_text("Loading the scene").wait_for()
+    until(lambda: any(one.request.url.endswith(studied.reconstruction_id) for one in held), "it is asked for")
+    assert page.get_by_role("button", name="Reconstruct it").count() == 0
+    page.unroute(of_jobs)
+    for one in held:
+        one.continue_()
+    until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+    gone = visit(f"{studied.address}?page=scene&capture={studied.capture_id}&reconstruction=gone")
+    gone.get_by_role("alert").filter(has_text="It may have been deleted").wait_for()
+    assert gone.get_by_role("button", name="Reconstruct it").count() == 0
+    assert violations(gone) == []
+    gone.get_by_role("button", name="Newest scene").click()
+    until(lambda: shown_version(gone) > 0, "the newest scene is on the canvas")
+
+
 def test_a_version_that_is_gone_is_told(studied: Studied, visit: Callable[..., Any]) -> None:
     page = visit(f"{studied.address}?page=scene&capture={studied.capture_id}&version=999")
     page.get_by_role("status").filter(has_text="Version 999 is not kept").wait_for()

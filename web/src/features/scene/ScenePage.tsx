@@ -10,7 +10,7 @@ import { copy } from "../../shared/state/clipboard";
 import { adjust, go, linkTo, nameFound, route, useRoute } from "../../shared/state/route";
 import { isEnded, newestCapture, newestReconstruction, useService } from "../../shared/state/store";
 import { toast } from "../../shared/state/toasts";
-import { useWanted } from "../../shared/state/useWanted";
+import { useWanted, useWantedReconstruction } from "../../shared/state/useWanted";
 import { Empty, ErrorMessage, JobReason, Loading, trackingHint } from "../../shared/ui/parts";
 import { CompareStage, type Names } from "./CompareStage";
 import { Inspector } from "./Inspector";
@@ -53,18 +53,19 @@ function Wanted(): JSX.Element {
   const capture = useService((state) =>
     at.capture === null ? newestCapture(state.captures) : (state.captures[at.capture] ?? null),
   );
-  const job = useService((state) =>
-    at.reconstruction === null
-      ? newestReconstruction(state.reconstructions, capture?.id ?? null)
-      : (state.reconstructions[at.reconstruction] ?? null),
-  );
+  const newest = useService((state) => newestReconstruction(state.reconstructions, capture?.id ?? null));
+  const named = useWantedReconstruction(at.reconstruction);
+  const job = at.reconstruction === null ? newest : named.job;
   const loaded = useService((state) => state.loaded);
-  const problem = useWanted(at.capture, capture);
+  const unknown = useWanted(at.capture, capture);
+  const problem = unknown ?? named.problem;
   if (problem !== null)
     return (
       <ErrorMessage text={problem} again={() => go({ capture: null, reconstruction: null })} called="Newest scene" />
     );
-  if (!loaded && capture === null) return <Loading what="the scene" />;
+  const awaited =
+    (capture === null && (!loaded || at.capture !== null)) || (job === null && at.reconstruction !== null);
+  if (awaited) return <Loading what="the scene" />;
   if (capture === null)
     return (
       <Empty icon="scene" title="No scene yet">

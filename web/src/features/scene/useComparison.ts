@@ -2,10 +2,9 @@
 
 import { useCallback, useEffect, useMemo, useState } from "react";
 
-import { reconstruction } from "../../shared/api/calls";
 import type { Reconstruction } from "../../shared/api/types";
 import { adjust, useRoute } from "../../shared/state/route";
-import { errorText, storeReconstruction, useService } from "../../shared/state/store";
+import { useWantedReconstruction } from "../../shared/state/useWanted";
 import { ComparedPaths } from "./ComparedPaths";
 import type { Colouring, Path } from "./path";
 import { IDENTITY, inverse, matrixOf, rmsDistance, type Similarity, similarityOf } from "./similarity";
@@ -74,7 +73,7 @@ export function useComparison(first: FirstScene): Comparison | null {
   const { viewer, layers } = first;
   const how = HOWS.find((one) => one === at.how) ?? "side";
   const on = at.against !== null;
-  const { job, problem: unknown } = useJob(at.against);
+  const { job, problem: unknown } = useWantedReconstruction(at.against);
   const versions = useVersions(job);
   const pinned = versions.find((one) => one.version === at.againstVersion) ?? null;
   const known = at.againstVersion === null || pinned !== null || at.againstVersion === job?.version;
@@ -117,18 +116,6 @@ export function useComparison(first: FirstScene): Comparison | null {
 }
 
 export const stopComparing = (): void => adjust({ against: null, againstVersion: null, how: "" });
-
-/** A reconstruction by its id, fetched if the store does not hold it. */
-function useJob(id: string | null): { job: Reconstruction | null; problem: string | null } {
-  const job = useService((state) => (id === null ? null : (state.reconstructions[id] ?? null)));
-  const [problem, setProblem] = useState<{ id: string; text: string } | null>(null);
-  const missing = id !== null && job === null;
-  useEffect(() => {
-    if (missing)
-      reconstruction(id).then(storeReconstruction, (error: unknown) => setProblem({ id, text: errorText(error) }));
-  }, [id, missing]);
-  return { job, problem: missing && problem?.id === id ? problem.text : null };
-}
 
 /** A viewer on the second canvas whose camera is that of the first, whichever of them is moved. */
 function useSecondViewer(

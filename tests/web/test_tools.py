@@ -131,6 +131,20 @@ def test_points_are_drawn_without_graphics_hardware(studied: Studied, visit: Cal
     assert page.locator(".stage-notes").get_by_text("without graphics hardware").count() == 0
 
 
+def test_the_key_m_leads_from_points_to_splats_without_graphics_hardware(
+    studied: Studied, visit: Callable[..., Any]
+) -> None:
+    page = visit("about:blank")
+    page.add_init_script("localStorage.removeItem('spiked.splats')")
+    page.goto(f"{studied.address}?page=scene&capture={studied.capture_id}")
+    page.locator(".stage-notes").get_by_text("without graphics hardware").wait_for()
+    modes = page.get_by_label("Show", exact=True)
+    page.locator(".stage canvas").focus()
+    for mode in ("colour", "depth"):
+        page.keyboard.press("m")
+        until(lambda: modes.input_value() == mode, f"{mode} is shown")  # noqa: B023
+
+
 def test_nothing_is_claimed_before_splats_are_drawn(studied: Studied, visit: Callable[..., Any]) -> None:
     page = visit("about:blank")
     page.add_init_script(

@@ -26,7 +26,7 @@ import { useScene } from "./useScene";
 import { useSceneKeys } from "./useSceneKeys";
 import { useVersions } from "./useVersions";
 import { type Layers, type Size, type Steering, Viewer } from "./Viewer";
-import { VIEW_MODES } from "./viewModes";
+import { VIEW_MODES, type ViewMode } from "./viewModes";
 
 const LAYERS: Layers = { splats: true, path: true, loops: true, frustum: true, grid: true, axes: true };
 const LAYER_NAMES = Object.keys(LAYERS) as (keyof Layers)[];
@@ -156,7 +156,16 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   useEffect(() => viewer?.steer(steering), [viewer, steering]);
   useEffect(() => viewer?.setRiding(riding), [viewer, riding]);
   useEffect(() => viewer?.setMode(riding ? "colour" : mode), [viewer, riding, mode]);
-  useSceneKeys(viewer, mode, steering === "orbit" && !riding);
+  const leave = riding ? { ride: false, how: "" } : {};
+  const onMode = (next: ViewMode): void => {
+    if (next === "colour") wantSplats(); // else points are drawn without graphics hardware
+    adjust({ ...leave, show: next === "colour" ? "" : next });
+  };
+  const onShows = (shows: ViewMode | "error"): void => {
+    if (shows === "error") adjust({ ride: true, how: "difference", against: null, againstVersion: null });
+    else onMode(shows);
+  };
+  useSceneKeys(viewer, mode, onMode, steering === "orbit" && !riding);
   const linked = at.camera;
   useEffect(() => {
     // Only views from a link or the history; the viewer's own updates are in effect already.
@@ -165,7 +174,6 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   }, [viewer, linked]);
 
   if (job === null) return null;
-  const leave = riding ? { ride: false, how: "" } : {};
   const copyLink = async (): Promise<void> => {
     const version = isEnded(job) ? (pinned?.version ?? (job.version > 0 ? job.version : null)) : at.version;
     await copy(linkTo({ version, camera: viewer?.view() ?? null }));
@@ -289,14 +297,7 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
         comparison={compared}
         onRide={(ride) => adjust({ ride, how: "", ...(ride ? { against: null, againstVersion: null } : {}) })}
         shows={riding && comparison === "difference" ? "error" : mode}
-        onShows={(shows) => {
-          if (shows === "colour") wantSplats();
-          adjust(
-            shows === "error"
-              ? { ride: true, how: "difference", against: null, againstVersion: null }
-              : { ...leave, show: shows === "colour" ? "" : shows },
-          );
-        }}
+        onShows={onShows}
         fov={Math.round(at.camera?.[6] ?? viewer?.view()[6] ?? 0)}
         onFov={(fov) => viewer?.setFov(fov)}
         onPreset={(preset) => {

@@ -55,6 +55,23 @@ def test_a_copied_link_shows_the_same_view_later(
         studied.http.delete(f"captures/{late}")
 
 
+def test_a_step_back_names_what_is_shown(studied: Studied, visit: Callable[..., Any]) -> None:
+    page = visit(f"{studied.address}?page=scene")
+    until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+    named = f"capture={studied.capture_id}&reconstruction={studied.reconstruction_id}"
+    until(lambda: named in address(page), "what is followed is in the address")
+    # The entry of a page that follows the newest, from when that was another one.
+    page.evaluate(
+        "named => history.replaceState(history.state, '', "
+        "location.search.replace(named, 'capture=x&reconstruction=a'))",
+        named,
+    )
+    page.evaluate("named => history.pushState(null, '', `?page=scene&${named}`)", named)
+    page.go_back()
+    until(lambda: named in address(page), "what is shown is in the address")
+    assert shown_version(page) > 0
+
+
 def test_a_link_is_copied_without_a_secure_context(studied: Studied, visit: Callable[..., Any]) -> None:
     page = visit("about:blank")
     page.add_init_script("Object.defineProperty(navigator, 'clipboard', { value: undefined })")
@@ -87,13 +104,14 @@ def test_the_error_against_the_views_is_in_the_address(studied: Studied, visit: 
 def test_a_reconstruction_that_is_awaited_or_gone_is_told(studied: Studied, visit: Callable[..., Any]) -> None:
     page = visit("about:blank")
     held: list[Any] = []
+    holding = True
     of_jobs = re.compile(r"/reconstructions(/[\w-]+)?(\?.*)?$")
-    page.route(of_jobs, lambda route: held.append(route))
+    page.route(of_jobs, lambda route: held.append(route) if holding else route.continue_())
     page.goto(f"{studied.address}?page=scene&capture={studied.capture_id}&reconstruction={studied.reconstruction_id}")
     page.get_by_text("Loading the scene").wait_for()
     until(lambda: any(one.request.url.endswith(studied.reconstruction_id) for one in held), "it is asked for")
     assert page.get_by_role("button", name="Reconstruct it").count() == 0
-    page.unroute(of_jobs)
+    holding = False
     for one in held:
         one.continue_()
     until(lambda: shown_version(page) > 0, "a scene is on the canvas")

@@ -100,10 +100,9 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
   const pinned = versions.find((one) => one.version === at.version) ?? null;
   const sensor = useSensor(capture, pinned ?? versions.at(-1));
   const gone = versions.length > 0 && pinned === null && at.version !== job?.version ? at.version : null;
-  useEffect(() => {
-    nameFound(capture.id, jobId);
-    return () => nameFound(null, null);
-  }, [capture.id, jobId]);
+  // After each change of the route: a step back may lead to an address that names what was found then.
+  useEffect(() => nameFound(capture.id, jobId), [capture.id, jobId, at]);
+  useEffect(() => () => nameFound(null, null), []);
   const path = usePath(job, pinned);
   const { shown, loading, problem } = useScene(viewer, job, full, pinned);
 
@@ -277,7 +276,8 @@ function SceneView({ capture, jobId }: { capture: Capture; jobId: string }): JSX
         pinned={pinned}
         onVersion={(version) => {
           setFull(false);
-          adjust({ version });
+          // A version is one of this reconstruction, whatever is the newest later.
+          adjust({ version, ...(version === null ? {} : { capture: capture.id, reconstruction: jobId }) });
         }}
         shown={shown}
         loading={loading}

@@ -67,9 +67,9 @@ it("names what the Scene page shows in the address, and goes on following the ne
   expect(route()).toMatchObject({ capture: null, reconstruction: null, frame: 7 });
   nameFound("y", "b");
   expect(window.location.search).toContain("capture=y&reconstruction=b");
-  expect(linkTo({ version: 3 })).toBe("http://localhost:3000/?page=scene&capture=y&reconstruction=b&version=3&frame=7");
+  expect(linkTo({ version: 3 })).toBe("http://localhost:3000/?page=scene&capture=y&reconstruction=b&version=3");
   go({ page: "live" });
-  expect(window.location.search).toBe("?frame=7");
+  expect(window.location.search).toBe("");
   expect(linkTo({})).not.toContain("capture");
 });
 
@@ -83,6 +83,54 @@ it("follows after a reload and a step back what it followed, but not where a lin
   vi.resetModules();
   const opened = await import("./route");
   expect(opened.route()).toMatchObject({ page: "scene", capture: "x", reconstruction: "a" });
+});
+
+it("names after a step back what is shown, not what was found when the entry was left", () => {
+  go({ page: "scene" });
+  nameFound("x", "a");
+  const left = { state: window.history.state as unknown, url: window.location.href };
+  go({ capture: "y", reconstruction: "b" });
+  nameFound("y", "b"); // and y/b is the newest by now
+  window.history.replaceState(left.state, "", left.url);
+  window.dispatchEvent(new PopStateEvent("popstate"));
+  nameFound("y", "b");
+  expect(route()).toMatchObject({ capture: null, reconstruction: null });
+  expect(window.location.search).toBe("?page=scene&capture=y&reconstruction=b");
+});
+
+it("keeps nothing of a reconstruction when another one is followed, also after a visit elsewhere or a reload", async () => {
+  go({ page: "scene" });
+  nameFound("x", "a");
+  const details = { version: 3, frame: 7, camera: [1, 2, 3, 4, 5, 6, 7], against: "c" };
+  const none = { version: null, frame: null, camera: null, against: null };
+  adjust(details);
+  go({ page: "live" });
+  nameFound(null, null);
+  go({ page: "scene" });
+  nameFound("x", "a");
+  expect(route()).toMatchObject(details);
+  go({ page: "live" });
+  nameFound(null, null);
+  go({ page: "scene" });
+  nameFound("y", "b");
+  expect(route()).toMatchObject(none);
+  expect(window.location.search).toBe("?page=scene&capture=y&reconstruction=b");
+  go({ page: "live" });
+  go({ page: "scene", ...details });
+  vi.resetModules();
+  const reloaded = await import("./route");
+  reloaded.nameFound("z", "d");
+  expect(reloaded.route()).toMatchObject(none);
+});
+
+it("keeps the view when what is followed becomes chosen", () => {
+  go({ page: "scene" });
+  nameFound("x", "a");
+  adjust({ frame: 7 });
+  adjust({ capture: "x", reconstruction: "a", version: 3 });
+  expect(route()).toMatchObject({ capture: "x", reconstruction: "a", version: 3, frame: 7 });
+  nameFound("x", "a");
+  expect(route().version).toBe(3);
 });
 
 it("plays through more frames than a browser allows changes of the address", () => {

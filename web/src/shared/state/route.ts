@@ -107,10 +107,18 @@ export function formatRoute(route: Route): string {
 /** The capture and the reconstruction, as chosen: of an entry of the history whose address names what was found instead. */
 type Chosen = Pick<Route, "capture" | "reconstruction">;
 
+/** What the address names; set when it is read or written. */
+let addressed: Chosen = { capture: null, reconstruction: null };
+
+/** The reconstruction that version, camera and the like of `current` belong to; null: the one that is found next. */
+let belongsTo: string | null = null;
+
 /** The state of an address: of an own entry of the history, reloads included, it follows what it followed. */
 function restored(): Route {
   const route = parseRoute(window.location.search);
   const state = window.history.state as { chosen?: Partial<Chosen> } | null;
+  addressed = route;
+  belongsTo = state?.chosen === undefined ? null : route.reconstruction;
   if (state?.chosen === undefined) return route;
   const { capture, reconstruction } = state.chosen;
   return { ...route, capture: identifier(capture ?? null), reconstruction: identifier(reconstruction ?? null) };
@@ -130,6 +138,7 @@ const named = (route: Route): Route =>
     : route;
 
 let current = restored();
+const same = (a: Chosen, b: Chosen): boolean => a.capture === b.capture && a.reconstruction === b.reconstruction;
 const listeners = new Set<() => void>();
 const subscribe = (listener: () => void): (() => void) => {
   listeners.add(listener);
@@ -144,6 +153,7 @@ let pending: ReturnType<typeof setTimeout> | undefined;
 function set(route: Route, push: boolean): void {
   if (formatRoute(route) === formatRoute(current)) return;
   if (push) flush(); // the entry that is left shows what was seen last
+  if (!same(route, current)) belongsTo = null;
   current = route;
   for (const listener of listeners) listener();
   const waitMs = push ? 0 : writtenMs + ADDRESS_MS - performance.now();
@@ -157,7 +167,9 @@ function writeAddress(how: "pushState" | "replaceState" = "replaceState"): void 
   writtenMs = performance.now();
   try {
     const { capture, reconstruction } = current;
-    window.history[how]({ chosen: { capture, reconstruction } }, "", formatRoute(named(current)));
+    const written = named(current);
+    window.history[how]({ chosen: { capture, reconstruction } }, "", formatRoute(written));
+    addressed = written;
   } catch {
     pending = setTimeout(writeAddress, 10 * ADDRESS_MS); // refused: the limit counts other parts of the page, too
   }
@@ -186,11 +198,16 @@ const OF_ONE: Partial<Route> = {
   ride: false,
 };
 
-/** The route after a change; what belongs to one reconstruction is reset when another one, or another capture, is shown. */
+/**
+ * The route after a change; what belongs to one reconstruction is reset when another one, or another capture, is shown. To
+ * choose what is found already shows no other.
+ */
 function changed(change: Partial<Route>): Route {
-  const capture = "capture" in change && change.capture !== current.capture;
-  const other = capture || ("reconstruction" in change && change.reconstruction !== current.reconstruction);
-  return { ...current, ...(other ? OF_ONE : {}), ...(capture ? { reconstruction: null } : {}), ...change };
+  const other = (key: keyof Chosen): boolean => key in change && change[key] !== current[key];
+  const leaves = (key: keyof Chosen): boolean =>
+    other(key) && (change[key] === null || current[key] !== null || change[key] !== found[key]);
+  const reset = leaves("capture") || leaves("reconstruction") ? OF_ONE : {};
+  return { ...current, ...reset, ...(other("capture") ? { reconstruction: null } : {}), ...change };
 }
 
 /** Navigate, with a new history entry. */
@@ -202,12 +219,18 @@ export const useRoute = (): Route => useSyncExternalStore(subscribe, route);
 
 /**
  * Name in the address what the Scene page has found, so that a copied one shows it later, too. Nothing is chosen by that:
- * this page goes on following the newest, and so does the Live page.
+ * this page goes on following the newest, and so does the Live page. What belongs to the reconstruction that was followed
+ * before is reset.
  */
 export function nameFound(capture: string | null, reconstruction: string | null): void {
-  if (found.capture === capture && found.reconstruction === reconstruction) return;
   found = { capture, reconstruction };
-  if (current.page === "scene" && capture !== null) writeAddress();
+  if (current.page !== "scene" || capture === null) return;
+  if (current.reconstruction === null && belongsTo !== null && belongsTo !== reconstruction) {
+    current = { ...current, ...OF_ONE };
+    for (const listener of listeners) listener();
+  }
+  belongsTo = reconstruction;
+  if (!same(named(current), addressed)) writeAddress();
 }
 
 /** The whole address of what is seen, for others; `fixed` is as it is given. */

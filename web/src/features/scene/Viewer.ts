@@ -38,6 +38,7 @@ import { LoopLines } from "./loops";
 import { MarkLines } from "./MarkLines";
 import { OVERLAY_ORDER, PathLines } from "./PathLines";
 import { distanceAlong } from "./picker";
+import { Pace } from "./pace";
 import { type Preset, presetDirection } from "./presets";
 import { showInHeadset } from "./vr";
 import { show as showMode, type ViewMode } from "./viewModes";
@@ -71,8 +72,6 @@ const SAMPLE = 20_000;
 const MOVING_SHARE = 0.5;
 /** A moving view has come to rest after this, ms. */
 const REST_MS = 150;
-/** A machine is slow that takes longer for each of so many pictures of a moving view, ms. */
-const [SLOW_MS, MOST_SLOW] = [33, 3];
 /** Two taps within this time and this way are one double tap, ms and px. */
 const [DOUBLE_TAP_MS, DOUBLE_TAP_PX] = [350, 30];
 /** How often it is looked whether splats are drawn, ms. */
@@ -168,9 +167,7 @@ export class Viewer {
   private lastMs = 0;
   /** Whether fewer pixels are drawn: the view moves, and this machine is too slow for all of them. */
   private coarse = false;
-  private slow: boolean;
-  /** Pictures of the moving view, one after the other, that took too long. */
-  private slowPictures = 0;
+  private readonly pace: Pace;
   /** Whether the view is held and turned. */
   private held = false;
   /** Runs while the view moves. */
@@ -186,7 +183,8 @@ export class Viewer {
   ) {
     this.renderer = new WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
     this.renderer.setPixelRatio(this.sharpness);
-    this.slow = this.software = drawsInSoftware(this.renderer.getContext());
+    this.software = drawsInSoftware(this.renderer.getContext());
+    this.pace = new Pace(this.software);
     this.spark = new SparkRenderer({
       renderer: this.renderer,
       onDirty: this.draw,
@@ -280,7 +278,9 @@ export class Viewer {
 
   /** Draw in the next animation frame, once for any number of calls. */
   readonly draw = (): void => {
-    if (this.scheduled === 0) this.scheduled = requestAnimationFrame(this.render);
+    if (this.scheduled !== 0) return;
+    this.scheduled = requestAnimationFrame(this.render);
+    this.pace.request(performance.now());
   };
 
   private readonly onDoubleClick = (event: MouseEvent): void => {
@@ -305,7 +305,7 @@ export class Viewer {
       this.resting = undefined;
       this.sharpen(false);
     }, REST_MS);
-    if (this.slow) this.sharpen(true);
+    if (this.pace.slow) this.sharpen(true);
     this.follower?.moves();
   }
 
@@ -328,6 +328,7 @@ export class Viewer {
     if (this.presenting) return;
     const elapsed = Math.min((nowMs - this.lastMs) / 1000, 0.1);
     this.lastMs = nowMs;
+    this.pace.drawn(nowMs, this.resting !== undefined);
     if (this.fly !== null) {
       const before = this.camera.matrix.elements.slice();
       this.fly.update(elapsed);
@@ -339,8 +340,6 @@ export class Viewer {
       this.draw(); // keys are held between events
     }
     this.follower?.takeCamera(this);
-    this.slowPictures = this.resting !== undefined && elapsed > SLOW_MS / 1000 ? this.slowPictures + 1 : 0;
-    if (this.slowPictures >= MOST_SLOW) this.slow = true;
     this.path.dashFor(this.camera, this.canvas.clientHeight);
     this.renderer.render(this.world, this.riding ? this.rider : this.camera);
   };

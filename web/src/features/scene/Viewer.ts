@@ -164,6 +164,7 @@ export class Viewer {
   private scheduled = 0;
   /** Whether a headset draws. */
   private presenting = false;
+  private disposed = false;
   private lastMs = 0;
   /** Whether fewer pixels are drawn: the view moves, and this machine is too slow for all of them. */
   private coarse = false;
@@ -242,6 +243,8 @@ export class Viewer {
   }
 
   dispose(): void {
+    this.disposed = true;
+    void this.renderer.xr.getSession()?.end();
     cancelAnimationFrame(this.scheduled);
     if (this.lead !== null) this.lead.follower = null;
     this.resizing.disconnect();
@@ -590,9 +593,11 @@ export class Viewer {
       await showInHeadset({ renderer, world, content, drawer: spark, eye: this.eye, ahead, depth });
     } finally {
       this.presenting = false;
-      this.renderer.setPixelRatio(this.sharpness);
-      this.resize();
-      this.show();
+      if (!this.disposed) {
+        this.renderer.setPixelRatio(this.sharpness);
+        this.resize();
+        this.show();
+      }
     }
   }
 

@@ -46,7 +46,7 @@ export async function showInHeadset(stage: Stage): Promise<void> {
   const { xr } = navigator as { xr?: XRSystem };
   if (xr === undefined) throw new Error("This browser has no access to a headset.");
   const session = await xr.requestSession("immersive-vr");
-  const ended = new Promise((resolve) => session.addEventListener("end", resolve, { once: true }));
+  const ended = sessionEnd(renderer);
   const hidden = world.children.filter((one) => one.visible && one !== content && one !== drawer);
   const before = { place: content.position.clone(), turn: content.quaternion.clone(), size: content.scale.clone() };
   const camera = new PerspectiveCamera(55, 1, NEAR_M, FAR_M);
@@ -61,7 +61,12 @@ export async function showInHeadset(stage: Stage): Promise<void> {
     content.position.copy(stage.eye).applyQuaternion(turn).multiplyScalar(-size);
     renderer.xr.enabled = true;
     renderer.xr.setReferenceSpaceType("local");
-    await renderer.xr.setSession(session);
+    try {
+      await renderer.xr.setSession(session);
+    } catch (error) {
+      await session.end(); // else the headset shows nothing until it is put away
+      throw error;
+    }
     renderer.setAnimationLoop(() => renderer.render(world, camera));
     await ended;
   } finally {
@@ -72,4 +77,15 @@ export async function showInHeadset(stage: Stage): Promise<void> {
     content.quaternion.copy(before.turn);
     content.scale.copy(before.size);
   }
+}
+
+/** The end of the next session, after three.js has restored its own state: it sets size and loop of the renderer. */
+function sessionEnd({ xr }: WebGLRenderer): Promise<void> {
+  return new Promise((resolve) => {
+    const onEnd = (): void => {
+      xr.removeEventListener("sessionend", onEnd);
+      resolve();
+    };
+    xr.addEventListener("sessionend", onEnd);
+  });
 }

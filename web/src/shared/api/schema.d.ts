@@ -1041,7 +1041,7 @@ export interface paths {
         };
         /**
          * Get Reconstruction Export
-         * @description A version in a format of another program; `GET exports` lists them. The file is made in a worker process, which takes seconds to minutes, and kept for a while; one is made at a time.
+         * @description A version in a format of another program; `GET exports` lists them. The file is made in a worker process, which takes seconds to minutes, and kept for a while. One is made at a time, and given up when its client hangs up.
          *
          *     Scope of a token: `read`.
          */
@@ -1063,7 +1063,7 @@ export interface paths {
         };
         /**
          * Get Export
-         * @description The newest reconstruction in a format of another program; `GET exports` lists them. The file is made in a worker process, which takes seconds to minutes, and kept for a while; one is made at a time.
+         * @description The newest reconstruction in a format of another program; `GET exports` lists them. The file is made in a worker process, which takes seconds to minutes, and kept for a while. One is made at a time, and given up when its client hangs up.
          *
          *     Scope of a token: `read`.
          */
@@ -1113,7 +1113,7 @@ export interface paths {
          *
          *     With floaters, splats larger than a quarter of the scene are replaced by smaller ones that show the same.
          *
-         *     `:revert` undoes it.
+         *     `:revert` undoes it. With floaters it takes seconds to minutes: wait long enough for the answer.
          *
          *     Scope of a token: `operate`.
          */
@@ -6090,6 +6090,15 @@ export interface operations {
                     "application/problem+json": components["schemas"]["Problem"];
                 };
             };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
             /** @description The body is larger than allowed. */
             413: {
                 headers: {
@@ -7535,8 +7544,10 @@ export interface operations {
                 white?: number | null;
                 /** @description Without the distortion of the lens: of a recorded frame, or of the scene. */
                 undistorted?: boolean;
-                /** @description Reconstruction by the optics of whose newest version a recorded image is undistorted. Default: those of the capture. */
+                /** @description Reconstruction of this capture by whose optics a recorded image is undistorted. Default: those of the capture. */
                 optics_of?: string | null;
+                /** @description Version of `optics_of` that has these optics. Default: the newest. */
+                optics_version?: number | null;
                 /** @description Takes precedence over Accept; the default is PNG. */
                 format?: components["schemas"]["ImageFormat"] | null;
             };
@@ -10790,13 +10801,13 @@ export interface operations {
                 expected_depth?: boolean;
                 /** @description Voxels of a mesh along the longest side of the scene. */
                 resolution?: number;
-                /** @description Length of a video. */
+                /** @description Length of a video; 36,000 pictures of 1000 x 1000 at most. */
                 seconds?: number;
                 /** @description Pictures a second of a video. */
                 fps?: number;
-                /** @description Pixels of a video. Default: of the sensor. */
+                /** @description Pixels of a video, 4096 x 2304 at most. Default: of the sensor. */
                 width?: number | null;
-                /** @description Pixels of a video. Default: of the sensor. */
+                /** @description Pixels of a video, 4096 x 2304 at most. Default: of the sensor. */
                 height?: number | null;
                 /** @description A video follows the recorded path without its tremor, or as it is. */
                 along?: "smooth" | "recorded";
@@ -10961,13 +10972,13 @@ export interface operations {
                 expected_depth?: boolean;
                 /** @description Voxels of a mesh along the longest side of the scene. */
                 resolution?: number;
-                /** @description Length of a video. */
+                /** @description Length of a video; 36,000 pictures of 1000 x 1000 at most. */
                 seconds?: number;
                 /** @description Pictures a second of a video. */
                 fps?: number;
-                /** @description Pixels of a video. Default: of the sensor. */
+                /** @description Pixels of a video, 4096 x 2304 at most. Default: of the sensor. */
                 width?: number | null;
-                /** @description Pixels of a video. Default: of the sensor. */
+                /** @description Pixels of a video, 4096 x 2304 at most. Default: of the sensor. */
                 height?: number | null;
                 /** @description A video follows the recorded path without its tremor, or as it is. */
                 along?: "smooth" | "recorded";

@@ -442,15 +442,13 @@ def test_the_ride_along_an_earlier_version_shows_the_picture_by_its_optics(
     studied: Studied, visit: Callable[..., Any]
 ) -> None:
     first = studied.http.get(f"reconstructions/{studied.reconstruction_id}/versions").json()["items"][0]["version"]
-    asked: list[str] = []
-    page = visit("about:blank")
-    page.on("request", lambda request: asked.append(request.url) if "/preview" in request.url else None)
-    page.goto(f"{studied.address}?page=scene&capture={studied.capture_id}&version={first}&ride=1&frame=100")
-    until(lambda: shown_version(page) == first, "the first version is on the canvas")
     pinned = f"optics_of={studied.reconstruction_id}&optics_version={first}"
-    until(lambda: asked and asked[-1].endswith(pinned), "the picture has the optics of the version")
-    page.get_by_role("combobox", name="Version").select_option("")
-    until(lambda: "optics_version" not in asked[-1], "and is asked for again with those of the newest")
+    page = visit("about:blank")
+    with page.expect_request(lambda request: request.url.endswith(pinned)):
+        page.goto(f"{studied.address}?page=scene&capture={studied.capture_id}&version={first}&ride=1&frame=200")
+    until(lambda: shown_version(page) == first, "the first version is on the canvas")
+    with page.expect_request(lambda request: request.url.endswith(f"optics_of={studied.reconstruction_id}")):
+        page.get_by_role("combobox", name="Version").select_option("")
 
 
 def test_the_scene_on_a_phone(studied: Studied, visit: Callable[..., Any]) -> None:

@@ -140,7 +140,6 @@ class Reconstructions:
             maps=tuple(MapRef(map_id) for map_id in map_ids),
             part=part,
         )
-        check(row, self._catalogue, self.rows)
         try:
             # Before the lock: a path of a minute is a large file, and captures that begin and end wait for the lock.
             row = (given or Given()).put(row, self._folder, self.rows, self._catalogue.captures.get(capture_id))

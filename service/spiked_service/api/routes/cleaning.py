@@ -19,6 +19,8 @@ from spiked_service.results.versions import Publisher
 
 _POSES = 256
 """Poses of the path that views are chosen from."""
+_NOTHING = dict.fromkeys(("outside", "outlined", "floaters", "split", "shrunk", "large"), 0)
+"""What going back to an earlier version removes and changes."""
 
 
 def cleaning_routes(rows: ReconstructionRepository, results: Results, route_class: type[APIRoute]) -> APIRouter:
@@ -71,16 +73,7 @@ def cleaning_routes(rows: ReconstructionRepository, results: Results, route_clas
             body.version,
             lambda publisher: _published_again(publisher, earlier, folder, body.version),
         )
-        return EditedOut(
-            version=published.version,
-            splats=published.splats,
-            outside=0,
-            outlined=0,
-            floaters=0,
-            split=0,
-            shrunk=0,
-            large=0,
-        )
+        return EditedOut(version=published.version, splats=published.splats, **_NOTHING)
 
     return router
 

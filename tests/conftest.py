@@ -70,6 +70,14 @@ class Daemon:
         self.output.close()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def settings_of_nobody(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Settings of the user who runs the tests are neither read nor changed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("settings")))
+        yield
+
+
 @pytest.fixture(scope="session")
 def daemon_class() -> type[Daemon]:
     """For fixtures that keep a daemon for more than one test."""

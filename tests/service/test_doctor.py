@@ -118,7 +118,7 @@ def test_the_disk_is_really_written_and_left_as_it_was(machine: Machine) -> None
 def test_little_shared_memory_is_a_problem(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = doctor.shutil.disk_usage(machine.root)._replace(free=64 << 20)
     monkeypatch.setattr(doctor.shutil, "disk_usage", lambda folder: usage)
-    monkeypatch.setattr(doctor, "disk_findings", lambda data: [])
+    monkeypatch.setattr(doctor, "disk_findings", lambda data, running: [])
     assert machine.examine()["shared memory"].status is DiagnosisStatus.PROBLEM
 
 

@@ -42,6 +42,12 @@ BEYOND_SCHEMA = {
     "/api/v1/captures": "a source is a small language of its own: options, files that requests may name",
     "/api/v1/captures/{capture_id}/views": "a matrix is a rotation, the sum of all pixels has a limit",
     "/api/v1/reconstructions/{reconstruction_id}/views": "a matrix is a rotation, the sum of all pixels has a limit",
+    "/api/v1/reconstructions": "poses are a text of a format of their own, and what is given fits the capture",
+    "/api/v1/reconstructions/{reconstruction_id}/scale:up": "points are not on a line, and a floor is not always seen",
+    "/api/v1/reconstructions/{reconstruction_id}/scale:board": "the board has to be in the scene",
+    "/api/v1/reconstructions/{reconstruction_id}/exports/{format}": "a frame has a pose, all pixels have a limit",
+    "/api/v1/captures/{capture_id}/exports/{format}": "a frame has a pose, all pixels have a limit",
+    "/api/v1/captures/{capture_id}/recording/video": "the range lies in the recording, all pixels have a limit",
     "/api/v1/uploads": "geometry and sidecar fit each other and the size, which has a limit of its own",
 }
 """Where what the schema allows may be refused with 422 or 413 all the same, and why; test_rules has the other rules."""
@@ -61,7 +67,7 @@ def configuration(known: dict[str, str]) -> str:
     lines += ["[parameters]", *(f'"path.{name}" = "{value}"' for name, value in known.items())]
     for path in BEYOND_SCHEMA:
         accepted = json.dumps([*_ACCEPTED, "413", "422"])
-        method = "PUT" if path.endswith("/profile") else "POST"
+        method = "PUT" if path.endswith("/profile") else "GET" if path.endswith(("/{format}", "/video")) else "POST"
         lines += ["[[operations]]", f'include-path = "{path}"', f'include-method = "{method}"']
         lines += [f"checks.positive_data_acceptance.expected-statuses = {accepted}"]
         if path in TOO_LARGE:

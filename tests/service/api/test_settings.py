@@ -158,7 +158,9 @@ class Three:
 @pytest.fixture
 def three(daemon: Callable[..., Any], tmp_path: Path) -> Three:
     tokens = Tokens(tmp_path / "data")
-    return Three(daemon("--set", "require_token=true", "--no-capture", token=tokens.create("keeper")), tokens)
+    file = tmp_path / "spiked.toml"
+    file.write_text("require_token = true\n")
+    return Three(daemon("--config", str(file), "--no-capture", token=tokens.create("keeper")), tokens)
 
 
 def test_tokens_are_made_shown_once_and_revoked(three: Three) -> None:

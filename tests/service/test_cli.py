@@ -286,7 +286,8 @@ def test_a_setting_that_has_a_flag_of_its_own_can_be_set_by_name_too() -> None:
 
 def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        done = run("serve", "--port", str(taken.getsockname()[1]), "--runtime", tmp_path / "runtime")
+        folders = ("--runtime", tmp_path / "runtime", "--data", tmp_path / "data")
+        done = run("serve", "--port", str(taken.getsockname()[1]), *folders)
     assert done.returncode == 2
     assert done.stderr.startswith("error: cannot listen at 127.0.0.1:")
     assert done.stderr.count("\n") == 1

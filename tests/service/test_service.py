@@ -113,6 +113,7 @@ def test_a_camera_that_is_not_plugged_in_is_waited_for(daemon: Callable[..., Any
 
 def test_serving_a_device_that_cannot_be_opened_ends_with_one_line(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "spiked_service", "serve", "--port", "0", "--runtime", str(tmp_path / "runtime")]
+    command += ["--data", str(tmp_path / "data")]
     done = subprocess.run(
         [*command, "--device", f"replay:{tmp_path / 'none.dat'}"],
         capture_output=True,

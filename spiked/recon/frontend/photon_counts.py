@@ -8,12 +8,17 @@ up to terms of 1/n^2 (Anscombe, "On estimating binomial response relations", Bio
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from spiked.blocks import Window
 from spiked.pose import Array
 from spiked.sensor import Image
+
+DEVIATION_PX = 7
+"""Side of the square whose mean count gives a pixel's standard deviation: a deviation from the pixel's own count is
+small where the count happens to be small, and weights made of it darken the map (decision 27)."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +54,10 @@ class PhotonCounts:
         return np.take(flux.astype(np.float32), self.count, out=out)
 
     def deviation(self) -> Image:
-        """Standard deviation of `rate`."""
-        fired = (np.arange(self.length + 1) + 0.5) / (self.length + 1)
-        return np.take(np.sqrt(fired / ((1 - fired) * self.length)).astype(np.float32), self.count)
+        """Standard deviation of `rate`, from the mean count around each pixel."""
+        count = cv2.blur(self.count.astype(np.float32), (DEVIATION_PX, DEVIATION_PX))
+        fired = (count + np.float32(0.5)) / np.float32(self.length + 1)
+        return np.sqrt(fired / ((1 - fired) * self.length))
 
     def times(self) -> tuple[Image, Image]:
         """Frames [H, W] from the middle of the window to its begin and to its end, the same for all pixels."""

@@ -18,6 +18,8 @@ from spiked.recon.mapping.seeding import Seeding
 
 PHOTON_SPLATS = 0.375
 """Splats of a map made of photon counts, over those of one made of spikes (decision 27)."""
+PHOTON_FLOOR, PHOTON_BACKGROUND = 0.06, 0.8
+"""`MapOptions.floor` and `MapOptions.background` of a map made of photon counts, at least (decision 27)."""
 
 
 @dataclass(frozen=True)
@@ -93,4 +95,10 @@ class MapOptions:
     def for_photons(self) -> "MapOptions":
         """Of a single-photon camera: structural similarity with so noisy images would fit their noise, and fewer splats
         leave less of it (decision 27)."""
-        return replace(self, ssim=0.0, splats_a_pixel=PHOTON_SPLATS * self.splats_a_pixel)
+        return replace(
+            self,
+            ssim=0.0,
+            splats_a_pixel=PHOTON_SPLATS * self.splats_a_pixel,
+            floor=max(PHOTON_FLOOR, self.floor),
+            background=max(PHOTON_BACKGROUND, self.background),
+        )

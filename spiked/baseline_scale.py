@@ -34,14 +34,14 @@ def scale_by_baseline(first: Trajectory, second: Trajectory, baseline_m: float, 
     common or the distance is not constant.
     """
     if not baseline_m > 0:
-        raise ConfigurationError(f"--baseline {baseline_m:g}: the distance has to be positive, in metres")
+        raise ConfigurationError(f"a baseline of {baseline_m:g} m: the distance has to be positive")
     times = first.times_s - offset_s
     common = np.zeros(len(times), bool)
     if len(second):
         common = (times >= second.times_s[0]) & (times <= second.times_s[-1])
     if common.sum() < LEAST_POSES:
         raise SceneError(
-            f"both cameras have a pose at {common.sum()} moments only: state --offset, by which the second recording "
+            f"both cameras have a pose at {common.sum()} moments only: state the offset, by which the second recording "
             "began later (`spiked offset`)"
         )
     distances = np.linalg.norm(first.centres[common] - _at(second, times[common]), axis=1)
@@ -49,7 +49,7 @@ def scale_by_baseline(first: Trajectory, second: Trajectory, baseline_m: float, 
     scatter = float(1.4826 * np.median(np.abs(distances - middle))) / max(middle, 1e-300)
     if not scatter < MOST_SCATTER:
         raise SceneError(
-            f"the distance of the cameras varies by {scatter:.0%}: they are not on one rig, or --offset is wrong"
+            f"the distance of the cameras varies by {scatter:.0%}: they are not on one rig, or the offset is wrong"
         )
     return BaselineScale(baseline_m / middle, max(scatter, 1e-6), int(common.sum()))
 

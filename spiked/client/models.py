@@ -22,6 +22,28 @@ class ArmRequest(BaseModel):
     ] = 1.0
 
 
+class BaselineScaleRequest(BaseModel):
+    """
+    The distance of two cameras of a rig, whose paths are in one map.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    revision: Annotated[int, Field(description="The one that this replaces; 409 if it is not.")]
+    baseline_m: Annotated[float, Field(description="Distance of the cameras.")]
+    path: Annotated[
+        int,
+        Field(description="Path of the second camera, see GET paths; the first has path 0."),
+    ] = 1
+    offset_s: Annotated[
+        float | None,
+        Field(
+            description="Seconds by which the second recording began later. Default: by the clocks of both recordings, as `groups/ID` says it."
+        ),
+    ] = None
+
+
 class BitOrder(StrEnum):
     """
     Which bit of a byte is the leftmost of its eight pixels.
@@ -2239,6 +2261,19 @@ class ViewRequest(BaseModel):
             description="Value shown as white in all formats but EXR. If not given: for color the scene's own, for alpha 1, for depth the largest of the picture. The header X-White says what was used."
         ),
     ] = None
+
+
+class BaselineScaleOut(BaseModel):
+    """
+    The scale by a baseline.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore",
+    )
+    scale: ScaleOut
+    poses: Annotated[int, Field(description="Moments at which both cameras have a pose.")]
+    offset_s: Annotated[float, Field(description="Seconds by which the second recording began later.")]
 
 
 class BoardScaleOut(BaseModel):

@@ -5,19 +5,17 @@ import os
 import signal
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from spiked_service.base.errors import BusyError
-from spiked_service.base.ids import new_id
 from spiked_service.captures.archive import DataStore
 from spiked_service.results.map_reports import LOCALISATION, REGISTRATION
 from spiked_service.results.report.job import JobReport
 from spiked_service.results.report.page import report_html
-from spiked_service.results.versions import Publisher, newest, pose_file, versions
+from spiked_service.results.versions import newest, pose_file, versions
 from spiked_service.settings.reconstruction_options import IntrinsicsOption, ReconstructionOptions
 from spiked_service.store.catalogue import UnknownIdError
 from spiked_service.store.rows import FrameRange, JobState, Plan, ReconstructionRow, Stage, Task
@@ -28,6 +26,7 @@ from spiked.poses import PoseFile
 from spiked.recording import RecordingWriter
 from spiked.trajectory import Trajectory
 
+from ..published_map import published_map
 from ..room_map import GAIN, OPTICS, SENSOR, room_map, visitor
 from .survival import ended, kept, over
 
@@ -98,15 +97,8 @@ def recorded(data_store: DataStore, folder: Path, seed: int, frames: int = FRAME
 
 def mapped(data_store: DataStore, capture_id: str, seed: int, turns_rad: tuple[float, ...] = (0.0, 0.4, 0.8)) -> str:
     """The id of a complete reconstruction that shows a room."""
-    now, made = datetime.now(UTC), room_map(seed, turns_rad)
-    row = ReconstructionRow(new_id(), capture_id, False, JobState.COMPLETE, now, stage=Stage.DONE, ended_at=now)
-    folder = data_store.folder.reconstruction(row.id)
-    folder.mkdir()
-    published = Publisher(folder).publish(made.scene, made.path, GAIN, None, OPTICS)
-    rows = data_store.reconstructions.rows
-    rows.save(replace(row, version=1, white=GAIN, poses=len(made.path), splats=len(made.scene)))
-    rows.add_version(row, published, {1})
-    return row.id
+    made = room_map(seed, turns_rad)
+    return published_map(data_store, capture_id, made.scene, made.path, OPTICS, GAIN)
 
 
 @pytest.fixture(scope="module")

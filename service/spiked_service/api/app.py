@@ -88,7 +88,7 @@ def _api(services: Services) -> APIRouter:
     api.include_router(report_routes(reconstructions.rows, Reports(results, captures, folder, views), once))
     api.include_router(export_routes(reconstructions.rows, results, Exports(results, captures, folder), once))
     api.include_router(cleaning_routes(reconstructions.rows, results, once))
-    api.include_router(scale_routes(reconstructions.rows, results, once))
+    api.include_router(scale_routes(reconstructions.rows, results, captures, once))
     api.include_router(reconstruction_record_routes(reconstructions.rows, once))
     api.include_router(doctor_routes(folder.path, captures))
     api.include_router(option_routes())

@@ -66,8 +66,7 @@ class Result:
 
     def path(self, poses: int) -> Trajectory:
         """Its trajectory, or every n-th pose of it: `poses` of them or somewhat more. Raises as `poses` does."""
-        found = self.poses()
-        return found.trajectory(range(0, len(found), max(1, len(found) // poses)))
+        return thinned(self.poses(), poses)
 
     @property
     def frame_rate_hz(self) -> float:
@@ -102,6 +101,11 @@ class Result:
         if frame is None:
             raise NothingError("the scale of this scene is not known; PUT its scale, or give its tags to scale:tag")
         return replace(self, frame=frame)
+
+
+def thinned(found: PoseFile, poses: int) -> Trajectory:
+    """All poses of a file, or every n-th: `poses` of them or somewhat more."""
+    return found.trajectory(range(0, len(found), max(1, len(found) // poses)))
 
 
 class SceneFiles:
@@ -238,6 +242,10 @@ class Results:
             poses, sensor = self._path(result, path)
         scale = result.scale_of_answer
         return trajectory_response(request, poses(), version, sensor, kind, part, self.downloads, scale)
+
+    def poses_along(self, result: Result, path: int) -> PoseFile:
+        """The poses of another recording in the map of a version. Raises NothingError, SceneError."""
+        return self._path(result, path)[0]()
 
     def _path(self, result: Result, path: int) -> tuple[Callable[[], PoseFile], Sensor | None]:
         """The poses of another recording in the map of a version, and its sensor."""

@@ -45,6 +45,7 @@ BEYOND_SCHEMA = {
     "/api/v1/reconstructions": "poses are a text of a format of their own, and what is given fits the capture",
     "/api/v1/reconstructions/{reconstruction_id}/scale:up": "points are not on a line, and a floor is not always seen",
     "/api/v1/reconstructions/{reconstruction_id}/scale:board": "the board has to be in the scene",
+    "/api/v1/reconstructions/{reconstruction_id}/scale:baseline": "the paths of two cameras have to be in the map",
     "/api/v1/reconstructions/{reconstruction_id}/exports/{format}": "a frame has a pose, all pixels have a limit",
     "/api/v1/captures/{capture_id}/exports/{format}": "a frame has a pose, all pixels have a limit",
     "/api/v1/captures/{capture_id}/recording/video": "the range lies in the recording, all pixels have a limit",

@@ -7,8 +7,6 @@ from fastapi import APIRouter, Request, Response
 from fastapi.routing import APIRoute
 
 from spiked.errors import RecordingError
-from spiked.recording import open_recording
-from spiked.recording.time_base import offset
 from spiked_service.api.idempotency import IdempotencyKey
 from spiked_service.api.problems import problems
 from spiked_service.api.routes.captures import plan_of
@@ -16,6 +14,7 @@ from spiked_service.api.schemas.captures import CaptureOut
 from spiked_service.api.schemas.groups import GroupOut, GroupRequest, OffsetOut
 from spiked_service.api.sources import Sources
 from spiked_service.captures.captures import Captures
+from spiked_service.captures.clock_offset import clock_offset
 from spiked_service.store.snapshot import Snapshot
 
 
@@ -58,20 +57,12 @@ def _group(captures: Captures, group_id: str) -> GroupOut:
 
 
 def _offsets(captures: Captures, members: Sequence[Snapshot]) -> list[OffsetOut]:
-    return [_offset(captures, members[0], one) for one in members[1:]]
+    return [_offset(captures, members[0].row.id, one.row.id) for one in members[1:]]
 
 
-def _offset(captures: Captures, first: Snapshot, other: Snapshot) -> OffsetOut:
-    capture_id = other.row.id
-    for one in (first, other):
-        if one.row.recording is None:
-            why = f"capture {one.row.id} has no recording"
-            return OffsetOut(capture_id=capture_id, offset_s=None, sigma_s=None, reason=why)
+def _offset(captures: Captures, first_id: str, capture_id: str) -> OffsetOut:
     try:
-        found = offset(*(open_recording(captures.recording(one.row.id)) for one in (first, other)))
+        found = clock_offset(captures, first_id, capture_id)
     except RecordingError as error:
-        why = str(error)
-        for one in (first, other):
-            why = why.replace(str(captures.recording(one.row.id)), f"the recording of capture {one.row.id}")
-        return OffsetOut(capture_id=capture_id, offset_s=None, sigma_s=None, reason=why)
+        return OffsetOut(capture_id=capture_id, offset_s=None, sigma_s=None, reason=str(error))
     return OffsetOut(capture_id=capture_id, offset_s=found.seconds, sigma_s=found.sigma_s, reason="")

@@ -81,6 +81,33 @@ class BoardScaleOut(Out):
     error_px: float = Field(description="Root mean square error of its corners, px of the pictures.")
 
 
+class BaselineScaleRequest(In):
+    """The distance of two cameras of a rig, whose paths are in one map."""
+
+    model_config = examples({"revision": 0, "baseline_m": 0.12}, {"revision": 0, "baseline_m": 0.12, "offset_s": 0.25})
+
+    revision: StrictInt = Field(ge=0, le=LARGEST_INTEGER, description="The one that this replaces; 409 if it is not.")
+    baseline_m: StrictFloat = Field(gt=0, le=1000, description="Distance of the cameras.")
+    path: StrictInt = Field(
+        1, ge=1, le=LARGEST_INTEGER, description="Path of the second camera, see GET paths; the first has path 0."
+    )
+    offset_s: StrictFloat | None = Field(
+        None,
+        ge=-1e6,
+        le=1e6,
+        description="Seconds by which the second recording began later. Default: by the clocks of both recordings, as "
+        "`groups/ID` says it.",
+    )
+
+
+class BaselineScaleOut(Out):
+    """The scale by a baseline."""
+
+    scale: ScaleOut
+    poses: int = Field(description="Moments at which both cameras have a pose.")
+    offset_s: float = Field(description="Seconds by which the second recording began later.")
+
+
 class UpRequest(In):
     """What up is found by: gravity at a frame, points of the floor, or neither: the floor is found."""
 

@@ -1246,6 +1246,28 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/api/v1/reconstructions/{reconstruction_id}/scale:baseline": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        get?: never;
+        put?: never;
+        /**
+         * Scale By A Baseline
+         * @description Store the scale by the distance of two cameras of a rig, whose reconstructions were merged.
+         *
+         *     Scope of a token: `operate`.
+         */
+        post: operations["scale_by_a_baseline_api_v1_reconstructions__reconstruction_id__scale_baseline_post"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
     "/api/v1/reconstructions/{reconstruction_id}/versions": {
         parameters: {
             query?: never;
@@ -1740,6 +1762,59 @@ export interface components {
              * @default 1
              */
             pretrigger_s?: number;
+        };
+        /**
+         * BaselineScaleOut
+         * @description The scale by a baseline.
+         */
+        BaselineScaleOut: {
+            scale: components["schemas"]["ScaleOut"];
+            /**
+             * Poses
+             * @description Moments at which both cameras have a pose.
+             */
+            poses: number;
+            /**
+             * Offset S
+             * @description Seconds by which the second recording began later.
+             */
+            offset_s: number;
+        };
+        /**
+         * BaselineScaleRequest
+         * @description The distance of two cameras of a rig, whose paths are in one map.
+         * @example {
+         *       "baseline_m": 0.12,
+         *       "revision": 0
+         *     }
+         * @example {
+         *       "baseline_m": 0.12,
+         *       "offset_s": 0.25,
+         *       "revision": 0
+         *     }
+         */
+        BaselineScaleRequest: {
+            /**
+             * Revision
+             * @description The one that this replaces; 409 if it is not.
+             */
+            revision: number;
+            /**
+             * Baseline M
+             * @description Distance of the cameras.
+             */
+            baseline_m: number;
+            /**
+             * Path
+             * @description Path of the second camera, see GET paths; the first has path 0.
+             * @default 1
+             */
+            path?: number;
+            /**
+             * Offset S
+             * @description Seconds by which the second recording began later. Default: by the clocks of both recordings, as `groups/ID` says it.
+             */
+            offset_s?: number | null;
         };
         /**
          * BitOrder
@@ -12087,6 +12162,125 @@ export interface operations {
                 };
                 content: {
                     "application/json": components["schemas"]["ScaleOut"];
+                };
+            };
+            /** @description The request is malformed. */
+            400: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A token is required. */
+            401: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The scope of the token does not allow it. */
+            403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It conflicts with the current state. */
+            409: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The body is larger than allowed. */
+            413: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description A value of the request is invalid. */
+            422: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description Too many requests. */
+            429: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The service is overloaded, or stops. */
+            503: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description The disk is full, or the catalogue cannot be written. */
+            507: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+        };
+    };
+    scale_by_a_baseline_api_v1_reconstructions__reconstruction_id__scale_baseline_post: {
+        parameters: {
+            query?: never;
+            header?: {
+                /** @description Any text, new for each new request. A request that is sent again with its key is not carried out again: the first answer is returned, with `Idempotency-Replayed: true`, for a day. A key that another request has used is refused with 422; one whose request is still carried out, or during which the service ended, with 409. */
+                "idempotency-key"?: string;
+            };
+            path: {
+                reconstruction_id: string;
+            };
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["BaselineScaleRequest"];
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["BaselineScaleOut"];
                 };
             };
             /** @description The request is malformed. */

@@ -136,6 +136,8 @@ it("puts what the service says into sentences for a person", () => {
   const full = new ApiError(507, "the disk is full", "remove recordings");
   expect(errorText(full)).toBe("The disk is full. Remove recordings.");
   expect(errorText(new ApiError(422, "/data/a.dat: cannot be read"))).toBe("/data/a.dat: cannot be read.");
+  const refused = new ApiError(422, "no floor is seen", "correct the request; /docs describes its fields");
+  expect(errorText(refused)).toBe("No floor is seen.");
 });
 
 it("lists those under way in the order of their turns, and says when each comes", () => {

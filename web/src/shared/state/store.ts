@@ -213,10 +213,12 @@ export const sentence = (text: string): string =>
 export function errorText(error: unknown): string {
   if (error instanceof ApiError) {
     if (error.status === 401) return "This service requires a token.";
-    // `what_to_do` is then meant for API clients.
+    // `what_to_do` of these is meant for API clients.
     if (error.status === 404 && error.message.startsWith("there is no "))
       return `${sentence(error.message.split(";")[0] ?? "")} It may have been deleted.`;
-    return error.whatToDo === null ? sentence(error.message) : `${sentence(error.message)} ${sentence(error.whatToDo)}`;
+    return error.whatToDo === null || error.status === 422
+      ? sentence(error.message)
+      : `${sentence(error.message)} ${sentence(error.whatToDo)}`;
   }
   if (error instanceof UnreachableError) return error.message;
   return error instanceof Error ? error.message : String(error);

@@ -1,8 +1,9 @@
-"""A card with a tag of 10 cm in the built-in room."""
+"""Cards with a tag of 10 cm or a board of 3 cm squares in the built-in room."""
 
 import cv2
 import numpy as np
 
+from spiked.board import Board
 from spiked.render import Camera
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics
@@ -15,6 +16,8 @@ from spiked.trajectory import Trajectory
 SIDE_M = 0.10
 """Of the black square."""
 TAG = 7
+BOARD = Board(7, 5)
+SQUARE_M = 0.03
 _CELLS, _BORDER, _TEXELS = 8, 2, 32
 """Cells of the tag and of its white border, and texels of a cell."""
 
@@ -24,6 +27,12 @@ def tag_card() -> Card:
     marker = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(TAG_FAMILIES["36h11"]), TAG, _CELLS)
     paper = np.kron(np.pad(marker, _BORDER, constant_values=255), np.ones((_TEXELS, _TEXELS))).astype(np.float32) / 255
     return Card(0.06 + 0.79 * paper, SIDE_M * (_CELLS + 2 * _BORDER) / _CELLS)
+
+
+def board_card() -> Card:
+    """The board with a white border of half a square."""
+    paper = np.pad(BOARD.picture(32), 16, constant_values=255).astype(np.float32) / 255
+    return Card(0.06 + 0.79 * paper, SQUARE_M * (BOARD.columns + 1))
 
 
 def card_scene(card: Card) -> tuple[Scene, Trajectory, Camera]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tag_card import card_scene
+from tag_card import BOARD, SQUARE_M, board_card, card_scene
 
 from spiked.baseline_scale import scale_by_baseline
 from spiked.board import Board
@@ -10,20 +10,10 @@ from spiked.board_scale import scale_by_board
 from spiked.errors import ConfigurationError, SceneError
 from spiked.pose import exp_so3
 from spiked.scene import Scene
-from spiked.simulate.room import Card
 from spiked.trajectory import Trajectory
 from spiked.upright import find_floor, up_by_gravity, up_by_points
 
 from .room_map import UP, room_map
-
-BOARD = Board(7, 5)
-SQUARE_M = 0.03
-
-
-def board_card() -> Card:
-    """The board with a white border of half a square."""
-    paper = np.pad(BOARD.picture(32), 16, constant_values=255).astype(np.float32) / 255
-    return Card(0.06 + 0.79 * paper, SQUARE_M * (BOARD.columns + 1))
 
 
 def angle_deg(one: np.ndarray, other: np.ndarray) -> float:

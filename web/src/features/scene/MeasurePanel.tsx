@@ -10,7 +10,9 @@ import { toast } from "../../shared/state/toasts";
 import { useFetch } from "../../shared/state/useFetch";
 import { ActionButton } from "../../shared/ui/access";
 import { Segmented } from "../../shared/ui/parts";
-import { angle, distance, lengthText, pointsOf, spreadText, type Tool, TOOLS, upOf } from "./measure";
+import { angle, distance, lengthText, pointsOf, scaleText, type Tool, TOOLS, upOf } from "./measure";
+import { BaselineForm, BoardForm, type Find, KnownLength, TagForm } from "./ScaleForms";
+import { FloorForm, GravityForm } from "./UpForms";
 import { usePicking } from "./usePicking";
 import type { Viewer } from "./Viewer";
 
@@ -51,6 +53,10 @@ function Measuring({ viewer, jobId, version }: MeasureProps): JSX.Element {
     again();
   };
   const revision = known?.revision ?? 0;
+  const find: Find = async (search) => {
+    await attempt(async () => toast(await search(revision)));
+    again();
+  };
   const up = tool === "up" ? upOf(points, viewer.eye) : null;
   return (
     <>
@@ -80,22 +86,24 @@ function Measuring({ viewer, jobId, version }: MeasureProps): JSX.Element {
       {!earlier && up !== null && (
         <ActionButton onClick={() => void store({ revision, version, up })}>This is the floor</ActionButton>
       )}
-      <TagForm
-        onTag={async (side_m) => {
-          await attempt(async () => {
-            const found = await calls.scaleByTag(jobId, { revision, side_m, family: "36h11" });
-            toast(`Found ${found.tags.map((one) => `tag ${one.tag} in ${one.views} views`).join(", ")}`);
-          });
-          again();
-        }}
-      />
+      {tool === "up" ? (
+        <>
+          <FloorForm jobId={jobId} onFind={find} />
+          <GravityForm jobId={jobId} onFind={find} />
+        </>
+      ) : (
+        <>
+          <TagForm jobId={jobId} onFind={find} />
+          <OtherScales jobId={jobId} onFind={find} />
+        </>
+      )}
       {earlier ? (
         <p className="dim hint">
           Version {version} is of an earlier run, in another unit of length: its scale cannot be set. Choose a version
           after {known.since}.
         </p>
       ) : (
-        <ScaleText scale={scale} />
+        <p className="dim hint">{scaleText(scale)}</p>
       )}
     </>
   );
@@ -109,101 +117,17 @@ function resultText(tool: Tool, points: readonly Vector3[], scale: Scale | null)
   return points.length === 0 ? "–" : `${points.length} of ${pointsOf(tool)} points`;
 }
 
-function KnownLength({
-  units,
-  error,
-  onLength,
-}: {
-  units: number;
-  /** Of a point that is clicked, in units: one pixel. */
-  error: number;
-  onLength: (metresPerUnit: number, sigma: number) => Promise<void>;
-}): JSX.Element {
+function OtherScales(of: { jobId: string; onFind: Find }): JSX.Element {
+  const [open, setOpen] = useState(false);
   return (
-    <MetresForm
-      before="It is"
-      label="Known length in metres"
-      action="Set the scale"
-      ready={(length) => length > 0 && units !== 0}
-      onMetres={(length) => onLength(length / units, Math.min((Math.SQRT2 * error) / units, 1))}
-    />
-  );
-}
-
-function TagForm({ onTag }: { onTag: (side_m: number) => Promise<void> }): JSX.Element {
-  const [busy, setBusy] = useState(false);
-  return (
-    <MetresForm
-      before="AprilTag of"
-      label="Side of the tag's black square in metres"
-      start="0.10"
-      least="0.001"
-      action={busy ? "Searching…" : "Find it"}
-      ready={() => !busy}
-      onMetres={async (side) => {
-        setBusy(true);
-        await onTag(side).finally(() => setBusy(false));
-      }}
-    />
-  );
-}
-
-function MetresForm({
-  before,
-  label,
-  start = "",
-  least = "0",
-  action,
-  ready,
-  onMetres,
-}: {
-  before: string;
-  label: string;
-  start?: string;
-  least?: string;
-  action: string;
-  ready: (metres: number) => boolean;
-  onMetres: (metres: number) => Promise<void>;
-}): JSX.Element {
-  const [metres, setMetres] = useState(start);
-  return (
-    <form
-      className="row"
-      onSubmit={(event) => {
-        event.preventDefault();
-        void onMetres(Number(metres));
-      }}
-    >
-      <label className="row">
-        <span className="dim">{before}</span>
-        <input
-          type="number"
-          min={least}
-          step="any"
-          required
-          aria-label={label}
-          value={metres}
-          onChange={(event) => setMetres(event.target.value)}
-        />
-        <span className="dim">m</span>
-      </label>
-      <ActionButton type="submit" disabled={!ready(Number(metres))}>
-        {action}
-      </ActionButton>
-    </form>
-  );
-}
-
-function ScaleText({ scale }: { scale: Scale | null }): JSX.Element {
-  const metres = scale?.metres_per_unit ?? null;
-  return (
-    <p className="dim hint">
-      {metres === null
-        ? "The scale is not known: a moving camera alone knows no metres."
-        : `A unit is ${metres.toPrecision(5)} m${spreadText(scale)}, by ${
-            scale?.source === "tag" ? "a tag" : "a known length"
-          }.`}{" "}
-      {scale?.up == null ? "Up is not known." : "Up is known."}
-    </p>
+    <details className="ways" onToggle={(event) => setOpen(event.currentTarget.open)}>
+      <summary>By a board or two cameras</summary>
+      {open && (
+        <>
+          <BoardForm {...of} />
+          <BaselineForm {...of} />
+        </>
+      )}
+    </details>
   );
 }

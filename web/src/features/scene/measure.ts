@@ -43,6 +43,39 @@ export function lengthText(length: number, scale: Scale | null): string {
   return `${(length * metres).toPrecision(4)} m${spreadText(scale)}`;
 }
 
+/** OpenCV's sets of markers of ChArUco boards, as the service names them. */
+export const MARKERS: readonly string[] = [4, 5, 6, 7].flatMap((side) =>
+  [50, 100, 250, 1000].map((count) => `${side}x${side}_${count}`),
+);
+
+/** Three numbers with blanks, commas or semicolons between them. Throws an error that says so for another text. */
+export function vectorOf(text: string): [number, number, number] {
+  const [x, y, z, ...more] = text
+    .trim()
+    .split(/[\s,;]+/)
+    .map((part) => (part === "" ? NaN : Number(part)));
+  if (x === undefined || y === undefined || z === undefined || more.length > 0 || !Number.isFinite(x + y + z))
+    throw new Error(`Write three numbers, as 0.1 9.7 0.9, not “${text}”.`);
+  return [x, y, z];
+}
+
+const SOURCES: Record<NonNullable<Scale["source"]>, string> = {
+  length: "a known length",
+  tag: "a tag",
+  board: "a board",
+  baseline: "the distance of two cameras",
+};
+
+/** What is known of the unit of a scene, and of up. */
+export function scaleText(scale: Scale | null): string {
+  const metres = scale?.metres_per_unit ?? null;
+  const unit =
+    metres === null
+      ? "The scale is not known: a moving camera alone knows no metres."
+      : `A unit is ${metres.toPrecision(5)} m${spreadText(scale)}, by ${SOURCES[scale?.source ?? "length"]}.`;
+  return `${unit} Up is ${scale?.up == null ? "not known" : "known"}.`;
+}
+
 /** How certain a scale is; empty if that is not known. */
 export const spreadText = (scale: Scale | null): string =>
   scale?.sigma == null ? "" : ` ± ${(100 * scale.sigma).toPrecision(2)} %`;

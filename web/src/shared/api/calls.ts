@@ -2,6 +2,10 @@
 
 import { answered, API, ApiError, client, query, request } from "./http";
 import type {
+  BaselineScale,
+  BaselineScaleRequest,
+  BoardScale,
+  BoardScaleRequest,
   Calibrated,
   Capture,
   CaptureChange,
@@ -16,6 +20,7 @@ import type {
   Grade,
   OptionSchema,
   OptionValues,
+  PathOf,
   PreviewKind,
   Profile,
   Reconstruction,
@@ -37,6 +42,7 @@ import type {
   Token,
   TokenRequest,
   Trajectory,
+  UpRequest,
   Upload,
   UploadRequest,
   Version,
@@ -261,6 +267,31 @@ export const scaleByTag = (id: string, body: TagScaleRequest): Promise<TagScale>
       params: { path: { reconstruction_id: id }, header: idempotent() },
     }),
   );
+export const scaleByBoard = (id: string, body: BoardScaleRequest): Promise<BoardScale> =>
+  answered(
+    client.POST("/api/v1/reconstructions/{reconstruction_id}/scale:board", {
+      body,
+      params: { path: { reconstruction_id: id }, header: idempotent() },
+    }),
+  );
+export const scaleByBaseline = (id: string, body: BaselineScaleRequest): Promise<BaselineScale> =>
+  answered(
+    client.POST("/api/v1/reconstructions/{reconstruction_id}/scale:baseline", {
+      body,
+      params: { path: { reconstruction_id: id }, header: idempotent() },
+    }),
+  );
+/** By gravity, or by the floor, which is found. */
+export const findUp = (id: string, body: UpRequest): Promise<Scale> =>
+  answered(
+    client.POST("/api/v1/reconstructions/{reconstruction_id}/scale:up", {
+      body,
+      params: { path: { reconstruction_id: id }, header: idempotent() },
+    }),
+  );
+/** The paths of all recordings through the scene, its own first. */
+export const paths = async (id: string): Promise<PathOf[]> =>
+  (await answered(client.GET("/api/v1/reconstructions/{reconstruction_id}/paths", ofReconstruction(id)))).items;
 
 /** Publish a version without floaters, or without what is outside of a box. */
 export const clean = (id: string, body: CleanRequest): Promise<Edited> =>

@@ -1,4 +1,4 @@
-"""The service as an object: devices, captures, reconstructions, what they give, uploads, events."""
+"""The service as an object: devices, captures, reconstructions, what they give, uploads, events, settings."""
 
 import hashlib
 import json
@@ -13,6 +13,7 @@ from urllib.parse import quote
 import httpx
 
 from spiked.client.connection import ApiError, Connection, plain
+from spiked.client.editing import EditingMethods
 from spiked.client.events import Event, events_in
 from spiked.client.frames import FrameMethods
 from spiked.client.maps import MapMethods
@@ -40,6 +41,7 @@ from spiked.client.models import (
     UploadOut,
 )
 from spiked.client.results import ResultMethods
+from spiked.client.settings import SettingMethods
 from spiked.errors import SpikedError
 from spiked.recording import remove_recording, sidecar_path
 from spiked.whole_files import write_atomically
@@ -56,7 +58,7 @@ _T = TypeVar("_T")
 _OVER = (JobState.complete, JobState.cancelled, JobState.failed)
 
 
-class Spiked(MapMethods, ResultMethods, FrameMethods):
+class Spiked(MapMethods, ResultMethods, EditingMethods, FrameMethods, SettingMethods):
     """A client of one service. Usable from any thread, and as a context manager.
 
     Every method raises ApiError when the service refuses, and ServiceUnreachableError when it does not answer.

@@ -69,11 +69,12 @@ class Connection:
     ) -> httpx.Response:
         """One answer. Sent again after a broken connection, and when the service is too busy. Raises as `get`."""
         asked = {name: value for name, value in (query or {}).items() if value is not None}
+        url = f"/{path}"  # without the slash, what is before the colon of `configuration:reload` were a scheme
         for attempt in range(_TRIES):
             last = attempt == _TRIES - 1
             try:
                 answer = self._http.request(
-                    method, path, params=asked, json=json, content=content, headers=dict(headers or {})
+                    method, url, params=asked, json=json, content=content, headers=dict(headers or {})
                 )
             except httpx.TransportError as error:
                 if last or isinstance(error, httpx.ConnectError | httpx.ReadTimeout):

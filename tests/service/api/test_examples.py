@@ -45,11 +45,13 @@ def test_curl(daemon: Callable[..., Any], tmp_path: Path) -> None:
 
 
 def test_python(daemon: Callable[..., Any], tmp_path: Path) -> None:
-    first, follow, second, frames = blocks("python", daemon().address)
+    first, follow, edit, second, frames = blocks("python", daemon().address)
     told = run([sys.executable, "-c", first], tmp_path)
     assert "the camera went" in told and "422" in told
     came = run([sys.executable, "-c", follow], tmp_path).splitlines()
     assert " 0 splats came" not in came[0] and " 0 splats came" in came[-1], came
+    edited = run([sys.executable, "-c", edit], tmp_path).splitlines()
+    assert edited[0].endswith(" floaters") and edited[1] == "2.11 m a unit" and len(edited) == 3, edited
     poses = run([sys.executable, "-c", second], tmp_path).splitlines()
     assert len(poses) > 10, poses
     assert run([sys.executable, "-c", frames], tmp_path).splitlines()[-1].startswith("finished ")

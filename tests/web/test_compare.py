@@ -70,6 +70,12 @@ def stage(page: Any) -> Picture:
     return decoded(page.locator(".stage").screenshot())
 
 
+def halves(of: Picture) -> tuple[slice, slice]:
+    """The columns left and right of the line of a wipe and its handle, when it is in the middle."""
+    middle = of.shape[1] // 2
+    return slice(0, middle - 16), slice(middle + 16, None)
+
+
 def apart(a: Picture, b: Picture) -> float:
     """Mean difference of two pictures, infinite for two sizes."""
     return float(np.abs(a - b).mean()) if a.shape == b.shape else float("inf")
@@ -129,6 +135,9 @@ def test_two_reconstructions_are_chosen_and_turned_together(
 def test_the_divider_is_moved_by_mouse_and_keys(compared: Callable[..., Any], pictures_folder: Path) -> None:
     page = compared("&how=wipe")
     before = stage(page)
+    rows, (left, right) = slice(before.shape[0] // 8, -before.shape[0] // 8), halves(before)
+    assert psnr_db(before[rows, left], picture(page)[rows, left]) > 40, "the first on the left"
+    assert psnr_db(before[rows, right], picture(page, SECOND)[rows, right]) > 40, "the second on the right"
     divider = page.get_by_role("slider", name="on the left")
     divider.focus()
     for _ in range(30):

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browsing import finished, until, violations
+from browsing import address, finished, until, violations
 from spiked_service.store.catalogue import Catalogue
 
 from tests.many_captures import MANY, many
@@ -106,3 +106,31 @@ def test_a_filter_chooses_among_all(house: Any, visit: Callable[..., Any]) -> No
     found = house.http.get("captures", params={"grade": "bad", "q": "room 000", "limit": 200}).json()
     assert found["total"] < FIRST
     until(lambda: names(page) == [one["name"] for one in found["items"]], "all that match both")
+
+
+def test_filter_and_order_are_in_the_address(house: Any, visit: Callable[..., Any]) -> None:
+    page = visit(f"{house.address}?page=captures")
+    page.get_by_label("Filter").select_option("bad")
+    page.locator(".list thead th").filter(has_text="Name").get_by_role("button").click()
+    until(lambda: address(page).endswith("?page=captures&filter=bad&sort=name&ascending=1"), "the address")
+    wanted = first_of(house, grade="bad", sort="name", descending=False)
+    until(lambda: names(page)[:5] == wanted, "the first bad ones by name")
+
+    def kept() -> bool:
+        shown = page.get_by_label("Filter").input_value(), page.get_by_label("Order").locator(":checked").inner_text()
+        return shown == ("bad", "by name") and names(page)[:5] == wanted
+
+    page.reload()
+    until(kept, "after a reload")
+    page.locator(".list tbody th a").first.click()
+    page.get_by_role("button", name="All captures").wait_for()
+    page.go_back()
+    until(kept, "after a step back")
+    page.locator(".list tbody th a").first.click()
+    page.get_by_role("button", name="All captures").click()
+    until(kept, "in the list of all")
+    page.get_by_label("Filter").select_option("")
+    page.get_by_label("Order").select_option(label="newest first")
+    until(lambda: address(page).endswith("?page=captures"), "what is usual is not named")
+    page.goto(f"{house.address}?page=captures&filter=attic&sort=colour")
+    until(lambda: names(page)[:5] == first_of(house), "what a link makes up is ignored")

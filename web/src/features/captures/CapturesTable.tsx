@@ -17,7 +17,7 @@ import { DeletedBar, ListControls, SelectionBar } from "./SelectionBar";
 import { removeWithUndo, restored } from "./remove";
 import { UnfinishedUploads } from "./UnfinishedUploads";
 import { UploadPanel } from "./UploadPanel";
-import { type Filter, type Order, useListing } from "./useListing";
+import { filterOf, named, type Order, orderOf, useListing } from "./useListing";
 
 const COLUMNS: (Column & { sort?: CaptureSort })[] = [
   { name: "Select", hidden: true },
@@ -32,11 +32,13 @@ const COLUMNS: (Column & { sort?: CaptureSort })[] = [
 ];
 
 export function CapturesTable(): JSX.Element {
-  const { search } = useRoute();
+  const at = useRoute();
+  const { search } = at;
   const [uploads, setUploads] = useState(false);
   const [selected, setSelected] = useState<ReadonlySet<string>>(new Set());
-  const [filter, setFilter] = useState<Filter>("");
-  const [order, setOrder] = useState<Order>({ sort: "started", descending: true });
+  const filter = filterOf(at);
+  const order = orderOf(at);
+  const setOrder = (wanted: Order): void => adjust(named(wanted));
   const { listed, problem, newer, more, again, forget } = useListing(search, filter, order);
   const known = useService((state) => state.captures);
   const deleted = filter === "deleted";
@@ -60,7 +62,7 @@ export function CapturesTable(): JSX.Element {
         <ListControls
           filter={filter}
           onFilter={(wanted) => {
-            setFilter(wanted);
+            adjust({ filter: wanted });
             setSelected(new Set());
           }}
           order={order}
@@ -99,7 +101,7 @@ export function CapturesTable(): JSX.Element {
         (listed.items.length === 0 ? (
           listed.filter === "deleted" && listed.q === "" ? (
             <Empty icon="trash" title="Nothing is deleted">
-              <button onClick={() => setFilter("")}>Show all</button>
+              <button onClick={() => adjust({ filter: "" })}>Show all</button>
             </Empty>
           ) : listed.q === "" && listed.filter === "" ? (
             <Empty icon="captures" title="No captures yet">
@@ -107,14 +109,7 @@ export function CapturesTable(): JSX.Element {
             </Empty>
           ) : (
             <Empty icon="search" title={`No capture matches “${listed.q === "" ? listed.filter : listed.q}”`}>
-              <button
-                onClick={() => {
-                  setFilter("");
-                  adjust({ search: "" });
-                }}
-              >
-                Show all
-              </button>
+              <button onClick={() => adjust({ search: "", filter: "" })}>Show all</button>
             </Empty>
           )
         ) : (

@@ -4,6 +4,7 @@ import { useEffect, useRef, useState } from "react";
 
 import * as calls from "../../shared/api/calls";
 import type { Capture, CaptureSort, Grade } from "../../shared/api/types";
+import type { Route } from "../../shared/state/route";
 import { errorText, useService } from "../../shared/state/store";
 
 const PAGE = 100;
@@ -11,11 +12,27 @@ const PAGE = 100;
 const MOST = 200;
 const TYPING_MS = 200;
 
-export type Filter = Grade | "" | "kept" | "deleted";
+const FILTERS = ["", "good", "degraded", "bad", "kept", "deleted"] as const satisfies readonly (
+  Grade | "" | "kept" | "deleted"
+)[];
+export type Filter = (typeof FILTERS)[number];
 export interface Order {
   sort: CaptureSort;
   descending: boolean;
 }
+const SORTS: readonly CaptureSort[] = ["started", "name", "length", "size", "verdict", "reconstruction"];
+
+/** The filter and the order that the address names. */
+export const filterOf = ({ filter }: Route): Filter => FILTERS.find((one) => one === filter) ?? "";
+export const orderOf = ({ sort, ascending }: Route): Order => ({
+  sort: SORTS.find((one) => one === sort) ?? "started",
+  descending: !ascending,
+});
+/** What the address names an order by. */
+export const named = ({ sort, descending }: Order): Pick<Route, "sort" | "ascending"> => ({
+  sort: sort === "started" ? "" : sort,
+  ascending: !descending,
+});
 
 export interface Listing {
   /** What was asked for when it was answered; null before the first answer. */

@@ -23,6 +23,9 @@ it("keeps everything that is looked at in the URL", () => {
     againstVersion: 3,
     how: "wipe",
     search: "desk & lamp",
+    filter: "kept",
+    sort: "size",
+    ascending: true,
   };
   expect(parseRoute(formatRoute(there).slice(2))).toEqual(there);
 });

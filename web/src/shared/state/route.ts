@@ -33,6 +33,12 @@ export interface Route {
   how: string;
   /** Search text of the captures table. */
   search: string;
+  /** Which captures the table lists; empty: all that are not deleted. */
+  filter: string;
+  /** What the table is sorted by; empty: the time of the start. */
+  sort: string;
+  /** Whether it begins with the least: the oldest, smallest or first. */
+  ascending: boolean;
 }
 
 export const HOME: Route = {
@@ -50,6 +56,9 @@ export const HOME: Route = {
   againstVersion: null,
   how: "",
   search: "",
+  filter: "",
+  sort: "",
+  ascending: false,
 };
 
 /** Identifiers are letters, digits and dashes; anything else in a link is ignored. */
@@ -81,6 +90,9 @@ export function parseRoute(search: string): Route {
     againstVersion: counted(query.get("against-version")),
     how: word(query.get("how")),
     search: query.get("search") ?? "",
+    filter: word(query.get("filter")),
+    sort: word(query.get("sort")),
+    ascending: query.get("ascending") === "1",
   };
 }
 
@@ -100,6 +112,9 @@ export function formatRoute(route: Route): string {
   if (route.againstVersion !== null) pairs.set("against-version", String(route.againstVersion));
   if (route.how !== "") pairs.set("how", route.how);
   if (route.search !== "") pairs.set("search", route.search);
+  if (route.filter !== "") pairs.set("filter", route.filter);
+  if (route.sort !== "") pairs.set("sort", route.sort);
+  if (route.ascending) pairs.set("ascending", "1");
   const text = pairs.toString().replaceAll("%2C", ",");
   return text === "" ? "./" : `./?${text}`;
 }

@@ -55,6 +55,27 @@ def test_a_copied_link_shows_the_same_view_later(
         studied.http.delete(f"captures/{late}")
 
 
+@pytest.mark.parametrize("known", [False, True], ids=["asked for", "known"])
+def test_a_reconstruction_without_a_capture_brings_its_own(
+    studied: Studied, visit: Callable[..., Any], known: bool
+) -> None:
+    late = newer(studied, "newer than the reconstruction")
+    try:
+        page = visit(f"{studied.address}?page=scene&reconstruction={studied.reconstruction_id}")
+        if known:
+            page.get_by_role("link", name="Live").click()
+            page.go_back()
+        until(lambda: shown_version(page) > 0, "the scene")
+        name = studied.http.get(f"captures/{studied.capture_id}").json()["name"]
+        assert page.locator(".inspector header strong").inner_text() == name
+        until(lambda: f"capture={studied.capture_id}&reconstruction=" in address(page), "its capture is named")
+        gone = "00000000-0000-7000-8000-000000000000"
+        page.goto(f"{studied.address}?page=scene&reconstruction={gone}")
+        page.get_by_role("button", name="Newest scene").wait_for()
+    finally:
+        studied.http.delete(f"captures/{late}")
+
+
 def test_a_step_back_names_what_is_shown(studied: Studied, visit: Callable[..., Any]) -> None:
     page = visit(f"{studied.address}?page=scene")
     until(lambda: shown_version(page) > 0, "a scene is on the canvas")

@@ -50,21 +50,23 @@ export function ScenePage(): JSX.Element {
 
 function Wanted(): JSX.Element {
   const at = useRoute();
+  const named = useWantedReconstruction(at.reconstruction);
+  // A reconstruction that is named without a capture brings its own.
+  const chosen = at.capture ?? named.job?.capture_id ?? null;
+  const follows = at.capture === null && at.reconstruction === null;
   const capture = useService((state) =>
-    at.capture === null ? newestCapture(state.captures) : (state.captures[at.capture] ?? null),
+    follows ? newestCapture(state.captures) : chosen === null ? null : (state.captures[chosen] ?? null),
   );
   const newest = useService((state) => newestReconstruction(state.reconstructions, capture?.id ?? null));
-  const named = useWantedReconstruction(at.reconstruction);
   const job = at.reconstruction === null ? newest : named.job;
   const loaded = useService((state) => state.loaded);
-  const unknown = useWanted(at.capture, capture);
+  const unknown = useWanted(chosen, capture);
   const problem = unknown ?? named.problem;
   if (problem !== null)
     return (
       <ErrorMessage text={problem} again={() => go({ capture: null, reconstruction: null })} called="Newest scene" />
     );
-  const awaited =
-    (capture === null && (!loaded || at.capture !== null)) || (job === null && at.reconstruction !== null);
+  const awaited = (capture === null && (!loaded || !follows)) || (job === null && at.reconstruction !== null);
   if (awaited) return <Loading what="the scene" />;
   if (capture === null)
     return (

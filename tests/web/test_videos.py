@@ -7,7 +7,7 @@ from typing import Any
 
 import av
 import pytest
-from browsing import DESKTOP, PHONE, Studied, keep, shown_version, until, violations
+from browsing import DESKTOP, PHONE, Studied, finished, keep, shown_version, until, violations
 
 
 def made(page: Any) -> tuple[int, int, int, float]:
@@ -51,11 +51,36 @@ def test_videos_are_made_as_chosen(
     page.get_by_text("show it more slowly").wait_for()
     assert violations(page) == []
     assert page.evaluate("() => document.documentElement.scrollWidth") <= viewport["width"]
-    fits = (
-        "() => { const panel = document.querySelector('.inspector'); return panel.scrollWidth <= panel.clientWidth; }"
-    )
-    assert page.evaluate(fits), "nothing widens the panel"
+    panel = page.locator("details.tool").filter(has_text="Video").bounding_box()
+    for field in page.locator(".tool select, .tool input[type=number]").all():
+        box = field.bounding_box()
+        assert box["x"] + box["width"] <= panel["x"] + panel["width"] + 1, "it ends where the panel ends"
     keep(page, pictures_folder / f"video-{viewport['width']}.webp")
+
+
+@pytest.mark.parametrize(("viewport", "touch"), [(DESKTOP, False), (PHONE, True)])
+def test_a_recording_without_a_reconstruction_is_shown_in_slow_motion(
+    studied: Studied, visit: Callable[..., Any], pictures_folder: Path, viewport: dict[str, int], touch: bool
+) -> None:
+    plan = {"source": "sim:?width=64&height=48", "frames": 640, "name": "no scene", "reconstruct": False}
+    one = studied.http.post("captures", json=plan).json()["id"]
+    finished(studied.http, one)
+    try:
+        page = visit(f"{studied.address}?page=captures&capture={one}", viewport=viewport, touch=touch)
+        page.locator("summary").filter(has_text="Video in slow motion").click()
+        page.get_by_label("Pictures a second").fill("10")
+        page.get_by_label("Times slower").fill("50")
+        page.get_by_label("Frames of a picture").fill("8")
+        with page.expect_request(re.compile("recording/video")) as asked:
+            assert made(page) == (64, 48, 16, 10.0), "32 ms, 50 times slower"
+        assert one in asked.value.url
+        page.get_by_label("Times slower").fill("0.001")
+        page.get_by_text("show it more slowly").wait_for()
+        assert violations(page) == []
+        assert page.evaluate("() => document.documentElement.scrollWidth") <= viewport["width"]
+        keep(page, pictures_folder / f"slow-motion-{viewport['width']}.webp")
+    finally:
+        studied.http.delete(f"captures/{one}")
 
 
 def test_a_video_that_cannot_be_made_is_told(studied: Studied, visit: Callable[..., Any]) -> None:

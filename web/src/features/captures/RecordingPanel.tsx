@@ -1,6 +1,6 @@
 /** The recording of a capture: grade, length, camera, downloads. */
 
-import type { JSX } from "react";
+import { type JSX, useState } from "react";
 
 import * as calls from "../../shared/api/calls";
 import type { Capture } from "../../shared/api/types";
@@ -9,6 +9,7 @@ import { bytes, count, rate, when } from "../../shared/state/format";
 import { isFinished } from "../../shared/state/store";
 import { Icon } from "../../shared/ui/icons";
 import { gradeTone, Panel, Warnings } from "../../shared/ui/parts";
+import { SlowMotion, usePace } from "../../shared/ui/SlowMotion";
 
 export function RecordingPanel({ capture }: { capture: Capture }): JSX.Element {
   const { recording, sensor, verdict } = capture;
@@ -61,6 +62,18 @@ export function RecordingPanel({ capture }: { capture: Capture }): JSX.Element {
           </a>
         </div>
       )}
+      {recording !== null && <SlowMotionTool capture={capture} />}
     </Panel>
+  );
+}
+
+function SlowMotionTool({ capture }: { capture: Capture }): JSX.Element {
+  const [open, setOpen] = useState(false);
+  const pace = usePace();
+  return (
+    <details className="tool" onToggle={(event) => setOpen(event.currentTarget.open)}>
+      <summary>Video in slow motion</summary>
+      {open && <SlowMotion capture={capture} pace={pace} />}
+    </details>
   );
 }

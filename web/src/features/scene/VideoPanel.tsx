@@ -4,12 +4,19 @@ import { type JSX, useState } from "react";
 
 import { address } from "../../shared/api/calls";
 import type { Capture, Reconstruction, Sensor } from "../../shared/api/types";
-import { count, duration } from "../../shared/state/format";
-import { DownloadLink } from "../../shared/ui/DownloadLink";
+import { type Kind, KINDS } from "../../shared/state/videos";
+import {
+  factorOf,
+  FpsField,
+  NumberField,
+  PaceFields,
+  SlowMotion,
+  usePace,
+  VideoLink,
+} from "../../shared/ui/SlowMotion";
 import { poseOfView } from "./axes";
 import type { Bookmark } from "./bookmarks";
 import type { Path } from "./path";
-import { type Kind, KINDS, problemOf, slownessFor } from "./videos";
 
 export interface VideoProps {
   capture: Capture;
@@ -35,37 +42,13 @@ function Making({ capture, job, version, sensor, path, bookmarks }: VideoProps):
   const [kind, setKind] = useState<Kind>("smooth");
   const [width, setWidth] = useState(`${sensor?.width ?? 1280}`);
   const [height, setHeight] = useState(`${sensor?.height ?? 720}`);
-  const [fps, setFps] = useState("30");
-  const [slower, setSlower] = useState<string | null>(null);
+  const pace = usePace();
   const [between, setBetween] = useState("3");
-  const [window, setWindow] = useState("16");
-  const [compensate, setCompensate] = useState(false);
   // Those of another reconstruction have a unit of length of their own.
   const marks = bookmarks.filter((one) => one.reconstruction === job.id);
   const pathS = path === null ? 0 : (path.times.at(-1) ?? 0) - (path.times[0] ?? 0);
-  const recordedS = sensor === null ? 0 : (capture.recording?.frames ?? 0) / sensor.frame_rate_hz;
-  const takenS = kind === "recording" ? recordedS : pathS;
-  const factor = slower === null ? slownessFor(takenS) : Number(slower);
-  const seconds = kind === "bookmarks" ? Number(between) * (marks.length - 1) : takenS * factor;
-  const problem =
-    kind === "bookmarks" && marks.length < 2
-      ? "Save two or more bookmarks of this reconstruction first."
-      : kind === "recording" && recordedS === 0
-        ? "The recording is not closed yet, or is gone."
-        : problemOf(seconds, Number(fps));
+  const seconds = kind === "bookmarks" ? Number(between) * (marks.length - 1) : pathS * factorOf(pace, pathS);
   const through = marks.map((one) => poseOfView(one.camera)).map((one) => [...one.position, ...one.quaternion_wxyz]);
-  const href =
-    kind === "recording"
-      ? address.slowMotion(capture.id, { slower: factor, fps, window, compensate })
-      : address.video(job.id, {
-          version,
-          seconds,
-          fps,
-          width,
-          height,
-          along: kind === "recorded" ? "recorded" : "smooth",
-          through: kind === "bookmarks" ? through : [],
-        });
   return (
     <>
       <label className="row">
@@ -79,72 +62,48 @@ function Making({ capture, job, version, sensor, path, bookmarks }: VideoProps):
         </select>
       </label>
       <p className="dim hint">{KINDS.find((one) => one.value === kind)?.hint}</p>
-      {kind !== "recording" && (
-        <div className="row">
-          <NumberField label="Width" value={width} onValue={setWidth} least={16} most={8192} />
-          <NumberField label="Height" value={height} onValue={setHeight} least={16} most={8192} />
-        </div>
-      )}
-      <NumberField label="Pictures a second" value={fps} onValue={setFps} least={1} most={240} />
-      {kind === "bookmarks" ? (
-        <NumberField label="Seconds from each to the next" value={between} onValue={setBetween} least={0.1} most={60} />
+      {kind === "recording" ? (
+        <SlowMotion capture={capture} pace={pace} />
       ) : (
-        <NumberField label="Times slower" value={slower ?? `${factor}`} onValue={setSlower} least={0.001} most={1e6} />
-      )}
-      {kind === "recording" && (
         <>
-          <NumberField label="Frames of a picture" value={window} onValue={setWindow} least={1} most={4096} />
-          <label className="check">
-            <input
-              type="checkbox"
-              checked={compensate}
-              onChange={(event) => setCompensate(event.currentTarget.checked)}
-            />
-            Less noise: neighbouring pictures, moved along the motion, are added
-          </label>
+          <div className="row">
+            <NumberField label="Width" value={width} onValue={setWidth} least={16} most={8192} />
+            <NumberField label="Height" value={height} onValue={setHeight} least={16} most={8192} />
+          </div>
+          {kind === "bookmarks" ? (
+            <>
+              <FpsField pace={pace} />
+              <NumberField
+                label="Seconds from each to the next"
+                value={between}
+                onValue={setBetween}
+                least={0.1}
+                most={60}
+              />
+            </>
+          ) : (
+            <PaceFields pace={pace} takenS={pathS} />
+          )}
+          <VideoLink
+            href={address.video(job.id, {
+              version,
+              seconds,
+              fps: pace.fps,
+              width,
+              height,
+              along: kind === "recorded" ? "recorded" : "smooth",
+              through: kind === "bookmarks" ? through : [],
+            })}
+            seconds={seconds}
+            fps={pace.fps}
+            problem={
+              kind === "bookmarks" && marks.length < 2
+                ? "Save two or more bookmarks of this reconstruction first."
+                : null
+            }
+          />
         </>
-      )}
-      {problem === null ? (
-        <>
-          <DownloadLink href={href}>Video, {duration(seconds)}</DownloadLink>
-          <p className="dim hint">
-            {count(Math.max(1, Math.round(seconds * Number(fps))))} pictures. The server makes it when you ask, which
-            takes about as long as the video, longer for large pictures.
-          </p>
-        </>
-      ) : (
-        <p className="note" role="status">
-          {problem}
-        </p>
       )}
     </>
-  );
-}
-
-function NumberField({
-  label,
-  value,
-  onValue,
-  least,
-  most,
-}: {
-  label: string;
-  value: string;
-  onValue: (value: string) => void;
-  least: number;
-  most: number;
-}): JSX.Element {
-  return (
-    <label className="row">
-      <span className="dim">{label}</span>
-      <input
-        type="number"
-        step="any"
-        min={least}
-        max={most}
-        value={value}
-        onChange={(event) => onValue(event.target.value)}
-      />
-    </label>
   );
 }

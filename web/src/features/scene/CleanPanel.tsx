@@ -37,7 +37,8 @@ export function CleanPanel(props: CleanProps): JSX.Element {
 function Cleaning({ viewer, job, newest, free, whole }: CleanProps & { viewer: Viewer }): JSX.Element {
   const [shares, setShares] = useState(NO_CUT);
   const [busy, setBusy] = useState(false);
-  const [undo, setUndo] = useState<{ after: number; to: number } | null>(null);
+  /** The versions before each change, the last one last; `at` is the version after it. */
+  const [undo, setUndo] = useState<{ at: number; to: readonly number[] }>({ at: 0, to: [] });
   const bounds = viewer.bounds();
   const box = useMemo(() => (bounds === null ? null : cut(bounds, shares)), [bounds, shares]);
   const cropped = shares.some((share) => share > 0);
@@ -53,13 +54,14 @@ function Cleaning({ viewer, job, newest, free, whole }: CleanProps & { viewer: V
     setBusy(true);
     const done = await attempt(async () => {
       const found = await begin();
-      setUndo({ after: found.version, to: job.version });
+      setUndo((old) => ({ at: found.version, to: [...(old.at === job.version ? old.to : []), job.version] }));
       setShares(NO_CUT);
       toast(say(found));
     });
     setBusy(false);
     return done;
   };
+  const before = undo.to.at(-1);
   const ready = isEnded(job) && newest && !busy;
   return (
     <>
@@ -128,14 +130,14 @@ function Cleaning({ viewer, job, newest, free, whole }: CleanProps & { viewer: V
           )
         }
       />
-      {undo !== null && (
+      {before !== undefined && (
         <ActionButton
-          disabled={busy || job.version !== undo.after}
+          disabled={busy || job.version !== undo.at}
           onClick={() =>
             void attempt(async () => {
-              await calls.revert(job.id, { version: job.version, to: undo.to });
-              setUndo(null);
-              toast(`The scene is as version ${undo.to} was`);
+              const found = await calls.revert(job.id, { version: job.version, to: before });
+              setUndo({ at: found.version, to: undo.to.slice(0, -1) });
+              toast(`The scene is as version ${before} was`);
             })
           }
         >

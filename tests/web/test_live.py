@@ -37,6 +37,7 @@ def test_a_capture_is_started_watched_and_judged(daemon: Callable[..., Any], vis
     page.get_by_text("No capture yet").wait_for()
     page.get_by_label("Name", exact=True).fill("first light")
     page.get_by_label("Length", exact=True).select_option("frames")
+    assert float(page.get_by_label("Length in frames").input_value()) > 100, "a number of frames, not of seconds"
     page.get_by_label("Length in frames").fill("400")
     page.get_by_label("Reconstruct").uncheck()
     page.get_by_role("button", name="Start").click()

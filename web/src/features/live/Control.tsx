@@ -14,6 +14,8 @@ import { fieldsOf, OptionInput, optionsOf, textOf, withOptions } from "../../sha
 import { Badge, deviceTone, Markup, Panel, ErrorMessage } from "../../shared/ui/parts";
 
 type Length = "open" | "seconds" | "frames";
+/** The length that is offered in each unit. */
+const USUAL = { seconds: "0.1", frames: "2000" };
 const OTHER = "(other)";
 
 /** The request for a capture, from the values of the form. */
@@ -42,7 +44,7 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
   const [chosen, setChosen] = useState<string | null>(null);
   const [other, setOther] = useState<string | null>(null);
   const [length, setLength] = useState<Length>("open");
-  const [amount, setAmount] = useState("0.1");
+  const [amount, setAmount] = useState(USUAL.seconds);
   const [name, setName] = useState("");
   const [record, setRecord] = useState(true);
   const [reconstruct, setReconstruct] = useState(true);
@@ -94,6 +96,7 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
           onChange={(event) => {
             setChosen(event.target.value);
             setOptions({});
+            setProblem(null);
           }}
         >
           {devices.map((one) => (
@@ -151,7 +154,11 @@ export function Control({ capture }: { capture: Capture | null }): JSX.Element {
             id={`${ids}-length`}
             value={length}
             disabled={fixed}
-            onChange={(event) => setLength(event.target.value as Length)}
+            onChange={(event) => {
+              const unit = event.target.value as Length;
+              setLength(unit);
+              if (unit !== "open") setAmount(USUAL[unit]);
+            }}
           >
             <option value="open">until stopped</option>
             <option value="seconds">seconds</option>

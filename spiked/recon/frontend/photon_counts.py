@@ -57,7 +57,8 @@ class PhotonCounts:
         """Standard deviation of `rate`, from the mean count around each pixel."""
         count = cv2.blur(self.count.astype(np.float32), (DEVIATION_PX, DEVIATION_PX))
         fired = (count + np.float32(0.5)) / np.float32(self.length + 1)
-        return np.sqrt(fired / ((1 - fired) * self.length))
+        deviation: Image = np.sqrt(fired / ((1 - fired) * np.float32(self.length)))
+        return deviation
 
     def times(self) -> tuple[Image, Image]:
         """Frames [H, W] from the middle of the window to its begin and to its end, the same for all pixels."""

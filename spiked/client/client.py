@@ -185,8 +185,7 @@ class Spiked(MapMethods, ResultMethods, EditingMethods, FrameMethods, SettingMet
         """Change what is given."""
         given = {"name": name, "notes": notes, "keep": keep}
         body = {key: value for key, value in given.items() if value is not None}
-        answer = self._connection.request("PATCH", f"captures/{capture_id}", json=body)
-        return CaptureOut.model_validate_json(answer.content)
+        return self._connection.change("PATCH", f"captures/{capture_id}", body, CaptureOut)
 
     def remove_capture(self, capture_id: str) -> None:
         """Remove it; `restore_capture` brings it back for some days."""
@@ -266,8 +265,7 @@ class Spiked(MapMethods, ResultMethods, EditingMethods, FrameMethods, SettingMet
         """Change what is given: texts, or whether and where (from 1) it waits in the queue."""
         given = {"name": name, "notes": notes, "held": held, "queue_place": queue_place}
         body = {key: value for key, value in given.items() if value is not None}
-        answer = self._connection.request("PATCH", f"reconstructions/{reconstruction_id}", json=body)
-        return ReconstructionOut.model_validate_json(answer.content)
+        return self._connection.change("PATCH", f"reconstructions/{reconstruction_id}", body, ReconstructionOut)
 
     def remove_reconstruction(self, reconstruction_id: str) -> None:
         """Remove it for good."""

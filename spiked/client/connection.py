@@ -57,6 +57,10 @@ class Connection:
         """A model from a POST, which works once however often it must be sent. Raises as `get`."""
         return _read(self.request("POST", path, json=body, headers={"Idempotency-Key": uuid.uuid4().hex}), model)
 
+    def change(self, method: str, path: str, body: Mapping[str, Any] | None, model: type[_Model]) -> _Model:
+        """A model from a PATCH, PUT or DELETE. Raises as `get`."""
+        return _read(self.request(method, path, json=body), model)
+
     def request(
         self,
         method: str,

@@ -78,13 +78,11 @@ class EditingMethods:
         """
         given = {"metres_per_unit": metres_per_unit, "sigma": sigma, "up": _list(up), "version": version}
         body = self._replacing(reconstruction_id, revision, given)
-        answer = self._connection.request("PUT", f"reconstructions/{reconstruction_id}/scale", json=body)
-        return ScaleOut.model_validate_json(answer.content)
+        return self._connection.change("PUT", f"reconstructions/{reconstruction_id}/scale", body, ScaleOut)
 
     def forget_scale(self, reconstruction_id: str) -> ScaleOut:
         """Forget the scale and the direction of up."""
-        answer = self._connection.request("DELETE", f"reconstructions/{reconstruction_id}/scale")
-        return ScaleOut.model_validate_json(answer.content)
+        return self._connection.change("DELETE", f"reconstructions/{reconstruction_id}/scale", None, ScaleOut)
 
     def scale_by_tag(
         self, reconstruction_id: str, side_m: float, *, family: str = "36h11", revision: int | None = None

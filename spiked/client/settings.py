@@ -31,8 +31,7 @@ class SettingMethods:
         Return what is in effect and what needs a restart.
         """
         body = SettingsChange(values=dict(values)).model_dump(mode="json")
-        answer = self._connection.request("PATCH", "configuration", json=body)
-        return ReloadedOut.model_validate_json(answer.content)
+        return self._connection.change("PATCH", "configuration", body, ReloadedOut)
 
     def reload_configuration(self) -> ReloadedOut:
         """Have the service read its file and environment again."""

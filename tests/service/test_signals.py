@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from spiked_service.base.signals import cleaning_up, handling, holding
+from spiked_service.base.signals import cleaning_up, handling, holding, read_line
 from waiting import until
 
 WIZARD = (sys.executable, "-m", "spiked_service", "calibrate", "--device", "sim:?width=64&height=48&rate=1000", "-o")
@@ -26,8 +26,10 @@ def waiting_wizard(folder: Path, *before: str) -> Iterator[subprocess.Popen[byte
         signal.signal(signal.SIGHUP, earlier)
     with started as wizard:
         until(lambda: bool(list(folder.glob(".spiked-*"))), "its folder")
-        yield wizard
-        wizard.kill()
+        try:
+            yield wizard
+        finally:
+            wizard.kill()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
@@ -44,6 +46,44 @@ def test_a_command_outlives_its_terminal_with_nohup(tmp_path: Path) -> None:
         wizard.send_signal(signal.SIGTERM)
         assert wizard.wait(60) == -signal.SIGTERM
     assert not list(tmp_path.glob(".spiked-*"))
+
+
+READER = """
+import os, signal, sys, threading
+from spiked_service.base.signals import cleaning_up, read_line
+
+def end() -> None:
+    os.read(go, 1)
+    signal.pthread_kill(threading.get_ident(), signal.SIGTERM)  # a read of the main thread is not interrupted by it
+
+go = os.dup(0)
+silent, kept = os.pipe()
+threading.Thread(target=end, daemon=True).start()
+with cleaning_up():
+    print("ready", flush=True)
+    read_line(silent)
+"""
+
+
+def test_a_signal_that_another_thread_took_ends_a_wait_for_a_line() -> None:
+    with subprocess.Popen([sys.executable, "-c", READER], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as reader:
+        assert reader.stdout is not None
+        assert reader.stdin is not None
+        assert reader.stdout.readline() == b"ready\n"
+        reader.stdin.write(b"x")
+        reader.stdin.flush()
+        try:
+            assert reader.wait(60) == -signal.SIGTERM
+        finally:
+            reader.kill()
+
+
+def test_lines_are_read_one_by_one() -> None:
+    end, start = os.pipe()
+    os.write(start, "s\nä\nrest".encode())
+    os.close(start)
+    assert [read_line(end) for _ in range(4)] == ["s\n", "ä\n", "rest", ""]
+    os.close(end)
 
 
 def test_signals_wait_for_an_import_that_would_swallow_them() -> None:

@@ -1,7 +1,9 @@
-"""Handlers of signals for a while, and an end by a signal that cleans up."""
+"""Handlers of signals for a while, an end by a signal that cleans up, and a read that signals interrupt."""
 
 import os
+import select
 import signal
+import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from types import FrameType
@@ -63,3 +65,32 @@ def holding() -> Iterator[None]:
         yield
     if came:
         signal.raise_signal(came[0])
+
+
+def read_line(fd: int) -> str:
+    """The next line of a file descriptor, with its end; empty at the end of the input.
+
+    Signals are handled while this waits. A plain read would block on after a signal that came just before it, or
+    that another thread took.
+    """
+    woken, wake = socket.socketpair()
+    with woken, wake:
+        wake.setblocking(False)
+        before = signal.set_wakeup_fd(wake.fileno(), warn_on_full_buffer=False)
+        try:
+            return _line_between_signals(fd, woken)
+        finally:
+            signal.set_wakeup_fd(before)
+
+
+def _line_between_signals(fd: int, woken: socket.socket) -> str:
+    line = bytearray()
+    while not line.endswith(b"\n"):
+        ready, _, _ = select.select([fd, woken.fileno()], [], [])
+        if woken.fileno() in ready:
+            woken.recv(4096)  # a signal came; Python calls its handler, which may end this
+        elif byte := os.read(fd, 1):  # what follows the line is left to the next reader
+            line += byte
+        else:
+            break
+    return line.decode(errors="replace")

@@ -13,6 +13,7 @@ from spiked.calibration import LEAST_FRAMES, LONGEST_FRAMES, Calibration
 from spiked.errors import CalibrationError, ConfigurationError, SourceError
 from spiked.recording import Recording, RecordingWriter, open_recording
 from spiked.ring import End, Gap
+from spiked_service.base.signals import read_line
 from spiked_service.cli.console import messages, report_error, report_warning
 
 _READ_FRAMES = 256
@@ -61,7 +62,7 @@ def _taken(
 def _answer(request: str) -> str:
     """What is written after a request. Raises ConfigurationError at the end of the input."""
     messages.print(request, markup=False, style="bold")
-    line = sys.stdin.readline()
+    line = read_line(sys.stdin.fileno())
     if not line:
         raise ConfigurationError("--device asks for the lens to be covered and uncovered, and nobody answers")
     return line.strip().lower()

@@ -1,8 +1,8 @@
-"""Cleaning of a scene: what lies outside a box or inside an outline, floaters, which few views see or which stick out,
+"""Cleaning of a scene: what lies outside a box or inside an outline, floaters, which few views see or which hang alone,
 and splats that are too large."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from spiked.errors import ConfigurationError
 from spiked.recon.statistics import evenly
-from spiked.render import Camera
+from spiked.render.camera import MAX_SIDE, Camera
 from spiked.render.cpu import Rasteriser
 from spiked.scene import Scene
 from spiked.splitting import split_large
@@ -78,16 +78,18 @@ class FloaterRemoval:
 
     views: int = 64
     """Views along the path that are rendered."""
+    margin: float = 1.25
+    """Their width and height over those of the recorded pictures: what lies at their edges is seen beside the path."""
     least_px: float = 0.05
     """Pixels that a splat has to fill in a view to be seen in it, all that hide it counted."""
     least_views: int = 2
     """Views that have to see a splat."""
     neighbours: int = 8
-    """Neighbours of a splat that say how lonely it is: by the distance to the last of them ..."""
-    lonely: float = 6.0
-    """... over the median of that distance in the scene."""
-    lonely_views: float = 0.15
-    """Share of the views that has to see a splat that lonely; it stays then."""
+    """Neighbours of a splat that say how lonely it is, by the distance to the last of them: a floater's is ..."""
+    lonely: float = 8.0
+    """... more than so many medians of the scene, both over the depth of the nearest view that sees the splat ..."""
+    apart: float = 4.0
+    """... and more than so many of its largest standard deviations."""
     span_percentiles: tuple[float, float] = (1, 99)
     """Percentiles of the means along each axis that give the size of the scene."""
     span_share: float = 1 / 12
@@ -100,13 +102,30 @@ class FloaterRemoval:
         low, high = np.percentile(scene.means, self.span_percentiles, axis=0)
         return float(np.linalg.norm(high - low))
 
-    def floaters(self, scene: Scene, seen: NDArray[np.int64], views: int) -> Mask:
-        """Splats [N] to be removed; `seen` [N] is the number of views that see each."""
+    def floaters(self, scene: Scene, seen: "Seen") -> Mask:
+        """Splats [N] to be removed.
+
+        The spacing of splats on a surface grows with its distance from the camera, which is why it is measured as an
+        angle: far surfaces are no floaters.
+        """
         count = min(self.neighbours + 1, len(scene))
         found = np.asarray(cKDTree(scene.means).query(scene.means, count)[0])
         distances = found.reshape(len(scene), -1)[:, -1]
-        lonely = distances > self.lonely * max(float(np.median(distances)), 1e-12)
-        return np.asarray((seen < self.least_views) | (lonely & (seen < self.lonely_views * views)))
+        angles = distances / seen.nearest
+        usual = float(np.median(angles[seen.views > 0])) if seen.views.any() else 0.0
+        lonely = angles > self.lonely * max(usual, 1e-12)
+        apart = distances > self.apart * np.exp(scene.log_scales.max(axis=1))
+        return np.asarray((seen.views < self.least_views) | (lonely & apart))
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """How views see the splats of a scene."""
+
+    views: NDArray[np.int64]
+    """Views that see each splat, [N]."""
+    nearest: NDArray[np.float64]
+    """Depth of each in the nearest of them, [N]; infinite for a splat that none sees."""
 
 
 @dataclass(frozen=True)
@@ -152,9 +171,9 @@ def clean(
         if camera is None or not len(path):
             raise ConfigurationError("the camera or the path of this scene is not known, so no view can tell floaters")
         rows = evenly(len(path), removal.views)
-        chosen = removal.floaters(
-            kept, _seen(kept, path, camera, rows, removal.least_px, _part(progress, SEEN, 0)), len(rows)
-        )
+        wider = _wider(camera, removal.margin)
+        seen = _seen(kept, path, wider, rows, removal.least_px, _part(progress, SEEN, 0))
+        chosen = removal.floaters(kept, seen)
         floaters = int(chosen.sum())
         kept = kept.select(~chosen)
     if not len(kept):
@@ -171,6 +190,16 @@ def _part(progress: Callable[[float], None] | None, share: float, begin: float) 
     return None if progress is None else lambda done: progress(begin + share * done)
 
 
+def _wider(camera: Camera, margin: float) -> Camera:
+    """The camera with larger pictures; as it is with distortion, which beyond its own edges is not known."""
+    optics = camera.intrinsics
+    if optics.distortion is not None:
+        return camera
+    width, height = (min(round(side * margin), MAX_SIDE) for side in (camera.width, camera.height))
+    shift = (width - camera.width) / 2, (height - camera.height) / 2
+    return Camera(replace(optics, cx=optics.cx + shift[0], cy=optics.cy + shift[1]), width, height)
+
+
 def _seen(
     scene: Scene,
     path: Trajectory,
@@ -178,15 +207,17 @@ def _seen(
     rows: list[int],
     least_px: float,
     progress: Callable[[float], None] | None,
-) -> NDArray[np.int64]:
-    """Number of views [N] that see each splat."""
+) -> Seen:
     rasteriser = Rasteriser(camera)
-    seen = np.zeros(len(scene), np.int64)
+    views, nearest = np.zeros(len(scene), np.int64), np.full(len(scene), np.inf)
     for done, row in enumerate(rows, 1):
-        image = rasteriser.forward(scene, path.rotations[row][None], path.centres[row][None])
+        rotation, centre = path.rotations[row], path.centres[row]
+        image = rasteriser.forward(scene, rotation[None], centre[None])
         # Each colour enters the image with the weight of its splat.
         weights = rasteriser.backward(np.ones_like(image.values)).colours
-        seen += weights.reshape(len(scene), -1).mean(axis=1) >= least_px
+        here = weights.reshape(len(scene), -1).mean(axis=1) >= least_px
+        views += here
+        nearest[here] = np.minimum(nearest[here], (scene.means[here] - centre) @ rotation[:, 2])
         if progress is not None:
             progress(done / len(rows))
-    return seen
+    return Seen(views, nearest)

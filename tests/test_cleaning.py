@@ -11,6 +11,7 @@ from spiked.pose import exp_so3, quaternion
 from spiked.render.cpu import Rasteriser
 from spiked.scene import Scene
 from spiked.splitting import LEAST_BUDGET, split_large
+from spiked.trajectory import Trajectory
 
 from .room_map import CAMERA, RoomMap, room_map
 
@@ -39,6 +40,40 @@ def test_floaters_go_and_pictures_stay(room: RoomMap) -> None:
     assert -10 * np.log10(np.mean((wanted - got) ** 2) / wanted.max() ** 2) > 30
 
 
+def test_splats_that_hang_in_the_air_go_though_each_view_sees_them(room: RoomMap) -> None:
+    row, count = len(room.path) // 2, 12
+    rotation, centre = room.path.rotations[row], room.path.centres[row]
+    rays = np.array([(x, y, 1) for x in (-0.3, -0.1, 0.1, 0.3) for y in (-0.15, 0, 0.15)])
+    depth = 0.5 * np.median(((room.scene.means - centre) @ rotation)[:, 2])
+    hanging = replace(
+        room.scene.select(np.zeros(count, np.int64)),
+        means=np.asarray(depth * rays @ rotation.T + centre, np.float32),
+        log_scales=np.full((count, 3), np.log(0.01 * depth), np.float32),
+        opacity_logits=np.full(count, 3, np.float32),
+    )
+    cleaned = clean(room.scene.join(hanging), room.path, CAMERA, removal=FloaterRemoval(split=False))
+    alone = clean(room.scene, room.path, CAMERA, removal=FloaterRemoval(split=False))
+    assert abs(cleaned.floaters - alone.floaters - count) <= 1
+    assert alone.floaters < 0.2 * len(room.scene)
+
+
+def test_a_place_of_large_splats_that_few_views_see_stays(room: RoomMap) -> None:
+    """As a walk through several rooms shows them: one for a long time, another from afar and for a moment."""
+    away, some = np.float32(50), room.scene.select(np.arange(0, len(room.scene), 49))
+    other = replace(some, means=some.means + away, log_scales=some.log_scales + np.float32(np.log(12)))
+    rows = np.append(np.zeros(60, np.int64), [len(room.path) - 1] * 4)
+    path = Trajectory(
+        np.arange(64) / 20_000,
+        room.path.rotations[rows],
+        room.path.centres[rows] + np.where(np.arange(64) < 60, 0, away)[:, None],
+    )
+    removal = FloaterRemoval(split=False)
+    cleaned = clean(room.scene.join(other), path, CAMERA, removal=removal)
+    seen_alone = clean(other, path, CAMERA, removal=removal)
+    there = int((cleaned.scene.means[:, 0] > away / 2).sum())
+    assert there > 0.9 * len(seen_alone.scene) > 0.3 * len(other)
+
+
 def with_large_splats(room: RoomMap) -> Scene:
     """The room with three huge splats that views see: two sheets and a stick, behind everything; and one behind the
     camera that none sees."""
@@ -61,7 +96,7 @@ def with_large_splats(room: RoomMap) -> Scene:
 def test_large_splats_become_several_that_show_the_same(room: RoomMap) -> None:
     scene = with_large_splats(room)
     shares: list[float] = []
-    removal = FloaterRemoval(views=4, least_views=0, lonely_views=0)
+    removal = FloaterRemoval(views=4, least_views=0, lonely=np.inf)
     cleaned = clean(scene, room.path, CAMERA, removal=removal, progress=shares.append)
     assert (cleaned.split, cleaned.shrunk) == (3, 1)
     assert shares == sorted(shares) and shares[-1] == 1

@@ -59,7 +59,7 @@ class CleanRequest(In):
     version: StrictInt = Newest
     box: BoxModel | None = Field(None, description="Splats outside are removed.")
     outline: OutlineModel | None = Field(None, description="Splats inside are removed, however far behind it.")
-    floaters: StrictBool = Field(True, description="Remove splats that few views see.")
+    floaters: StrictBool = Field(True, description="Remove splats that few views see or that hang alone.")
     split: StrictBool = Field(
         True,
         description="With floaters: also replace splats larger than a quarter of the scene by smaller ones that show "

@@ -27,7 +27,7 @@ def clean(
         tuple[float, float, float, float, float, float] | None,
         typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Remove splats outside of this box, in the scene's axes."),
     ] = None,
-    floaters: Annotated[bool, typer.Option(help="Remove splats that few views see.")] = True,
+    floaters: Annotated[bool, typer.Option(help="Remove splats that few views see or that hang alone.")] = True,
     split: Annotated[
         bool,
         typer.Option(help="Replace splats larger than a quarter of the scene by smaller ones that show the same."),
@@ -35,8 +35,8 @@ def clean(
 ) -> None:
     """Remove floaters from a scene, and what is outside of a box.
 
-    A floater is a splat that fewer than two views along the path see, or a lonely one that few see. Splats larger than
-    a quarter of the scene become several. OUT is an output folder like the other one, which stays as it is.
+    A floater is a splat that fewer than two views along the path see, or one that hangs in the air, far from all others.
+    Splats larger than a quarter of the scene become several. OUT is an output folder like the other one, which stays as it is.
 
     Examples:
 

@@ -52,6 +52,11 @@ BACKGROUND = 0.5
 opaque as what they replace."""
 HUBER = 0.1
 """Errors over white beyond which the loss is linear."""
+WIDER = 1.1
+"""Size of the pictures in which pieces have to be seen, over those of the camera, and ..."""
+LEAST_PX = 0.05
+"""... the pixels that a piece has to fill in one of them, from the path or as far aside of it as fitted views are. A
+splat that reaches far out of all views would else become a wall around the scene."""
 
 
 @dataclass(frozen=True)
@@ -102,14 +107,39 @@ def split_large(
     for some in pieces:
         made = made.join(some)
     if pieces:
-        _fit(made, first, scene, largest, path, rasteriser, progress)
+        depth = _depth(scene, path, rasteriser)
+        _fit(made, first, scene, largest, path, rasteriser, depth, progress)
+        made = _seen(made, first, path, camera, depth)
     return Split(made, len(replaced), len(unseen), len(large) - len(replaced) - len(unseen))
 
 
-def _rasteriser(camera: Camera) -> Rasteriser:
-    """For pictures of the camera, smaller if they are large."""
+def _rasteriser(camera: Camera, wider: float = 1.0) -> Rasteriser:
+    """For pictures of the camera, smaller if they are large, and wider on each side by the same share."""
     factor = int(np.ceil(np.sqrt(camera.width * camera.height / PIXELS)))
-    return Rasteriser(Camera(camera.intrinsics.scaled(1 / factor), camera.width // factor, camera.height // factor))
+    optics, width, height = camera.intrinsics.scaled(1 / factor), camera.width // factor, camera.height // factor
+    x, y = round((wider - 1) / 2 * width), round((wider - 1) / 2 * height)
+    moved = replace(optics, cx=optics.cx + x, cy=optics.cy + y)
+    return Rasteriser(Camera(moved, width + 2 * x, height + 2 * y))
+
+
+def _depth(scene: Scene, path: Trajectory, rasteriser: Rasteriser) -> float:
+    """Median depth of what is opaque in the first view."""
+    start = rasteriser.forward(scene.seen_from(path.centres[0]), path.rotations[:1], path.centres[:1])
+    opaque = start.alpha > 0.5
+    return float(np.median(start.depth[opaque])) if opaque.any() else 1.0
+
+
+def _seen(made: Scene, first: int, path: Trajectory, camera: Camera, depth: float) -> Scene:
+    """The scene without the splats from `first` on that no view sees, from the path or beside it."""
+    rasteriser, wanted = _rasteriser(camera, WIDER), np.arange(first, len(made))
+    around = ASIDE * depth * np.array([(0, 0), (-1, -1), (1, -1), (-1, 1), (1, 1)])
+    rows = np.array(evenly(len(path), VIEWS))
+    filled = np.zeros(len(wanted))
+    for row, aside in zip(rows, np.resize(around, (len(rows), 2)), strict=True):
+        centre = path.centres[row] + path.rotations[row][:, :2] @ aside
+        image = rasteriser.forward(made, path.rotations[row][None], centre[None])
+        filled = np.maximum(filled, rasteriser.backward(np.zeros_like(image.values)).contribution[wanted])
+    return made.select(np.append(np.ones(first, bool), filled >= LEAST_PX))
 
 
 def _fullest(
@@ -194,13 +224,12 @@ def _fit(
     largest: float,
     path: Trajectory,
     rasteriser: Rasteriser,
+    depth: float,
     progress: Callable[[float], None] | None,
 ) -> None:
     """Fit the splats from `first` on, in place, to pictures of the scene before."""
     rng, adam, most = np.random.default_rng(0), Adam(made.arrays()[:4], 0.9, 0.99), np.float32(np.log(largest))
     start = rasteriser.forward(before.seen_from(path.centres[0]), path.rotations[:1], path.centres[:1])
-    opaque = start.alpha > 0.5
-    depth = float(np.median(start.depth[opaque])) if opaque.any() else 1.0
     white = max(float(np.percentile(start.values, 99.5)), 1e-9)
     pieces = np.arange(len(made)) >= first
     for step in range(STEPS):

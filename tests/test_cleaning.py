@@ -110,6 +110,19 @@ def test_large_splats_become_several_that_show_the_same(room: RoomMap) -> None:
         assert error < 0.1 * effect, (row, error / effect)
 
 
+def test_large_splats_become_no_wall_that_no_view_sees(room: RoomMap) -> None:
+    """A cleaned scene is about as large as before, and has few splats more that no view sees."""
+    scene = with_large_splats(room)
+    removal = FloaterRemoval(views=16)
+    cleaned = clean(scene, room.path, CAMERA, removal=removal)
+    span = removal.span(room.scene)
+    outside = np.linalg.norm(cleaned.scene.means - np.median(room.scene.means, axis=0), axis=1) > 1.5 * span
+    assert outside.sum() < 0.005 * len(scene)
+    assert removal.span(cleaned.scene) < 1.5 * span
+    again = clean(cleaned.scene, room.path, CAMERA, removal=removal)
+    assert again.split == 0 and again.floaters < 0.5 * cleaned.floaters
+
+
 def test_a_large_splat_far_behind_the_scene_is_kept(room: RoomMap) -> None:
     row = len(room.path) // 2
     rotation, centre = room.path.rotations[row], room.path.centres[row]

@@ -2104,6 +2104,16 @@ class SystemOut(BaseModel):
         Scope,
         Field(description="Scope of the token of this request; admin where no token is required."),
     ]
+    token_required: Annotated[
+        bool,
+        Field(description="Whether requests need a token. Where none is required, scopes limit nothing."),
+    ]
+    token_scope: Annotated[
+        Scope | None,
+        Field(
+            description="Scope of the token that this request brings, whether one is required or not; null without one."
+        ),
+    ]
 
 
 class TagScaleOut(BaseModel):

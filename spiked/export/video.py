@@ -28,7 +28,7 @@ def write(source: ExportSource, file: Path, options: ExportOptions) -> str:
     path = _path(source, options)
     count = limit(source.sensor, options)
     with Mp4Writer(file, options.pictures_a_second) as video:
-        for picture in scene_pictures(scene, path, camera, count, source.white):
+        for picture in scene_pictures(scene, path, camera, count, source.white, bool(options.through)):
             video.write(picture)
     return f"{count} pictures of {camera.width} x {camera.height}, {options.seconds:g} s"
 

@@ -84,11 +84,27 @@ def test_what_another_has_written_is_kept_by_a_visit_of_the_field(studied: Studi
         studied.http.patch(f"{kind}/{id_}", json={key: before})
 
 
+def test_how_much_is_refined_is_read_to_its_end(studied: Studied, visit: Callable[..., Any]) -> None:
+    plan = {"capture_id": studied.capture_id, "options": {"steps": 200_000}}
+    job = studied.http.post("reconstructions", json=plan).json()["id"]
+    try:
+        page = visit(f"{studied.address}?page=scene&capture={studied.capture_id}&reconstruction={job}")
+        text = page.locator(".inspector .refining span")
+        text.get_by_text("left").wait_for()
+        bounds, panel = text.bounding_box(), page.locator(".inspector").bounding_box()
+        assert bounds["x"] + bounds["width"] <= panel["x"] + panel["width"]
+    finally:
+        studied.http.post(f"reconstructions/{job}:cancel")
+        until(lambda: studied.http.get(f"reconstructions/{job}").json()["state"] == "cancelled", "it has ended")
+        studied.http.delete(f"reconstructions/{job}")
+
+
 def test_everything_can_be_downloaded(studied: Studied, visit: Callable[..., Any]) -> None:
     page = visit(f"{studied.address}?page=captures&capture={studied.capture_id}")
     page.get_by_role("link", name="nerfstudio").wait_for()
     targets = page.eval_on_selector_all("a[download]", "links => links.map(link => link.href)")
     assert len(targets) == 10
+    page.get_by_role("group", name="Path alone").get_by_text("Path alone").wait_for()  # COLMAP without a scene
     for target in targets:
         answer = studied.http.get(target)
         assert answer.status_code == 200, target

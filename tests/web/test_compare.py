@@ -109,6 +109,8 @@ def test_two_reconstructions_are_chosen_and_turned_together(
     until(lambda: shown_version(page) > 0, "a scene is on the canvas")
     still(page)
     page.locator("summary").filter(has_text="Compare").click()
+    named = page.locator(f"option[value='{other_id}.']").inner_text()
+    assert re.match(r"#2, \d\d:\d\d:\d\d: ", named), f"{named}: as the page of the capture calls it"
     page.get_by_label("With").select_option(value=f"{other_id}.")
     until(lambda: page.locator(SECOND).count() == 1, "a second canvas")
     until(lambda: int(page.locator(SECOND).get_attribute("data-version") or 0) > 0, "the second scene")

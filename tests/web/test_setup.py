@@ -54,6 +54,12 @@ def test_settings_are_changed_and_what_restarts_is_told(
     panel.get_by_text("Given at the start or by the environment, and changed there: limit_captures").wait_for()
     panel.get_by_label(re.compile("^retention days")).fill("30")
     panel.get_by_label(re.compile("^limit renders")).fill("3")
+    field = panel.get_by_role("spinbutton", name="retention bytes", exact=True)  # named without its hint
+    field.fill("20000000000")
+    field.locator("xpath=..").get_by_text(
+        re.compile(r"20\.0\sGB\. Remove the oldest.+ Takes effect at once\.")
+    ).wait_for()
+    field.fill("")
     panel.get_by_label(re.compile("^log format")).select_option("json")
     assert violations(page) == []
     panel.screenshot(path=pictures_folder / "settings.png")
@@ -84,7 +90,7 @@ def test_tokens_are_made_and_revoked(
     panel.get_by_role("button", name="Create").click()
     made = panel.locator(".made")
     made.wait_for()
-    secret = made.locator("code").inner_text()
+    secret = made.locator("code").last.inner_text()
     holder = tokens.holder_of(secret)
     assert holder is not None and (holder.name, holder.scope) == ("display", Scope.OPERATE)
     assert violations(page) == []
@@ -95,6 +101,32 @@ def test_tokens_are_made_and_revoked(
     panel.get_by_role("button", name="Revoke at once").click()
     panel.get_by_role("row").filter(has_text="display").wait_for(state="detached")
     assert tokens.holder_of(secret) is None
+
+
+def test_a_token_is_entered_where_none_is_required(
+    daemon: Callable[..., Any], visit: Callable[..., Any], tmp_path: Path
+) -> None:
+    tokens = Tokens(tmp_path / "data")
+    one = daemon("--no-capture")
+    page = visit(f"{one.address}?page=setup")
+    panel = page.locator(".panel:has(h2:text-is('Tokens'))")
+    panel.get_by_text("tokens limit nothing until").wait_for()
+    panel.locator("summary", has_text="Create or revoke a token").click()
+    panel.get_by_label("Token", exact=True).fill("guess")
+    panel.get_by_role("button", name="Sign in").click()
+    panel.get_by_text("This token is not valid.").wait_for()
+    assert violations(page) == []
+    panel.get_by_label("Token", exact=True).fill(tokens.create("mine"))
+    panel.get_by_role("button", name="Sign in").click()
+    panel.locator("summary", has_text="Create a token").click()
+    panel.get_by_label("Name", exact=True).fill("display")
+    panel.get_by_role("button", name="Create").click()
+    made = panel.locator(".made")
+    made.get_by_text("Authorization: Bearer").wait_for()
+    panel.get_by_role("button", name="Revoke display").click()
+    panel.get_by_role("button", name="Revoke at once").click()
+    made.wait_for(state="detached")  # it opens nothing any more
+    assert [one.name for one in Tokens(tmp_path / "data").all()] == ["mine"]
 
 
 def test_a_person_calibrates_a_camera(

@@ -57,7 +57,8 @@ class Initialiser:
         advice = MOVE_NOW if self.live and not final else MOVE_AGAIN
         if count < BOOT_VIEWS:
             after = f" since the camera last stood still, at view {self._start + 1}" if self._start else ""
-            self.status.explain(f"{count} of {BOOT_VIEWS} views for a first map{after}: {advice}")
+            what = f": {advice}" if self.live or final else ""  # a recording may have more views
+            self.status.explain(f"{count} of {BOOT_VIEWS} views for a first map{after}{what}")
             return False
         if (count % ATTEMPT_EVERY or count < self._min_views) and not final:
             return False

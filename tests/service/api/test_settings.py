@@ -171,7 +171,8 @@ def test_tokens_are_made_shown_once_and_revoked(three: Three) -> None:
     made = answer.json()
     assert (made["scope"], made["created_by"]) == ("read", "admin-1")
     guest = httpx.Client(base_url=admin.base_url, headers={"Authorization": f"Bearer {made['secret']}"})
-    assert guest.get("system").json()["scope"] == "read"
+    system = guest.get("system").json()
+    assert (system["scope"], system["token_scope"], system["token_required"]) == ("read", "read", True)
     listed = admin.get("tokens")
     assert "display" in [one["name"] for one in listed.json()["items"]]
     assert made["secret"] not in listed.text and "sha256" not in listed.text

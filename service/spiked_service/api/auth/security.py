@@ -69,6 +69,8 @@ class Caller:
     """What its token allows; everything if no token is required."""
     token_scope: TokenScope | None = None
     """Scope of the token that it brings, whether one is required or not."""
+    required: bool = False
+    """Whether a token is required."""
 
 
 def is_loopback(host: str) -> bool:
@@ -108,17 +110,17 @@ class Security:
             answer = error.answer() if isinstance(error, _TooManyGuesses) else _unavailable(error)
             await _refuse(answer, scope, receive, _with_headers(send))
             return
-        if self._guarded and (holder is None or request.path == sign_in.PATH) and request.path not in _OPEN:
+        if request.path == sign_in.PATH or (self._guarded and holder is None and request.path not in _OPEN):
             answer = await self._sign_in(request, holder, scope, receive)
             await _refuse(answer, scope, receive, _with_headers(send))
             return
         if holder is not None and request.path == "/" and "token" in request.query:
             await _remember(request)(scope, receive, _with_headers(send))
             return
-        caller = Caller(request.address, None)
+        caller = Caller(request.address, None, required=self._guarded)
         if holder is not None:
             allowed = holder.scope if self._guarded else TokenScope.ADMIN
-            caller = Caller(request.address, holder.name, allowed, holder.scope)
+            caller = Caller(request.address, holder.name, allowed, holder.scope, self._guarded)
         scope.setdefault("state", {})["caller"] = caller
         passed = self._app(scope, self._limited(request, receive), _with_headers(send))
         if not self._guarded or holder is None:
@@ -161,7 +163,7 @@ class Security:
     def _holder(self, request: "RequestInfo", given: str) -> Holder | None:
         """The holder of the token. Raises _TooManyGuesses, ConfigurationError if the tokens cannot be read."""
         holder = self._tokens.holder_of(given) if given else None
-        if given and self._guarded and request.path not in _OPEN:
+        if given and (self._guarded or request.path == sign_in.PATH) and request.path not in _OPEN:
             wait_s = self._wrong.wait_s(request.address, given, right=holder is not None)
             if wait_s:
                 raise _TooManyGuesses(request.address, wait_s)

@@ -49,6 +49,12 @@ class SystemOut(BaseModel):
     event_clients: int = Field(description="Clients of the events now, WebSocket and server-sent events.")
     zmq: ZmqOut | None = Field(description="null where ZeroMQ is turned off.")
     scope: Scope = Field(description="Scope of the token of this request; admin where no token is required.")
+    token_required: bool = Field(
+        description="Whether requests need a token. Where none is required, scopes limit nothing."
+    )
+    token_scope: Scope | None = Field(
+        description="Scope of the token that this request brings, whether one is required or not; null without one."
+    )
 
 
 def system_routes(services: Services) -> APIRouter:
@@ -78,6 +84,8 @@ def system_routes(services: Services) -> APIRouter:
             event_clients=services.event_clients.active,
             zmq=None if services.zmq is None else ZmqOut(**vars(services.zmq)),
             scope=request.state.caller.scope,
+            token_required=request.state.caller.required,
+            token_scope=request.state.caller.token_scope,
         )
 
     return router

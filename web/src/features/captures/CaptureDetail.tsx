@@ -6,7 +6,7 @@ import * as calls from "../../shared/api/calls";
 import type { Capture, CaptureChange, Reconstruction } from "../../shared/api/types";
 import { useDenied } from "../../shared/state/access";
 import { attempt } from "../../shared/state/attempt";
-import { nameOf, sourceOf } from "../../shared/state/capture";
+import { nameOf, numberOf, sourceOf } from "../../shared/state/capture";
 import { adjust, go, useRoute } from "../../shared/state/route";
 import {
   isFinished,
@@ -63,7 +63,7 @@ function Detail({ capture }: { capture: Capture }): JSX.Element {
   const job = jobs.find((one) => one.id === at.reconstruction) ?? newestReconstruction(all, capture.id);
   const [otherId, setOtherId] = useState<string | null>(null);
   const other = jobs.find((one) => one.id === otherId && one.id !== job?.id) ?? null;
-  const nameOfJob = (one: Reconstruction): string => `#${jobs.length - jobs.indexOf(one)}`;
+  const nameOfJob = (one: Reconstruction): string => numberOf(one, jobs);
   const [form, setForm] = useState<"rerun" | "map" | null>(null);
   const toggle = (wanted: "rerun" | "map"): void => setForm(form === wanted ? null : wanted);
 

@@ -7,6 +7,7 @@ import type { Reconstruction } from "../../shared/api/types";
 import { useFetch } from "../../shared/state/useFetch";
 import { DownloadLink } from "../../shared/ui/DownloadLink";
 import { Fetched } from "../../shared/ui/Fetched";
+import { Markup } from "../../shared/ui/parts";
 
 export function ExportMenu({ job }: { job: Reconstruction }): JSX.Element {
   const [open, setOpen] = useState(false);
@@ -47,7 +48,10 @@ function Formats({ job }: { job: Reconstruction }): JSX.Element {
                   <span className="dim">{format.name}</span>
                 )}
                 <span>
-                  {format.title}. <span className="dim">For {format.readers}.</span>
+                  {format.title}.{" "}
+                  <span className="dim">
+                    For <Markup>{format.readers}</Markup>.
+                  </span>
                   {format.missing !== "" && <span className="dim"> Not installed: {format.missing}.</span>}
                 </span>
               </li>

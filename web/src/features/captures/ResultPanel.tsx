@@ -95,10 +95,11 @@ export function ResultPanel({
             </a>
           </div>
           <ExportMenu job={job} />
-          <div className="downloads" role="group" aria-label="Trajectory">
+          <div className="downloads" role="group" aria-label="Path alone">
+            <span className="dim">Path alone</span>
             {TRAJECTORIES.map(({ format, label }) => (
               <a key={format} className="button" href={calls.address.trajectory(job.id, format)} download>
-                {label}
+                <Icon name="download" /> {label}
               </a>
             ))}
           </div>

@@ -75,7 +75,7 @@ function DropZone({
         onDrop={() => setOver(false)}
         onChange={(event) => onChoose([...(event.target.files ?? [])])}
       />
-      <Icon name="download" />
+      <Icon name="upload" />
       {chosen === null ? (
         <span>
           Drop a recording here, or <u>choose files</u>

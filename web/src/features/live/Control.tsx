@@ -11,7 +11,7 @@ import { useFetch } from "../../shared/state/useFetch";
 import { ActionButton, ScopeNote } from "../../shared/ui/access";
 import { Icon } from "../../shared/ui/icons";
 import { fieldsOf, OptionInput, optionsOf, textOf, withOptions } from "../../shared/ui/options";
-import { Badge, deviceTone, Markup, Panel, ErrorMessage } from "../../shared/ui/parts";
+import { Badge, deviceTone, ErrorMessage, Labelled, Markup, Panel } from "../../shared/ui/parts";
 
 type Length = "open" | "seconds" | "frames";
 /** The length that is offered in each unit. */
@@ -245,18 +245,17 @@ function SourceOptions({
     <details className="source-options">
       <summary>Camera and options of {kind.name}</summary>
       {fields.map((field) => (
-        <label key={field.key}>
-          <span>{field.label}</span>
-          <OptionInput
-            field={field}
-            text={texts[field.key] ?? stated[field.key] ?? textOf(field.initial)}
-            disabled={disabled}
-            onChange={(text) => onChange(field.key, text)}
-          />
-          <small className="dim">
-            <Markup>{field.hint}</Markup>
-          </small>
-        </label>
+        <Labelled key={field.key} label={field.label} hint={<Markup>{field.hint}</Markup>}>
+          {(called) => (
+            <OptionInput
+              {...called}
+              field={field}
+              text={texts[field.key] ?? stated[field.key] ?? textOf(field.initial)}
+              disabled={disabled}
+              onChange={(text) => onChange(field.key, text)}
+            />
+          )}
+        </Labelled>
       ))}
     </details>
   );

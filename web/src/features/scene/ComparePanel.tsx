@@ -5,7 +5,7 @@ import { type JSX, useEffect, useState } from "react";
 import * as calls from "../../shared/api/calls";
 import type { Capture, Reconstruction, Version } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
-import { calledOf, nameOf } from "../../shared/state/capture";
+import { calledOf, nameOf, numberOf } from "../../shared/state/capture";
 import { count, decibel, small } from "../../shared/state/format";
 import { adjust } from "../../shared/state/route";
 import { storeReconstruction, useService } from "../../shared/state/store";
@@ -88,6 +88,8 @@ function Choice({
   const far = others.filter((one) => one.capture_id !== capture.id);
   const other = comparison?.job ?? null;
   const ofOther = useVersions(other?.id === job.id ? null : other);
+  // All of this capture are known, of others those that are complete.
+  const nameOfNear = (one: Reconstruction): string => `${numberOf(one, Object.values(all))}, ${calledOf(one)}`;
   const nameOfFar = (one: Reconstruction): string => {
     const from = captures[one.capture_id];
     return `${from === undefined ? "an older capture" : nameOf(from)}, ${calledOf(one)}`;
@@ -121,7 +123,7 @@ function Choice({
                 </option>
               ))}
           </optgroup>
-          <Reconstructions label="Of this capture" jobs={same} nameOf={calledOf} />
+          <Reconstructions label="Of this capture" jobs={same} nameOf={nameOfNear} />
           <Reconstructions label="Of other captures" jobs={far} nameOf={nameOfFar} />
           {other !== null && other.id !== job.id && (
             <optgroup label="Versions of the other reconstruction">

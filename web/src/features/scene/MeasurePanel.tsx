@@ -1,6 +1,7 @@
 /** Distances and angles in the scene, its scale in metres, and which way is up. */
 
 import { type JSX, useEffect, useState } from "react";
+import { createPortal } from "react-dom";
 import type { Vector3 } from "three";
 
 import * as calls from "../../shared/api/calls";
@@ -42,6 +43,7 @@ function Measuring({ viewer, jobId, version }: MeasureProps): JSX.Element {
   const earlier = known !== null && version > 0 && version <= known.since;
   const scale = earlier ? null : known;
   const full = points.length >= pointsOf(tool);
+  const notes = viewer.canvas.closest(".viewport")?.querySelector(".stage-notes") ?? null;
   usePicking(viewer, (point) => setPoints(full ? [point] : [...points, point]));
   useEffect(() => {
     viewer.mark(points, tool === "up");
@@ -76,6 +78,14 @@ function Measuring({ viewer, jobId, version }: MeasureProps): JSX.Element {
       <output className="measured" aria-live="polite">
         {resultText(tool, points, scale)}
       </output>
+      {notes !== null &&
+        createPortal(
+          // Beside the points, too: on a phone this panel is out of sight then.
+          <p className="glass" aria-hidden="true">
+            {points.length === 0 ? TOOLS.find((one) => one.value === tool)?.ask : resultText(tool, points, scale)}
+          </p>,
+          notes,
+        )}
       {!earlier && tool === "distance" && full && (
         <KnownLength
           units={distance(points) ?? 0}

@@ -4,7 +4,7 @@ import { type JSX, useCallback, useEffect, useMemo, useRef, useState } from "rea
 
 import type { Capture, Intrinsics, Reconstruction, Sensor, Version } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
-import { calledOf, nameOf } from "../../shared/state/capture";
+import { calledOf, nameOf, numberOf } from "../../shared/state/capture";
 import { count } from "../../shared/state/format";
 import { copy } from "../../shared/state/clipboard";
 import { adjust, go, linkTo, nameFound, route, useRoute } from "../../shared/state/route";
@@ -352,8 +352,11 @@ function namesOf(job: Reconstruction, pinned: Version | null, compared: Compared
   const first = version(job, pinned?.version ?? null);
   const second = version(compared.job, compared.version);
   if (compared.job === null || compared.job.id === job.id) return { first, second };
+  const all = Object.values(useService.getState().reconstructions);
+  const near = compared.job.capture_id === job.capture_id; // all of this capture are known
+  const name = (one: Reconstruction): string => `${near ? `${numberOf(one, all)}, ` : ""}${calledOf(one)}`;
   return {
-    first: `${calledOf(job)}, ${first}`,
-    second: `${calledOf(compared.job)}, ${second}`,
+    first: `${name(job)}, ${first}`,
+    second: `${name(compared.job)}, ${second}`,
   };
 }

@@ -5,9 +5,9 @@ import { Vector3 } from "three";
 import type { Scale } from "../../shared/api/types";
 
 export const TOOLS = [
-  { value: "distance", label: "Distance", points: 2, ask: "Click two points." },
-  { value: "angle", label: "Angle", points: 3, ask: "Click three points; the angle is at the second." },
-  { value: "up", label: "Up", points: 3, ask: "Click three points of the floor, far from each other." },
+  { value: "distance", label: "Distance", points: 2, ask: "Tap or click two points." },
+  { value: "angle", label: "Angle", points: 3, ask: "Tap or click three points; the angle is at the second." },
+  { value: "up", label: "Up", points: 3, ask: "Tap or click three points of the floor, far from each other." },
 ] as const;
 export type Tool = (typeof TOOLS)[number]["value"];
 

@@ -5,6 +5,7 @@ import type { JSX } from "react";
 import * as calls from "../../shared/api/calls";
 import type { OptionField, OptionValues, Reloaded, Setting, Settings } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
+import { bytes } from "../../shared/state/format";
 import { toast } from "../../shared/state/toasts";
 import { useFetch } from "../../shared/state/useFetch";
 import { Fetched } from "../../shared/ui/Fetched";
@@ -109,7 +110,10 @@ function Form({
 }
 
 function described({ option, doc, reloadable }: Setting): OptionField {
-  return { ...(option as OptionField), description: `${doc} ${reloadable ? "At once." : "After a restart."}` };
+  return {
+    ...(option as OptionField),
+    description: `${doc} Takes effect ${reloadable ? "at once" : "after a restart"}.`,
+  };
 }
 
 function Row({ setting }: { setting: Setting }): JSX.Element {
@@ -124,6 +128,7 @@ function Row({ setting }: { setting: Setting }): JSX.Element {
       </th>
       <td>
         <code>{value === null ? "–" : typeof value === "string" ? value : JSON.stringify(value)}</code>
+        {setting.key.endsWith("_bytes") && typeof value === "number" && <span className="dim"> {bytes(value)}</span>}
       </td>
       <td>
         <span className={setting.origin === "default" ? "dim" : ""}>{setting.origin}</span>

@@ -11,6 +11,7 @@ import { type Fetch, useFetch } from "../../shared/state/useFetch";
 import { ScopeNote } from "../../shared/ui/access";
 import { Fetched } from "../../shared/ui/Fetched";
 import { Icon } from "../../shared/ui/icons";
+import { SignInForm } from "../../shared/ui/SignInForm";
 import { Badge, Empty, Loading, Markup, Panel, type Tone } from "../../shared/ui/parts";
 import { ConfigurationPanel } from "./ConfigurationPanel";
 import { ProfilePanel } from "./ProfilePanel";
@@ -44,6 +45,10 @@ export function SetupPage(): JSX.Element {
           <Panel title="Administration">
             <p>Configuration and tokens are hidden.</p>
             <ScopeNote needs="admin" />
+            <details>
+              <summary>Use another token</summary>
+              <SignInForm />
+            </details>
           </Panel>
         )}
         <Links />

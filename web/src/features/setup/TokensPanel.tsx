@@ -5,12 +5,15 @@ import { type JSX, type SubmitEvent, useState } from "react";
 import * as calls from "../../shared/api/calls";
 import type { NewToken, Scope, Token } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
+import { copy } from "../../shared/state/clipboard";
 import { when } from "../../shared/state/format";
+import { useService } from "../../shared/state/store";
 import { toast } from "../../shared/state/toasts";
 import { useFetch } from "../../shared/state/useFetch";
 import { Fetched } from "../../shared/ui/Fetched";
 import { Icon } from "../../shared/ui/icons";
-import { Badge, Panel } from "../../shared/ui/parts";
+import { Badge, Labelled, Panel } from "../../shared/ui/parts";
+import { SignInForm } from "../../shared/ui/SignInForm";
 import { Table } from "../../shared/ui/Table";
 
 const COLUMNS = [
@@ -28,6 +31,7 @@ const SCOPES: readonly { scope: Scope; may: string }[] = [
 
 export function TokensPanel(): JSX.Element {
   const tokens = useFetch("tokens", calls.tokens);
+  const system = useService((state) => state.system);
   const [made, setMade] = useState<NewToken | null>(null);
   return (
     <Panel
@@ -45,7 +49,15 @@ export function TokensPanel(): JSX.Element {
           ) : (
             <Table label="Table of tokens" className="grid" columns={COLUMNS}>
               {items.map((token) => (
-                <Row key={token.name} token={token} onRevoked={tokens.again} />
+                <Row
+                  mayRevoke={system?.token_scope === "admin"}
+                  key={token.name}
+                  token={token}
+                  onRevoked={() => {
+                    if (made?.name === token.name) setMade(null);
+                    tokens.again();
+                  }}
+                />
               ))}
             </Table>
           )
@@ -54,42 +66,54 @@ export function TokensPanel(): JSX.Element {
       {made !== null && (
         <div className="made" role="status">
           <p>
-            Store the token <strong>{made.name}</strong> now: it is not shown again.
+            Store the token <strong>{made.name}</strong> now: it is not shown again. Programs send it as{" "}
+            <code>Authorization: Bearer TOKEN</code>, browsers ask for it.
           </p>
           <p>
             <code>{made.secret}</code>{" "}
-            {window.isSecureContext && (
-              <button
-                type="button"
-                onClick={() =>
-                  void attempt(async () => {
-                    await navigator.clipboard.writeText(made.secret);
-                    toast("Copied");
-                  })
-                }
-              >
-                Copy
-              </button>
-            )}{" "}
+            <button
+              type="button"
+              onClick={() =>
+                void attempt(async () => {
+                  await copy(made.secret);
+                  toast("Copied");
+                })
+              }
+            >
+              Copy
+            </button>{" "}
             <button type="button" onClick={() => setMade(null)}>
               Hide
             </button>
           </p>
         </div>
       )}
-      <details>
-        <summary>Create a token</summary>
-        <Form
-          onMade={(token) => {
-            setMade(token);
-            tokens.again();
-          }}
-        />
-      </details>
-      <p className="dim note">
-        Tokens are created and revoked with a token of scope <code>admin</code>, even where none is required;{" "}
-        <code>spiked token create NAME</code> makes the first.
-      </p>
+      {system?.token_required === false && (
+        <p className="dim note">
+          This service listens to its own machine only, and requires no token: tokens limit nothing until{" "}
+          <code>require_token</code> is set or it listens elsewhere.
+        </p>
+      )}
+      {system !== null && system.token_scope !== "admin" ? (
+        <details>
+          <summary>Create or revoke a token</summary>
+          <p>
+            That needs a token of scope <code>admin</code>. <code>spiked token create NAME</code> on the machine of the
+            service makes the first; enter it here.
+          </p>
+          <SignInForm />
+        </details>
+      ) : (
+        <details>
+          <summary>Create a token</summary>
+          <Form
+            onMade={(token) => {
+              setMade(token);
+              tokens.again();
+            }}
+          />
+        </details>
+      )}
     </Panel>
   );
 }
@@ -110,40 +134,42 @@ function Form({ onMade }: { onMade: (token: NewToken) => void }): JSX.Element {
   };
   return (
     <form className="options" onSubmit={submit}>
-      <label>
-        <span>Name</span>
-        <input
-          required
-          maxLength={64}
-          pattern="[A-Za-z0-9][A-Za-z0-9._\-]*"
-          value={name}
-          onChange={(event) => setName(event.target.value)}
-        />
-        <small className="dim">Of its user or device: letters, digits, “.”, “-” and “_”.</small>
-      </label>
-      <label>
-        <span>Scope</span>
-        <select value={scope} onChange={(event) => setScope(event.target.value as Scope)}>
-          {SCOPES.map((one) => (
-            <option key={one.scope} value={one.scope}>
-              {one.scope}: {one.may}
-            </option>
-          ))}
-        </select>
-        <small className="dim">No more than its user needs.</small>
-      </label>
-      <label>
-        <span>Days</span>
-        <input
-          type="number"
-          min={0}
-          step="any"
-          placeholder="as yours"
-          value={days}
-          onChange={(event) => setDays(event.target.value)}
-        />
-        <small className="dim">Until it expires; no later than the token that you use.</small>
-      </label>
+      <Labelled label="Name" hint="Of its user or device: letters, digits, “.”, “-” and “_”.">
+        {(called) => (
+          <input
+            {...called}
+            required
+            maxLength={64}
+            pattern="[A-Za-z0-9][A-Za-z0-9._\-]*"
+            value={name}
+            onChange={(event) => setName(event.target.value)}
+          />
+        )}
+      </Labelled>
+      <Labelled label="Scope" hint="No more than its user needs.">
+        {(called) => (
+          <select {...called} value={scope} onChange={(event) => setScope(event.target.value as Scope)}>
+            {SCOPES.map((one) => (
+              <option key={one.scope} value={one.scope}>
+                {one.scope}: {one.may}
+              </option>
+            ))}
+          </select>
+        )}
+      </Labelled>
+      <Labelled label="Days" hint="Until it expires; no later than the token that you use.">
+        {(called) => (
+          <input
+            {...called}
+            type="number"
+            min={0}
+            step="any"
+            placeholder="as yours"
+            value={days}
+            onChange={(event) => setDays(event.target.value)}
+          />
+        )}
+      </Labelled>
       <div className="buttons">
         <button type="submit" className="primary" disabled={busy}>
           Create
@@ -154,7 +180,15 @@ function Form({ onMade }: { onMade: (token: NewToken) => void }): JSX.Element {
 }
 
 /** Asks once more, since what the token has opened ends at once. */
-function Row({ token, onRevoked }: { token: Token; onRevoked: () => void }): JSX.Element {
+function Row({
+  token,
+  mayRevoke,
+  onRevoked,
+}: {
+  token: Token;
+  mayRevoke: boolean;
+  onRevoked: () => void;
+}): JSX.Element {
   const [asked, setAsked] = useState(false);
   const revoke = async (): Promise<void> => {
     if (await attempt(() => calls.revokeToken(token.name))) toast(`Revoked ${token.name}`);
@@ -170,7 +204,7 @@ function Row({ token, onRevoked }: { token: Token; onRevoked: () => void }): JSX
       <td className="dim">{when(token.created_at)}</td>
       <td>{expiry(token)}</td>
       <td className="number">
-        {asked ? (
+        {!mayRevoke ? null : asked ? (
           <button type="button" onClick={() => void revoke()}>
             Revoke at once
           </button>

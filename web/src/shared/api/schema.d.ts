@@ -4517,6 +4517,13 @@ export interface components {
             zmq: components["schemas"]["ZmqOut"] | null;
             /** @description Scope of the token of this request; admin where no token is required. */
             scope: components["schemas"]["Scope"];
+            /**
+             * Token Required
+             * @description Whether requests need a token. Where none is required, scopes limit nothing.
+             */
+            token_required: boolean;
+            /** @description Scope of the token that this request brings, whether one is required or not; null without one. */
+            token_scope: components["schemas"]["Scope"] | null;
         };
         /**
          * TagScaleOut

@@ -9,8 +9,15 @@ export const sourceOf = (capture: Capture): string =>
 
 export const nameOf = (capture: Capture): string => (capture.name === "" ? sourceOf(capture) : capture.name);
 
+/** The number of a reconstruction among those of its capture, the first one first. */
+export function numberOf(job: Reconstruction, all: Iterable<Reconstruction>): string {
+  let number = 1;
+  for (const one of all) if (one.capture_id === job.capture_id && one.id < job.id) number += 1;
+  return `#${number}`;
+}
+
 /** The name of a reconstruction, else when it was begun. */
-export const calledOf = (job: Reconstruction): string => (job.name === "" ? `of ${when(job.created_at)}` : job.name);
+export const calledOf = (job: Reconstruction): string => (job.name === "" ? when(job.created_at) : job.name);
 
 /** Frames received and lost since the capture began; null before there are counters. */
 export const framesSoFar = ({ counters }: Capture): number | null =>

@@ -280,7 +280,11 @@ async function refreshSystem(): Promise<void> {
 
 onUnauthorized(() => set({ signedOut: true }));
 /** The scope may be another one: it is unknown until the service states it. */
-export const signedIn = (): void => set({ signedOut: false, connectionError: null, system: null });
+export function signedIn(): void {
+  const before = get().signedOut;
+  set({ signedOut: false, connectionError: null, system: null });
+  if (!before) void refreshSystem(); // else following begins anew
+}
 
 /** Start following the service; returns a function that stops it. */
 export function follow(): () => void {

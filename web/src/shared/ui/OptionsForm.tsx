@@ -3,9 +3,10 @@
 import { type JSX, type ReactNode, type SubmitEvent, useState } from "react";
 
 import type { OptionSchema, OptionValues } from "../api/types";
+import { bytes } from "../state/format";
 import { ActionButton } from "./access";
-import { fieldsOf, OptionInput, textOf, valuesOf, withoutField } from "./options";
-import { Markup } from "./parts";
+import { type Field, fieldsOf, OptionInput, textOf, valuesOf, withoutField } from "./options";
+import { Labelled, Markup } from "./parts";
 
 export function OptionsForm({
   schema,
@@ -46,13 +47,16 @@ export function OptionsForm({
   return (
     <form className="options" onSubmit={submit}>
       {fields.map((field) => (
-        <label key={field.key}>
-          <span>{field.label}</span>
-          <OptionInput field={field} text={texts[field.key] ?? ""} onChange={(text) => change(field.key, text)} />
-          <small className="dim">
-            <Markup>{field.hint}</Markup>
-          </small>
-        </label>
+        <Labelled key={field.key} label={field.label} hint={<Hint field={field} text={texts[field.key] ?? ""} />}>
+          {(called) => (
+            <OptionInput
+              {...called}
+              field={field}
+              text={texts[field.key] ?? ""}
+              onChange={(text) => change(field.key, text)}
+            />
+          )}
+        </Labelled>
       ))}
       {children}
       <div className="buttons">
@@ -66,5 +70,15 @@ export function OptionsForm({
         )}
       </div>
     </form>
+  );
+}
+
+/** What an option is; of a number of bytes also how much that is. */
+function Hint({ field, text }: { field: Field; text: string }): JSX.Element {
+  return (
+    <>
+      {field.key.endsWith("_bytes") && text !== "" && <b>{bytes(Number(text))}. </b>}
+      <Markup>{field.hint}</Markup>
+    </>
   );
 }

@@ -2,6 +2,7 @@ import type { JSX } from "react";
 
 import { dismiss, useToasts } from "../state/toasts";
 import { Icon } from "./icons";
+import { Markup } from "./parts";
 
 /** The toasts shown now; announced by screen readers. */
 export function Toasts(): JSX.Element {
@@ -11,7 +12,9 @@ export function Toasts(): JSX.Element {
       {toasts.map((toast) => (
         <div key={toast.id} className={`toast ${toast.tone}`}>
           {toast.tone === "problem" && <Icon name="warning" />}
-          <span>{toast.text}</span>
+          <span>
+            <Markup>{toast.text}</Markup>
+          </span>
           {toast.action !== undefined && (
             <button
               type="button"

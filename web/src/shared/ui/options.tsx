@@ -3,6 +3,7 @@
 import type { JSX } from "react";
 
 import type { OptionField, OptionSchema, OptionValues } from "../api/types";
+import type { Named } from "./parts";
 
 export interface Field {
   key: string;
@@ -100,15 +101,17 @@ export function OptionInput({
   text,
   disabled,
   onChange,
+  ...called
 }: {
   field: Field;
   text: string;
   disabled?: boolean;
   onChange: (text: string) => void;
-}): JSX.Element {
+} & Partial<Named>): JSX.Element {
   if (field.kind === "boolean" && !field.optional) {
     return (
       <input
+        {...called}
         type="checkbox"
         checked={text === "true"}
         disabled={disabled}
@@ -119,7 +122,7 @@ export function OptionInput({
   if (field.kind === "choice" || field.kind === "boolean") {
     const choices = field.kind === "choice" ? field.choices : ["true", "false"];
     return (
-      <select value={text} disabled={disabled} onChange={(event) => onChange(event.target.value)}>
+      <select {...called} value={text} disabled={disabled} onChange={(event) => onChange(event.target.value)}>
         {field.optional && <option value="">default</option>}
         {choices.map((choice) => (
           <option key={choice}>{choice}</option>
@@ -129,6 +132,7 @@ export function OptionInput({
   }
   return (
     <input
+      {...called}
       type={field.kind === "text" ? "text" : "number"}
       step={field.kind === "integer" ? 1 : "any"}
       min={field.minimum}

@@ -1,6 +1,6 @@
 /** Small components shared by all pages. */
 
-import type { JSX, ReactNode } from "react";
+import { type JSX, type ReactNode, useId } from "react";
 
 import type { Capture, CaptureState, DeviceState, Grade, JobState, Reconstruction, TrackingState } from "../api/types";
 import { Icon, type IconName } from "./icons";
@@ -216,6 +216,34 @@ export function Segmented<T extends string>({
         </label>
       ))}
     </fieldset>
+  );
+}
+
+/** What names and describes an input. */
+export interface Named {
+  id: string;
+  "aria-describedby": string;
+}
+
+/** An input with its name and a hint, which is its description: a screen reader reads the name first. */
+export function Labelled({
+  label,
+  hint,
+  children,
+}: {
+  label: string;
+  hint: ReactNode;
+  children: (called: Named) => ReactNode;
+}): JSX.Element {
+  const id = useId();
+  return (
+    <div className="field">
+      <label htmlFor={id}>{label}</label>
+      {children({ id, "aria-describedby": `${id}-hint` })}
+      <small id={`${id}-hint`} className="dim">
+        {hint}
+      </small>
+    </div>
   );
 }
 

@@ -1,5 +1,6 @@
 """Metres and up on the Scene page, of a map of a rig of two cameras that shows a board."""
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,25 @@ def test_a_board_gives_metres(
     assert violations(page) == []
     assert page.evaluate("() => document.documentElement.scrollWidth") <= viewport["width"]
     keep(page, pictures_folder / f"measure-{viewport['width']}.webp")
+
+
+def test_a_length_is_seen_beside_its_points(measuring: Callable[..., Any]) -> None:
+    """On a phone the tool is far below the scene that is tapped."""
+    page = measuring(viewport=PHONE, touch=True)
+    notes = page.locator(".stage-notes")
+    notes.get_by_text("Tap or click two points.").wait_for()
+    page.evaluate("() => scrollTo(0, 0)")
+    box = page.locator(".stage canvas").bounding_box()
+    y = box["y"] + box["height"] / 2
+    page.touchscreen.tap(box["x"] + 0.3 * box["width"], y)
+    notes.get_by_text("1 of 2 points").wait_for()
+    page.touchscreen.tap(box["x"] + 0.55 * box["width"], y + 0.13 * box["height"])
+    found = notes.get_by_text(re.compile(r"^\d+\.\d+\sunits$"))
+    found.wait_for()
+    bounds = found.bounding_box()
+    assert bounds["y"] >= 0 and bounds["y"] + bounds["height"] <= PHONE["height"]
+    page.get_by_text("Measure", exact=True).click()
+    found.wait_for(state="detached")
 
 
 def test_two_cameras_at_a_known_distance_give_metres(rig: Rig, measuring: Callable[..., Any]) -> None:

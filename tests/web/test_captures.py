@@ -165,8 +165,8 @@ def test_a_rerun_is_given_poses_optics_and_time(studied: Studied, visit: Callabl
     page.get_by_role("button", name="Re-run with other options").click()
     form = page.locator(".panel:has(h2:text-is('Options of the new reconstruction')) form")
     form.wait_for()
-    for label in form.locator("label").all():
-        assert len(label.locator("small").inner_text()) > 10, f"help of {label.inner_text()}"
+    for named in form.locator(".field").all():
+        assert len(named.locator("small").inner_text()) > 10, f"help of {named.inner_text()}"
     fields = studied.http.get("options").json()["properties"]
     assert form.locator("label").count() == len(fields) + 2, "every option, poses and calibration"
     form.get_by_label(re.compile("^steps")).fill("10")

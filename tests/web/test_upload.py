@@ -48,9 +48,7 @@ def choose_files(page: Any, *paths: Path) -> None:
 
 
 def field(page: Any, name: str) -> Any:
-    return (
-        page.locator(".upload form label").filter(has=page.locator(f'span:text-is("{name}")')).locator("input, select")
-    )
+    return page.locator(".upload form").get_by_label(name, exact=True)
 
 
 def newest(daemon: Any) -> dict[str, Any]:

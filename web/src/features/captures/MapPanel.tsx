@@ -9,7 +9,7 @@ import { count, when } from "../../shared/state/format";
 import { useService } from "../../shared/state/store";
 import { useFetch } from "../../shared/state/useFetch";
 import { Fetched } from "../../shared/ui/Fetched";
-import { Empty, Panel } from "../../shared/ui/parts";
+import { Empty, Labelled, Panel } from "../../shared/ui/parts";
 
 export type MapTask = "localise" | "extend" | "merge";
 
@@ -72,39 +72,42 @@ function Form({
   };
   return (
     <form className="options" onSubmit={submit}>
-      <label>
-        <span>what to do</span>
-        <select value={task} onChange={(event) => setTask(event.target.value as MapTask)}>
-          <option value="localise" disabled={!canRead}>
-            Find this recording in a map
-          </option>
-          <option value="extend" disabled={!canRead}>
-            Extend a map by this recording
-          </option>
-          <option value="merge" disabled={!canMerge}>
-            Merge the shown reconstruction with a map
-          </option>
-        </select>
-        <small className="dim">Both have to show the same place.</small>
-      </label>
+      <Labelled label="what to do" hint="Both have to show the same place.">
+        {(called) => (
+          <select {...called} value={task} onChange={(event) => setTask(event.target.value as MapTask)}>
+            <option value="localise" disabled={!canRead}>
+              Find this recording in a map
+            </option>
+            <option value="extend" disabled={!canRead}>
+              Extend a map by this recording
+            </option>
+            <option value="merge" disabled={!canMerge}>
+              Merge the shown reconstruction with a map
+            </option>
+          </select>
+        )}
+      </Labelled>
       {chosen === undefined ? (
         <Empty icon="scene" title="No map" />
       ) : (
-        <label>
-          <span>map</span>
-          <select value={chosen.id} onChange={(event) => setWanted(event.target.value)}>
-            {choices.map((one) => (
-              <option key={one.id} value={one.id}>
-                {label(one)}
-              </option>
-            ))}
-          </select>
-          <small className="dim">
-            {task === "merge"
+        <Labelled
+          label="map"
+          hint={
+            task === "merge"
               ? "The result is in the frame of reference of the shown reconstruction."
-              : "The result is in the frame of reference of the map."}
-          </small>
-        </label>
+              : "The result is in the frame of reference of the map."
+          }
+        >
+          {(called) => (
+            <select {...called} value={chosen.id} onChange={(event) => setWanted(event.target.value)}>
+              {choices.map((one) => (
+                <option key={one.id} value={one.id}>
+                  {label(one)}
+                </option>
+              ))}
+            </select>
+          )}
+        </Labelled>
       )}
       <div className="buttons">
         <button

@@ -10,7 +10,7 @@ import { useService } from "../../shared/state/store";
 import { useFetch } from "../../shared/state/useFetch";
 import { Fetched } from "../../shared/ui/Fetched";
 import { OptionsForm } from "../../shared/ui/OptionsForm";
-import { Panel } from "../../shared/ui/parts";
+import { Labelled, Panel } from "../../shared/ui/parts";
 import { thinned } from "./thinned";
 
 const FILE = "file";
@@ -61,43 +61,55 @@ export function RerunPanel({
             onSubmit={submit}
             onCancel={onCancel}
           >
-            <label>
-              <span>poses</span>
-              <select value={from} onChange={(event) => setFrom(event.target.value)}>
-                <option value="">estimate them</option>
-                <option value={FILE}>from a TUM file…</option>
-                {paths.map((one) => (
-                  <option key={one.id} value={one.id}>
-                    of reconstruction {nameOf(one)} {one.name}
-                  </option>
-                ))}
-              </select>
-              <small className="dim">
-                Given poses are not changed: the map is fitted to them. Those in between are interpolated.
-              </small>
-            </label>
+            <Labelled
+              label="poses"
+              hint="Given poses are not changed: the map is fitted to them. Those in between are interpolated."
+            >
+              {(called) => (
+                <select {...called} value={from} onChange={(event) => setFrom(event.target.value)}>
+                  <option value="">estimate them</option>
+                  <option value={FILE}>from a TUM file…</option>
+                  {paths.map((one) => (
+                    <option key={one.id} value={one.id}>
+                      of reconstruction {nameOf(one)} {one.name}
+                    </option>
+                  ))}
+                </select>
+              )}
+            </Labelled>
             {from === FILE && (
-              <label>
-                <span>file with poses</span>
-                <input type="file" accept=".tum,.txt" onChange={(event) => void read(event.target.files?.[0])} />
-                <small className="dim">
-                  Lines <code>time x y z qx qy qz qw</code>, camera to world, in seconds since the start of the capture.
-                  {poses !== null && poses.every > 1 && ` Every ${poses.every}th pose of ${poses.name} is sent.`}
-                </small>
-              </label>
+              <Labelled
+                label="file with poses"
+                hint={
+                  <>
+                    Lines <code>time x y z qx qy qz qw</code>, camera to world, in seconds since the start of the
+                    capture.
+                    {poses !== null && poses.every > 1 && ` Every ${poses.every}th pose of ${poses.name} is sent.`}
+                  </>
+                }
+              >
+                {(called) => (
+                  <input
+                    {...called}
+                    type="file"
+                    accept=".tum,.txt"
+                    onChange={(event) => void read(event.target.files?.[0])}
+                  />
+                )}
+              </Labelled>
             )}
-            <label>
-              <span>calibration</span>
-              <select value={calibration} onChange={(event) => setCalibration(event.target.value)}>
-                <option value="">that of the recording, if any</option>
-                {devices.map((one) => (
-                  <option key={one.id} value={one.id}>
-                    of {one.id}, as it is now
-                  </option>
-                ))}
-              </select>
-              <small className="dim">Gains, dark rates and dead pixels, by which the rates are corrected.</small>
-            </label>
+            <Labelled label="calibration" hint="Gains, dark rates and dead pixels, by which the rates are corrected.">
+              {(called) => (
+                <select {...called} value={calibration} onChange={(event) => setCalibration(event.target.value)}>
+                  <option value="">that of the recording, if any</option>
+                  {devices.map((one) => (
+                    <option key={one.id} value={one.id}>
+                      of {one.id}, as it is now
+                    </option>
+                  ))}
+                </select>
+              )}
+            </Labelled>
           </OptionsForm>
         )}
       </Fetched>

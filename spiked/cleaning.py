@@ -2,7 +2,7 @@
 and splats that are too large."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from spiked.errors import ConfigurationError
 from spiked.recon.statistics import evenly
-from spiked.render.camera import MAX_SIDE, Camera
+from spiked.render import Camera
 from spiked.render.cpu import Rasteriser
 from spiked.scene import Scene
 from spiked.splitting import split_large
@@ -171,8 +171,7 @@ def clean(
         if camera is None or not len(path):
             raise ConfigurationError("the camera or the path of this scene is not known, so no view can tell floaters")
         rows = evenly(len(path), removal.views)
-        wider = _wider(camera, removal.margin)
-        seen = _seen(kept, path, wider, rows, removal.least_px, _part(progress, SEEN, 0))
+        seen = _seen(kept, path, camera.wider(removal.margin), rows, removal.least_px, _part(progress, SEEN, 0))
         chosen = removal.floaters(kept, seen)
         floaters = int(chosen.sum())
         kept = kept.select(~chosen)
@@ -188,16 +187,6 @@ def clean(
 def _part(progress: Callable[[float], None] | None, share: float, begin: float) -> Callable[[float], None] | None:
     """Progress of a part of the work."""
     return None if progress is None else lambda done: progress(begin + share * done)
-
-
-def _wider(camera: Camera, margin: float) -> Camera:
-    """The camera with larger pictures; as it is with distortion, which beyond its own edges is not known."""
-    optics = camera.intrinsics
-    if optics.distortion is not None:
-        return camera
-    width, height = (min(round(side * margin), MAX_SIDE) for side in (camera.width, camera.height))
-    shift = (width - camera.width) / 2, (height - camera.height) / 2
-    return Camera(replace(optics, cx=optics.cx + shift[0], cy=optics.cy + shift[1]), width, height)
 
 
 def _seen(

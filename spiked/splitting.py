@@ -113,13 +113,10 @@ def split_large(
     return Split(made, len(replaced), len(unseen), len(large) - len(replaced) - len(unseen))
 
 
-def _rasteriser(camera: Camera, wider: float = 1.0) -> Rasteriser:
-    """For pictures of the camera, smaller if they are large, and wider on each side by the same share."""
+def _rasteriser(camera: Camera) -> Rasteriser:
+    """For pictures of the camera, smaller if they are large."""
     factor = int(np.ceil(np.sqrt(camera.width * camera.height / PIXELS)))
-    optics, width, height = camera.intrinsics.scaled(1 / factor), camera.width // factor, camera.height // factor
-    x, y = round((wider - 1) / 2 * width), round((wider - 1) / 2 * height)
-    moved = replace(optics, cx=optics.cx + x, cy=optics.cy + y)
-    return Rasteriser(Camera(moved, width + 2 * x, height + 2 * y))
+    return Rasteriser(Camera(camera.intrinsics.scaled(1 / factor), camera.width // factor, camera.height // factor))
 
 
 def _depth(scene: Scene, path: Trajectory, rasteriser: Rasteriser) -> float:
@@ -131,7 +128,7 @@ def _depth(scene: Scene, path: Trajectory, rasteriser: Rasteriser) -> float:
 
 def _seen(made: Scene, first: int, path: Trajectory, camera: Camera, depth: float) -> Scene:
     """The scene without the splats from `first` on that no view sees, from the path or beside it."""
-    rasteriser, wanted = _rasteriser(camera, WIDER), np.arange(first, len(made))
+    rasteriser, wanted = _rasteriser(camera.wider(WIDER)), np.arange(first, len(made))
     around = ASIDE * depth * np.array([(0, 0), (-1, -1), (1, -1), (-1, 1), (1, 1)])
     rows = np.array(evenly(len(path), VIEWS))
     filled = np.zeros(len(wanted))

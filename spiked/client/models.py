@@ -1414,7 +1414,7 @@ class CleanRequest(BaseModel):
         OutlineModel | None,
         Field(description="Splats inside are removed, however far behind it."),
     ] = None
-    floaters: Annotated[bool, Field(description="Remove splats that few views see.")] = True
+    floaters: Annotated[bool, Field(description="Remove splats that few views see or that hang alone.")] = True
     split: Annotated[
         bool,
         Field(

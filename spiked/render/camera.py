@@ -1,6 +1,6 @@
 """The camera that the renderers see: intrinsics, distortion included, and an image size."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from spiked.errors import ConfigurationError
 from spiked.sensor import Intrinsics
@@ -24,3 +24,15 @@ class Camera:
             raise ConfigurationError(
                 f"focal lengths {self.intrinsics.fx:g}, {self.intrinsics.fy:g} px are not positive"
             )
+
+    def wider(self, share: float) -> "Camera":
+        """The same camera with pictures so many times as wide and high, as far as can be rendered.
+
+        With distortion it is as it is: a lens beyond its own edges is not known.
+        """
+        optics = self.intrinsics
+        if optics.distortion is not None:
+            return self
+        width, height = (min(round(side * share), MAX_SIDE) for side in (self.width, self.height))
+        cx, cy = optics.cx + (width - self.width) / 2, optics.cy + (height - self.height) / 2
+        return Camera(replace(optics, cx=cx, cy=cy), width, height)

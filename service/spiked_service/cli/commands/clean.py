@@ -35,8 +35,9 @@ def clean(
 ) -> None:
     """Remove floaters from a scene, and what is outside of a box.
 
-    A floater is a splat that fewer than two views along the path see, or one that hangs in the air, far from all others.
-    Splats larger than a quarter of the scene become several. OUT is an output folder like the other one, which stays as it is.
+    A floater is a splat that fewer than two views along the path see, or one that hangs in the air, far from all
+    others. Splats larger than a quarter of the scene become several. OUT is an output folder like the other one, which
+    stays as it is.
 
     Examples:
 

@@ -2380,7 +2380,7 @@ export interface components {
             outline?: components["schemas"]["OutlineModel"] | null;
             /**
              * Floaters
-             * @description Remove splats that few views see.
+             * @description Remove splats that few views see or that hang alone.
              * @default true
              */
             floaters?: boolean;

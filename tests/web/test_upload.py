@@ -164,11 +164,11 @@ def test_an_upload_goes_on_after_a_reload(idle: Any, visit: Callable[..., Any], 
     headers = {"content-type": "application/octet-stream", "upload-offset": "0"}
     answer = idle.http.patch(f"uploads/{begun['id']}", content=desk.read_bytes()[:half], headers=headers)
     assert answer.status_code == 200, answer.text
-    page.unroute_all(behavior="ignoreErrors")
     page.reload()
 
     left = page.locator(".panel:has(h2:text-is('Unfinished uploads')) li")
     left.wait_for()
+    page.unroute_all(behavior="ignoreErrors")  # not before: the page would go on by itself
     assert "desk.dat" in left.inner_text()
     assert violations(page) == []
     chosen = left.get_by_label("File of desk.dat, to go on")

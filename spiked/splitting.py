@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from spiked.pose import quaternion, rotation_of
 from spiked.recon.statistics import evenly
-from spiked.render import Camera
+from spiked.render import Camera, RenderedImage
 from spiked.render.cpu import Rasteriser
 from spiked.render.optimiser import Adam
 from spiked.scene import Scene
@@ -107,8 +107,10 @@ def split_large(
     for some in pieces:
         made = made.join(some)
     if pieces:
-        depth = _depth(scene, path, rasteriser)
-        _fit(made, first, scene, largest, path, rasteriser, depth, progress)
+        start = rasteriser.forward(scene.seen_from(path.centres[0]), path.rotations[:1], path.centres[:1])
+        depth = _depth(start)
+        white = max(float(np.percentile(start.values, 99.5)), 1e-9)
+        _fit(made, first, scene, largest, path, rasteriser, depth, white, progress)
         made = _seen(made, first, path, camera, depth)
     return Split(made, len(replaced), len(unseen), len(large) - len(replaced) - len(unseen))
 
@@ -119,11 +121,10 @@ def _rasteriser(camera: Camera) -> Rasteriser:
     return Rasteriser(Camera(camera.intrinsics.scaled(1 / factor), camera.width // factor, camera.height // factor))
 
 
-def _depth(scene: Scene, path: Trajectory, rasteriser: Rasteriser) -> float:
-    """Median depth of what is opaque in the first view."""
-    start = rasteriser.forward(scene.seen_from(path.centres[0]), path.rotations[:1], path.centres[:1])
-    opaque = start.alpha > 0.5
-    return float(np.median(start.depth[opaque])) if opaque.any() else 1.0
+def _depth(view: RenderedImage) -> float:
+    """Median depth of what is opaque in a view."""
+    opaque = view.alpha > 0.5
+    return float(np.median(view.depth[opaque])) if opaque.any() else 1.0
 
 
 def _seen(made: Scene, first: int, path: Trajectory, camera: Camera, depth: float) -> Scene:
@@ -222,12 +223,11 @@ def _fit(
     path: Trajectory,
     rasteriser: Rasteriser,
     depth: float,
+    white: float,
     progress: Callable[[float], None] | None,
 ) -> None:
     """Fit the splats from `first` on, in place, to pictures of the scene before."""
     rng, adam, most = np.random.default_rng(0), Adam(made.arrays()[:4], 0.9, 0.99), np.float32(np.log(largest))
-    start = rasteriser.forward(before.seen_from(path.centres[0]), path.rotations[:1], path.centres[:1])
-    white = max(float(np.percentile(start.values, 99.5)), 1e-9)
     pieces = np.arange(len(made)) >= first
     for step in range(STEPS):
         row = int(rng.integers(len(path)))

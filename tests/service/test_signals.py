@@ -19,11 +19,9 @@ WIZARD = (sys.executable, "-m", "spiked_service", "calibrate", "--device", "sim:
 @contextmanager
 def waiting_wizard(folder: Path, *before: str) -> Iterator[subprocess.Popen[bytes]]:
     command = [*before, *WIZARD, folder / "camera.npz"]
-    earlier = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run with nohup themselves
-    try:
+    # The tests may run with nohup themselves, or in the background of a shell, which ignores Ctrl-C.
+    with handling({signal.SIGHUP: signal.SIG_DFL, signal.SIGINT: signal.SIG_DFL}):
         started = subprocess.Popen(command, stdin=subprocess.PIPE, cwd=folder)
-    finally:
-        signal.signal(signal.SIGHUP, earlier)
     with started as wizard:
         until(lambda: bool(list(folder.glob(".spiked-*"))), "its folder")
         try:

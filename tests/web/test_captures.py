@@ -84,6 +84,22 @@ def test_what_another_has_written_is_kept_by_a_visit_of_the_field(studied: Studi
         studied.http.patch(f"{kind}/{id_}", json={key: before})
 
 
+def test_an_old_capture_is_followed_without_messages(studied: Studied, visit: Callable[..., Any]) -> None:
+    """One that is not among the newest, which alone are fetched for all pages, while the WebSocket is not there."""
+    page = visit("about:blank")
+    page.route_web_socket("**/api/v1/events?*", lambda socket: socket.close())
+    page.route("**/api/v1/captures?*", lambda route: route.fulfill(json={"items": [], "next_cursor": None, "total": 0}))
+    page.goto(f"{studied.address}?page=captures&capture={studied.capture_id}")
+    name = page.get_by_label("Name of the capture")
+    name.wait_for()
+    before = studied.http.get(f"captures/{studied.capture_id}").json()["name"]
+    studied.http.patch(f"captures/{studied.capture_id}", json={"name": "by another"})
+    try:
+        until(lambda: name.input_value() == "by another", "what another wrote")
+    finally:
+        studied.http.patch(f"captures/{studied.capture_id}", json={"name": before})
+
+
 def test_how_much_is_refined_is_read_to_its_end(studied: Studied, visit: Callable[..., Any]) -> None:
     plan = {"capture_id": studied.capture_id, "options": {"steps": 200_000}}
     job = studied.http.post("reconstructions", json=plan).json()["id"]

@@ -10,6 +10,7 @@ import { nameOf, numberOf, sourceOf } from "../../shared/state/capture";
 import { adjust, go, useRoute } from "../../shared/state/route";
 import {
   isFinished,
+  loadCapture,
   loadReconstructions,
   newestReconstruction,
   storeCapture,
@@ -32,11 +33,8 @@ import { LogPanel, OptionsPanel, ResultPanel } from "./ResultPanel";
 
 export function CaptureDetail({ id }: { id: string }): JSX.Element {
   const capture = useService((state) => state.captures[id] ?? null);
-  const fetched = useFetch(id, async () => {
-    const [one] = await Promise.all([calls.capture(id), loadReconstructions(id)]);
-    storeCapture(one);
-    return one;
-  });
+  const refreshed = useService((state) => state.refreshed);
+  const fetched = useFetch(`${id} ${String(refreshed)}`, () => Promise.all([loadCapture(id), loadReconstructions(id)]));
   if (capture === null)
     return (
       <div className="detail">

@@ -2,13 +2,12 @@
 
 import { type JSX, useEffect, useState } from "react";
 
-import * as calls from "../../shared/api/calls";
 import type { Capture, Reconstruction, Version } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
 import { calledOf, nameOf, numberOf } from "../../shared/state/capture";
 import { count, decibel, small } from "../../shared/state/format";
 import { adjust } from "../../shared/state/route";
-import { storeReconstruction, useService } from "../../shared/state/store";
+import { loadComplete, useService } from "../../shared/state/store";
 import { Segmented } from "../../shared/ui/parts";
 import { pathOfTum } from "./similarity";
 import { COMPARED_STYLES } from "./stateStyles";
@@ -79,7 +78,7 @@ function Choice({
   const all = useService((state) => state.reconstructions);
   const captures = useService((state) => state.captures);
   useEffect(() => {
-    void attempt(async () => (await calls.complete()).forEach(storeReconstruction));
+    void attempt(loadComplete);
   }, []);
   const others = Object.values(all)
     .filter((one) => one.id !== job.id && one.version > 0)

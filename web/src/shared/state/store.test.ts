@@ -11,6 +11,7 @@ import {
   newestCapture,
   newestReconstruction,
   handleMessage,
+  loadCapture,
   refresh,
   storeCapture,
   activeJobs,
@@ -87,6 +88,28 @@ it("keeps older and removed captures, and what messages told meanwhile, when it 
   ]);
   const ended = told.mock.calls.filter(([before, now]) => before?.state === "running" && now.state !== "running");
   expect(ended.map(([, now]) => now.id).sort()).toEqual(["w", "x", "y"]);
+  vi.restoreAllMocks();
+});
+
+it("lets no answer replace what was told, or asked for, after it was asked for", async () => {
+  const named = (name: string): Capture => capture("one", { name });
+  const answers = [pending<Capture>(), pending<Capture>(), pending<Capture>()] as const;
+  const ask = vi.spyOn(calls, "capture");
+  for (const answer of answers) ask.mockReturnValueOnce(answer.promise);
+  const name = (): string | undefined => useService.getState().captures["one"]?.name;
+
+  const [older, newer] = [loadCapture("one"), loadCapture("one")];
+  answers[1].resolve(named("newer"));
+  await newer;
+  answers[0].resolve(named("older"));
+  await older;
+  expect(name()).toBe("newer");
+
+  const slow = loadCapture("one");
+  storeCapture(named("by another"));
+  answers[2].resolve(named("newer"));
+  await slow;
+  expect(name()).toBe("by another");
   vi.restoreAllMocks();
 });
 

@@ -23,6 +23,8 @@ export interface ServiceState {
   /** A token is required: no requests until sign-in. */
   signedOut: boolean;
   loaded: boolean;
+  /** How often everything was fetched again; what one page alone shows is fetched again with it. */
+  refreshed: number;
   devices: Device[];
   /** Known captures by id; the table of all captures asks for its own pages. */
   captures: Record<string, Capture>;
@@ -41,6 +43,7 @@ export const useService = create<ServiceState>(() => ({
   connectionError: null,
   signedOut: false,
   loaded: false,
+  refreshed: 0,
   devices: [],
   captures: {},
   reconstructions: {},
@@ -110,8 +113,8 @@ function measuredRates(rates: Record<string, number>, capture: Capture): Record<
 }
 
 /**
- * A message tells the newest state; an answer that was asked for before it came is older, and must not replace it.
- * `heard` has when each object was last told of, or removed, on a clock that counts these and the requests.
+ * A message, and the answer to a change, tell the newest state; an answer that was asked for before is older, and must
+ * not replace it. `heard` has when each object was last told of, removed, or asked for, on a clock that counts these.
  */
 let clock = 0;
 const heard = new Map<string, number>();
@@ -126,22 +129,28 @@ function merged<T extends { id: string }>(
   kept: (one: T) => boolean,
 ): Record<string, T> {
   const listed = new Set(answered.map((one) => one.id));
+  const newest = answered.filter((one) => !isNewer(one.id, asked));
+  for (const one of newest) heard.set(one.id, asked);
   return Object.fromEntries([
     ...Object.values(stored)
       .filter((one) => isNewer(one.id, asked) || (!listed.has(one.id) && kept(one)))
       .map((one) => [one.id, one] as const),
-    ...answered.filter((one) => !isNewer(one.id, asked)).map((one) => [one.id, one] as const),
+    ...newest.map((one) => [one.id, one] as const),
   ]);
 }
 
+/** Store a capture that a message, or the answer to a change, tells of. */
 export function storeCapture(capture: Capture): void {
+  hear(capture.id);
   set((state) => ({
     captures: { ...state.captures, [capture.id]: capture },
     rates: measuredRates(state.rates, capture),
   }));
 }
 
+/** Store a reconstruction that a message, or the answer to a change, tells of. */
 export function storeReconstruction(job: Reconstruction): void {
+  hear(job.id);
   const before = get().reconstructions[job.id];
   set((state) => ({ reconstructions: { ...state.reconstructions, [job.id]: job } }));
   notifyOfEnd(before, job);
@@ -173,11 +182,9 @@ export function handleMessage(message: Message): void {
       return;
     }
     case "capture":
-      hear(message.data.id);
       storeCapture(message.data);
       return;
     case "job":
-      hear(message.data.id);
       storeReconstruction(message.data);
       return;
     case "pose":
@@ -241,6 +248,7 @@ export async function refresh(): Promise<void> {
       captures: merged(state.captures, captures.items, asked, (one) => one.id < oldest || one.deleted_at !== null),
       reconstructions: merged(state.reconstructions, unfinished, asked, isEnded),
       loaded: true,
+      refreshed: state.refreshed + 1,
       connectionError: null,
     }));
     const missed = active.filter((job) => get().reconstructions[job.id] === undefined);
@@ -254,21 +262,29 @@ export async function refresh(): Promise<void> {
 
 /** Tell the end of a job that was under way, is no longer listed as such, and whose messages were missed. */
 async function tellEnd(before: Reconstruction): Promise<void> {
-  if (get().reconstructions[before.id] === undefined) {
-    const asked = ++clock;
-    const found = await calls.reconstruction(before.id).catch(() => null);
-    if (found === null) return; // it was deleted meanwhile, or the service is out of reach again
-    set((state) => ({ reconstructions: merged(state.reconstructions, [found], asked, () => true) }));
-  }
+  if (get().reconstructions[before.id] === undefined) await loadReconstruction(before.id).catch(() => undefined); // deleted meanwhile, or out of reach again
   const now = get().reconstructions[before.id];
   if (now !== undefined) notifyOfEnd(before, now);
 }
 
-export async function loadReconstructions(captureId: string): Promise<void> {
+export async function loadCapture(id: string): Promise<void> {
   const asked = ++clock;
-  const jobs = await calls.reconstructions(captureId);
+  const one = await calls.capture(id);
+  set((state) => ({ captures: merged(state.captures, [one], asked, () => true) }));
+}
+
+async function mergeReconstructions(ask: () => Promise<Reconstruction[]>): Promise<void> {
+  const asked = ++clock;
+  const jobs = await ask();
   set((state) => ({ reconstructions: merged(state.reconstructions, jobs, asked, () => true) }));
 }
+
+export const loadReconstruction = (id: string): Promise<void> =>
+  mergeReconstructions(async () => [await calls.reconstruction(id)]);
+export const loadReconstructions = (captureId: string): Promise<void> =>
+  mergeReconstructions(() => calls.reconstructions(captureId));
+/** The complete ones of all captures. */
+export const loadComplete = (): Promise<void> => mergeReconstructions(calls.complete);
 
 async function refreshSystem(): Promise<void> {
   try {

@@ -1,20 +1,20 @@
 import { useEffect, useState } from "react";
 
-import { capture as askCapture, reconstruction as askReconstruction } from "../api/calls";
 import type { Capture, Reconstruction } from "../api/types";
-import { errorText, loadReconstructions, storeCapture, storeReconstruction, useService } from "./store";
+import { errorText, loadCapture, loadReconstruction, loadReconstructions, useService } from "./store";
 
-/** Fetch a capture that the URL names and the store does not hold. */
+/** Keep a capture that the URL names: fetched if the store does not hold it, and after messages were missed. */
 export function useWanted(id: string | null, known: Capture | null): string | null {
   const [problem, setProblem] = useState<{ id: string; text: string } | null>(null);
   const missing = id !== null && known === null;
   const knownId = known?.id ?? null;
+  const refreshed = useService((state) => state.refreshed);
   useEffect(() => {
-    if (missing) askCapture(id).then(storeCapture, (error: unknown) => setProblem({ id, text: errorText(error) }));
+    if (missing) loadCapture(id).catch((error: unknown) => setProblem({ id, text: errorText(error) }));
   }, [id, missing]);
   useEffect(() => {
-    if (knownId !== null) loadReconstructions(knownId).catch(() => undefined); // shown by the banner at the top
-  }, [knownId]);
+    if (knownId !== null) Promise.all([loadCapture(knownId), loadReconstructions(knownId)]).catch(() => undefined); // the banner tells it
+  }, [knownId, refreshed]);
   return missing && problem?.id === id ? problem.text : null;
 }
 
@@ -24,8 +24,7 @@ export function useWantedReconstruction(id: string | null): { job: Reconstructio
   const [problem, setProblem] = useState<{ id: string; text: string } | null>(null);
   const missing = id !== null && job === null;
   useEffect(() => {
-    if (missing)
-      askReconstruction(id).then(storeReconstruction, (error: unknown) => setProblem({ id, text: errorText(error) }));
+    if (missing) loadReconstruction(id).catch((error: unknown) => setProblem({ id, text: errorText(error) }));
   }, [id, missing]);
   return { job, problem: missing && problem?.id === id ? problem.text : null };
 }

@@ -262,7 +262,8 @@ export async function refresh(): Promise<void> {
 
 /** Tell the end of a job that was under way, is no longer listed as such, and whose messages were missed. */
 async function tellEnd(before: Reconstruction): Promise<void> {
-  if (get().reconstructions[before.id] === undefined) await loadReconstruction(before.id).catch(() => undefined); // deleted meanwhile, or out of reach again
+  // An error: it was deleted meanwhile, or the service is out of reach again.
+  if (get().reconstructions[before.id] === undefined) await loadReconstruction(before.id).catch(() => undefined);
   const now = get().reconstructions[before.id];
   if (now !== undefined) notifyOfEnd(before, now);
 }

@@ -13,7 +13,8 @@ export function useWanted(id: string | null, known: Capture | null): string | nu
     if (missing) loadCapture(id).catch((error: unknown) => setProblem({ id, text: errorText(error) }));
   }, [id, missing]);
   useEffect(() => {
-    if (knownId !== null) Promise.all([loadCapture(knownId), loadReconstructions(knownId)]).catch(() => undefined); // the banner tells it
+    // The banner at the top shows errors.
+    if (knownId !== null) Promise.all([loadCapture(knownId), loadReconstructions(knownId)]).catch(() => undefined);
   }, [knownId, refreshed]);
   return missing && problem?.id === id ? problem.text : null;
 }

@@ -2222,6 +2222,10 @@ class VersionOut(BaseModel):
             description="Of the camera, as it was given or as the reconstruction found it, with its lens; null: not known."
         ),
     ]
+    cleaned_from: Annotated[
+        int | None,
+        Field(description="The version that `:clean` made it from, which undoes it; null: it was not cleaned."),
+    ]
 
 
 class VersionsOut(BaseModel):

@@ -314,7 +314,30 @@ def test_a_scene_is_cleaned_and_brought_back(studied: Studied, scene: Callable[.
     for splats in (cleaned["splats"], before["splats"]):
         page.get_by_role("button", name="Undo").click()
         until(lambda splats=splats: studied.reconstruction()["splats"] == splats, "each change is undone")
-    page.get_by_role("button", name="Undo").wait_for(state="detached")
+    until(page.get_by_role("button", name="Undo").is_disabled, "nothing is left to undo")
+
+
+def test_a_cleaning_is_undone_after_the_page_was_left(studied: Studied, scene: Callable[..., Any]) -> None:
+    before = studied.reconstruction()
+    url = f"reconstructions/{studied.reconstruction_id}"
+    box = {"low": [-1e6, -1e6, -1e6], "high": [0.0, 1e6, 1e6]}
+    for high in (0.0, -0.2):
+        box["high"][0] = high
+        version = studied.reconstruction()["version"]
+        answer = studied.http.post(f"{url}:clean", json={"version": version, "floaters": False, "box": box})
+        assert answer.status_code == 200, answer.text
+    page = scene()
+    for _ in range(2):
+        page.locator("summary").filter(has_text="Clean").click()
+        version = studied.reconstruction()["version"]
+        page.get_by_role("button", name="Undo").click()
+        until(lambda version=version: studied.reconstruction()["version"] > version, "undone")
+        page.reload()
+        until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+    assert studied.reconstruction()["splats"] == before["splats"]
+    page.locator("summary").filter(has_text="Clean").click()
+    until(page.get_by_role("button", name="Undo").is_disabled, "nothing is left to undo")
+    assert violations(page) == []
 
 
 def test_splats_inside_a_lasso_are_removed(studied: Studied, scene: Callable[..., Any], pictures_folder: Path) -> None:

@@ -43,6 +43,8 @@ class Published(BaseModel):
     """Name of the file of `ShownScene`, which only the newest versions have."""
     slots_began: int = 0
     """The number of these slots: `ShownScene.began`."""
+    cleaned_from: int | None = None
+    """The version that it is without what cleaning removed; None: it was not cleaned."""
     paths: list[OtherPath] = []
     """Of a map of several recordings: the paths of the others."""
 

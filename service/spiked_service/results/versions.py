@@ -107,7 +107,12 @@ class Publisher:
         edited: dict[str, Any] = {}
         content = (self._folder / earlier.scene).read_bytes() if scene is None else scene.ply(earlier.white)
         if scene is not None:
-            edited = {"splats": len(scene), "scene_bytes": len(content), "psnr_db": None}
+            edited = {
+                "splats": len(scene),
+                "scene_bytes": len(content),
+                "psnr_db": None,
+                "cleaned_from": earlier.version,
+            }
         shown = scene or Scene.read_ply(self._folder / earlier.scene)
         paths = [
             one.model_copy(update={"trajectory": f"path-{version:06d}-{number}.poses"})

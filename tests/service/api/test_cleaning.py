@@ -30,13 +30,16 @@ def test_a_cleaned_scene_is_a_version_and_can_be_undone(
     assert edited["splats"] == len(scene_of(service, job, tmp_path)) < len(scene)
     assert http.get(url).json()["splats"] == edited["splats"]
     assert http.get(f"{url}/trajectory").json()["frames"]
-    assert http.get(f"{url}/versions").json()["items"][-1]["version"] == edited["version"]
+    *_, earlier, newest = http.get(f"{url}/versions").json()["items"]
+    assert (newest["version"], newest["cleaned_from"]) == (edited["version"], before["version"])
+    assert earlier["cleaned_from"] is None
     assert http.post(f"{url}:clean", json=body).status_code == 409
     back = http.post(f"{url}:revert", json={"version": edited["version"], "to": before["version"]})
     assert back.status_code == 200, back.text
     assert (
         len(scene_of(service, job, tmp_path)) == len(scene) and http.get(url).json()["version"] == edited["version"] + 1
     )
+    assert http.get(f"{url}/versions").json()["items"][-1]["cleaned_from"] is None
 
 
 def test_what_is_outlined_in_a_view_is_removed(service: Any, done: CaptureOut, job: str, tmp_path: Path) -> None:

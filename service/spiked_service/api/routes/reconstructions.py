@@ -150,9 +150,9 @@ def reconstruction_record_routes(rows: ReconstructionRepository, route_class: ty
     @router.get("/versions", responses=problems(404))
     def list_versions(reconstruction_id: str) -> VersionsOut:
         """Available versions, oldest first."""
-        cameras = {one.version: one.camera for one in versions(rows.folder(reconstruction_id))}
+        published = {one.version: one for one in versions(rows.folder(reconstruction_id))}
         found = rows.versions(reconstruction_id)
-        return VersionsOut(items=[VersionOut.of(row, cameras.get(row.version)) for row in found])
+        return VersionsOut(items=[VersionOut.of(row, published.get(row.version)) for row in found])
 
     @router.get("/timeline", responses=problems(404))
     def get_timeline(

@@ -6,7 +6,6 @@ from typing import Annotated, Self
 from pydantic import Field, StrictBool, StrictInt, model_validator
 
 from spiked.recon import State
-from spiked.sensor import Intrinsics
 from spiked_service.api.schemas.base import (
     ID_EXAMPLE,
     LARGEST_INTEGER,
@@ -21,6 +20,7 @@ from spiked_service.api.schemas.base import (
     example,
     examples,
 )
+from spiked_service.results.published import Published
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.rows import FrameRange, JobState, ReconstructionRow, Stage, Task, VersionRow
 
@@ -213,12 +213,20 @@ class VersionOut(Out):
     intrinsics: IntrinsicsModel | None = Field(
         description="Of the camera, as it was given or as the reconstruction found it, with its lens; null: not known."
     )
+    cleaned_from: int | None = Field(
+        description="The version that `:clean` made it from, which undoes it; null: it was not cleaned."
+    )
 
     @classmethod
-    def of(cls, row: VersionRow, intrinsics: Intrinsics | None) -> "VersionOut":
-        """A row as it is shown."""
-        fields = {name: getattr(row, name) for name in cls.model_fields if name != "intrinsics"}
-        return cls(**fields, intrinsics=IntrinsicsModel.of(intrinsics))
+    def of(cls, row: VersionRow, published: Published | None) -> "VersionOut":
+        """A row as it is shown, with what the index of the folder has of the version, None if it has nothing."""
+        ours = ("intrinsics", "cleaned_from")
+        fields = {name: getattr(row, name) for name in cls.model_fields if name not in ours}
+        return cls(
+            **fields,
+            intrinsics=IntrinsicsModel.of(None if published is None else published.camera),
+            cleaned_from=None if published is None else published.cleaned_from,
+        )
 
 
 class VersionsOut(Out):

@@ -3,10 +3,10 @@
 import { type JSX, useEffect, useMemo, useState } from "react";
 
 import * as calls from "../../shared/api/calls";
-import type { Reconstruction } from "../../shared/api/types";
+import type { Reconstruction, Version } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
 import { count } from "../../shared/state/format";
-import { isEnded } from "../../shared/state/store";
+import { isEnded, storeReconstruction } from "../../shared/state/store";
 import { toast } from "../../shared/state/toasts";
 import { ActionButton } from "../../shared/ui/access";
 import { type Box, cut, NO_CUT, opened, SIDES } from "./cropBox";
@@ -16,6 +16,8 @@ import type { Viewer } from "./Viewer";
 export interface CleanProps {
   viewer: Viewer | null;
   job: Reconstruction;
+  /** The versions that are kept, oldest first. */
+  versions: readonly Version[];
   /** Whether the newest version is shown: only that one is edited. */
   newest: boolean;
   /** Whether the scene alone is seen, by the free camera. */
@@ -34,11 +36,9 @@ export function CleanPanel(props: CleanProps): JSX.Element {
   );
 }
 
-function Cleaning({ viewer, job, newest, free, whole }: CleanProps & { viewer: Viewer }): JSX.Element {
+function Cleaning({ viewer, job, versions, newest, free, whole }: CleanProps & { viewer: Viewer }): JSX.Element {
   const [shares, setShares] = useState(NO_CUT);
   const [busy, setBusy] = useState(false);
-  /** The versions before each change, the last one last; `at` is the version after it. */
-  const [undo, setUndo] = useState<{ at: number; to: readonly number[] }>({ at: 0, to: [] });
   const bounds = viewer.bounds();
   const box = useMemo(() => (bounds === null ? null : cut(bounds, shares)), [bounds, shares]);
   const cropped = shares.some((share) => share > 0);
@@ -54,14 +54,15 @@ function Cleaning({ viewer, job, newest, free, whole }: CleanProps & { viewer: V
     setBusy(true);
     const done = await attempt(async () => {
       const found = await begin();
-      setUndo((old) => ({ at: found.version, to: [...(old.at === job.version ? old.to : []), job.version] }));
+      storeReconstruction(await calls.reconstruction(job.id)); // the next change names the version of this one
       setShares(NO_CUT);
       toast(say(found));
     });
     setBusy(false);
     return done;
   };
-  const before = undo.to.at(-1);
+  const before = versions.find((one) => one.version === job.version)?.cleaned_from ?? null;
+  const kept = versions.some((one) => one.version === before);
   const ready = isEnded(job) && newest && !busy;
   return (
     <>
@@ -130,20 +131,25 @@ function Cleaning({ viewer, job, newest, free, whole }: CleanProps & { viewer: V
           )
         }
       />
-      {before !== undefined && (
-        <ActionButton
-          disabled={busy || job.version !== undo.at}
-          onClick={() =>
-            void attempt(async () => {
-              const found = await calls.revert(job.id, { version: job.version, to: before });
-              setUndo({ at: found.version, to: undo.to.slice(0, -1) });
-              toast(`The scene is as version ${before} was`);
-            })
-          }
-        >
-          Undo
-        </ActionButton>
-      )}
+      <ActionButton
+        disabled={!ready || !kept}
+        title={
+          before === null
+            ? "The newest version was not cleaned"
+            : kept
+              ? `Back to version ${before}`
+              : `Version ${before} is not kept any more`
+        }
+        onClick={() => {
+          if (before === null) return;
+          void edit(
+            () => calls.revert(job.id, { version: job.version, to: before }),
+            () => `The scene is as version ${before} was`,
+          );
+        }}
+      >
+        Undo
+      </ActionButton>
     </>
   );
 }

@@ -170,6 +170,7 @@ export function Inspector(props: InspectorProps): JSX.Element {
       <CleanPanel
         viewer={props.viewer}
         job={job}
+        versions={props.versions}
         newest={pinned === null}
         free={!props.ride && props.comparison === null}
         whole={shown?.whole ?? false}

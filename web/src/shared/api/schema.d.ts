@@ -5044,6 +5044,11 @@ export interface components {
             psnr_db: number | null;
             /** @description Of the camera, as it was given or as the reconstruction found it, with its lens; null: not known. */
             intrinsics: components["schemas"]["IntrinsicsModel"] | null;
+            /**
+             * Cleaned From
+             * @description The version that `:clean` made it from, which undoes it; null: it was not cleaned.
+             */
+            cleaned_from: number | null;
         };
         /**
          * VersionsOut

@@ -132,6 +132,7 @@ def test_two_reconstructions_are_chosen_and_turned_together(
     page.get_by_role("button", name="Stop comparing").click()
     until(lambda: page.locator(SECOND).count() == 0, "one scene")
     assert "against" not in address(page)
+    assert page.get_by_label("With").evaluate("field => field === document.activeElement"), "the button has gone"
 
 
 def test_the_divider_is_moved_by_mouse_and_keys(compared: Callable[..., Any], pictures_folder: Path) -> None:
@@ -234,6 +235,8 @@ def test_an_earlier_version_is_compared_and_brought_back(studied: Studied, compa
     page.get_by_role("button", name=f"Go back to version {before['version']}").click()
     until(lambda: studied.reconstruction()["splats"] == before["splats"], "all splats are back")
     page.get_by_text(f"The scene is as version {before['version']} was").wait_for()
+    chooser = page.get_by_role("combobox", name="Version")
+    assert chooser.evaluate("field => field === document.activeElement"), "the button has gone"
     assert violations(page) == []
 
 

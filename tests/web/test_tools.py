@@ -340,6 +340,41 @@ def test_a_cleaning_is_undone_after_the_page_was_left(studied: Studied, scene: C
     assert violations(page) == []
 
 
+def focused(page: Any) -> str:
+    """What has the keyboard's focus: its text, or the label of a field."""
+    found: str = page.evaluate(
+        "() => { const at = document.activeElement; return at.labels?.length && at.tagName !== 'BUTTON'"
+        " ? at.labels[0].textContent : at.tagName === 'BODY' ? 'nothing' : at.textContent; }"
+    )
+    return found
+
+
+def test_cleaning_by_keyboard_leaves_the_focus_where_it_is(studied: Studied, scene: Callable[..., Any]) -> None:
+    page = scene()
+    before = studied.reconstruction()
+    page.locator("summary").filter(has_text="Clean").focus()
+    page.keyboard.press("Enter")
+    slider = page.get_by_role("slider", name="far")
+    slider.focus()
+    page.keyboard.press("PageUp")
+    page.keyboard.press("Tab")
+    assert focused(page) == "Cut to the box"
+    page.keyboard.press("Enter")
+    until(lambda: studied.reconstruction()["splats"] < before["splats"], "fewer splats")
+    until(lambda: page.get_by_role("button", name="Undo").is_enabled(), "it can be undone")
+    assert focused(page) == "Cut to the box", "although nothing is left to cut"
+    cut = studied.reconstruction()["version"]
+    page.keyboard.press("Enter")
+    page.keyboard.press("Tab")
+    page.keyboard.press("Tab")
+    assert focused(page) == "Undo"
+    page.keyboard.press("Enter")
+    until(lambda: studied.reconstruction()["splats"] == before["splats"], "all splats are back")
+    until(page.get_by_role("button", name="Undo").is_disabled, "nothing is left to undo")
+    assert focused(page) == "Undo" and studied.reconstruction()["version"] == cut + 1
+    assert violations(page) == []
+
+
 def test_splats_inside_a_lasso_are_removed(studied: Studied, scene: Callable[..., Any], pictures_folder: Path) -> None:
     page = scene()
     before = studied.reconstruction()
@@ -360,6 +395,7 @@ def test_splats_inside_a_lasso_are_removed(studied: Studied, scene: Callable[...
     remove.click()
     page.get_by_text(re.compile(r"Removed \d.* splats")).wait_for()
     until(lambda: studied.reconstruction()["splats"] == before["splats"] - inside, "as many as the page has counted")
+    until(lambda: focused(page) == "Stop drawing", "the pressed button has gone")
     page.keyboard.press("Escape")
     page.get_by_role("button", name="Draw around splats").wait_for()
     page.get_by_role("button", name="Undo").click()

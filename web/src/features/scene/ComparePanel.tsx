@@ -1,6 +1,6 @@
 /** What the scene is compared with and how, and what differs. */
 
-import { type JSX, useEffect, useState } from "react";
+import { type JSX, type Ref, useEffect, useRef, useState } from "react";
 
 import type { Capture, Reconstruction, Version } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
@@ -42,9 +42,17 @@ export function ComparePanel(props: CompareProps): JSX.Element {
 
 function Comparing({ capture, job, versions, pinned, comparison }: CompareProps): JSX.Element {
   const shownVersion = pinned?.version ?? job.version;
+  const choice = useRef<HTMLSelectElement>(null);
   return (
     <>
-      <Choice capture={capture} job={job} versions={versions} shownVersion={shownVersion} comparison={comparison} />
+      <Choice
+        field={choice}
+        capture={capture}
+        job={job}
+        versions={versions}
+        shownVersion={shownVersion}
+        comparison={comparison}
+      />
       {comparison === null ? (
         <p className="dim hint">Choose a version or a reconstruction to see it beside this one.</p>
       ) : (
@@ -58,7 +66,13 @@ function Comparing({ capture, job, versions, pinned, comparison }: CompareProps)
           <p className="dim hint">{HOWS.find((one) => one.value === comparison.how)?.hint}</p>
           <Figures job={job} pinned={pinned} comparison={comparison} />
           <Truth comparison={comparison} frameRateHz={capture.sensor?.frame_rate_hz ?? null} />
-          <button type="button" onClick={stopComparing}>
+          <button
+            type="button"
+            onClick={() => {
+              choice.current?.focus(); // this button goes
+              stopComparing();
+            }}
+          >
             Stop comparing
           </button>
         </>
@@ -69,12 +83,13 @@ function Comparing({ capture, job, versions, pinned, comparison }: CompareProps)
 
 /** What there is to compare with: versions, other reconstructions of the capture, and those of other captures. */
 function Choice({
+  field,
   capture,
   job,
   versions,
   shownVersion,
   comparison,
-}: Omit<CompareProps, "pinned"> & { shownVersion: number }): JSX.Element {
+}: Omit<CompareProps, "pinned"> & { field: Ref<HTMLSelectElement>; shownVersion: number }): JSX.Element {
   const all = useService((state) => state.reconstructions);
   const captures = useService((state) => state.captures);
   useEffect(() => {
@@ -99,6 +114,7 @@ function Choice({
       <label className="row">
         <span className="dim">With</span>
         <select
+          ref={field}
           value={value}
           onChange={(event) => {
             const [against = "", version = ""] = event.target.value.split(".");

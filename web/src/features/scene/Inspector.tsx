@@ -1,6 +1,6 @@
 /** Settings of the scene view: version, camera control, layers, legend, bookmarks. */
 
-import { type JSX, useEffect, useState } from "react";
+import { type JSX, useEffect, useRef, useState } from "react";
 
 import { revert } from "../../shared/api/calls";
 import type { Capture, Closure, Reconstruction, Sensor, Version } from "../../shared/api/types";
@@ -215,12 +215,14 @@ function Headset({ viewer }: { viewer: Viewer | null }): JSX.Element | null {
 
 /** Choice of a published version; the service keeps earlier ones. */
 function Versions({ job, versions, pinned, onVersion }: InspectorProps): JSX.Element | null {
+  const choice = useRef<HTMLSelectElement>(null);
   if (job.version === 0) return null;
   return (
     <>
       <label className="row version">
         <span className="dim">Version</span>
         <select
+          ref={choice}
           value={pinned?.version ?? ""}
           onChange={(event) => onVersion(event.target.value === "" ? null : Number(event.target.value))}
         >
@@ -239,7 +241,12 @@ function Versions({ job, versions, pinned, onVersion }: InspectorProps): JSX.Ele
         <ActionButton
           disabled={!isEnded(job)}
           title={isEnded(job) ? "Publishes it again, as the newest" : "When the reconstruction has ended"}
-          onClick={() => void goBack(job, pinned.version, () => onVersion(null))}
+          onClick={() =>
+            void goBack(job, pinned.version, () => {
+              choice.current?.focus(); // this button goes
+              onVersion(null);
+            })
+          }
         >
           <Icon name="back" /> Go back to version {pinned.version}
         </ActionButton>

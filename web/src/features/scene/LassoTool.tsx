@@ -1,6 +1,6 @@
 /** Draws an outline over the scene with the pointer, and removes the splats behind it. */
 
-import { type JSX, type PointerEvent, useEffect, useState } from "react";
+import { type JSX, type PointerEvent, useEffect, useRef, useState } from "react";
 import { createPortal } from "react-dom";
 
 import { count } from "../../shared/state/format";
@@ -32,6 +32,7 @@ export function LassoTool({
     setLine([]);
     setFound(null);
   };
+  const toggle = useRef<HTMLButtonElement>(null);
   const stage = viewer.canvas.parentElement;
   useEffect(() => {
     if (!armed) return;
@@ -51,7 +52,12 @@ export function LassoTool({
     if (found === null) return;
     const now = viewer.outline(line); // the view may have moved below the line since it was drawn
     if (now === null) forget();
-    else if (now.splats === found.splats) void onRemove(now.outline).then((done) => done && forget());
+    else if (now.splats === found.splats)
+      void onRemove(now.outline).then((done) => {
+        if (!done) return;
+        toggle.current?.focus(); // the button that was pressed goes
+        forget();
+      });
     else setFound(now);
   };
   const overlay = armed && (
@@ -80,6 +86,7 @@ export function LassoTool({
     <fieldset className="crop">
       <legend>Lasso</legend>
       <ActionButton
+        ref={toggle}
         disabled={(!ready || !free) && !armed}
         title={free ? undefined : "Leave the comparison or the ride along first"}
         aria-pressed={armed}

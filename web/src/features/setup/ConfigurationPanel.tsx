@@ -28,7 +28,7 @@ export function ConfigurationPanel(): JSX.Element {
       aside={
         <button
           type="button"
-          disabled={configuration.loading}
+          aria-disabled={configuration.loading}
           title="Read file and environment again"
           onClick={() => void told(calls.reloadConfiguration)}
         >

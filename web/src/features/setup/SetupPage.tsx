@@ -60,7 +60,7 @@ export function SetupPage(): JSX.Element {
 
 function Refresh({ of, label }: { of: Fetch<unknown>; label: string }): JSX.Element {
   return (
-    <button type="button" aria-label={label} onClick={of.again} disabled={of.loading}>
+    <button type="button" aria-label={label} onClick={of.again} aria-disabled={of.loading}>
       <Icon name="again" /> Refresh
     </button>
   );

@@ -37,7 +37,7 @@ export function TokensPanel(): JSX.Element {
     <Panel
       title="Tokens"
       aside={
-        <button type="button" aria-label="Refresh the tokens" onClick={tokens.again} disabled={tokens.loading}>
+        <button type="button" aria-label="Refresh the tokens" onClick={tokens.again} aria-disabled={tokens.loading}>
           <Icon name="again" /> Refresh
         </button>
       }

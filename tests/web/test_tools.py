@@ -340,6 +340,33 @@ def test_a_cleaning_is_undone_after_the_page_was_left(studied: Studied, scene: C
     assert violations(page) == []
 
 
+def test_the_version_that_is_shown_is_downloaded(studied: Studied, scene: Callable[..., Any]) -> None:
+    before = studied.reconstruction()
+    url = f"reconstructions/{studied.reconstruction_id}"
+    cut = {"version": before["version"], "floaters": False, "box": {"low": [-1e6] * 3, "high": [0.0, 1e6, 1e6]}}
+    cleaned = studied.http.post(f"{url}:clean", json=cut).json()
+    page = scene()
+
+    def fetched(name: str, version: int) -> bytes:
+        with page.expect_download() as download:
+            link = page.get_by_role("group", name=f"Download version {version}").get_by_role("link", name=name)
+            link.focus()
+            page.keyboard.press("Enter")
+        assert download.value.suggested_filename == f"scene-{version:06d}.{name.lower()}"
+        return Path(download.value.path()).read_bytes()
+
+    ply = fetched("PLY", cleaned["version"])
+    assert f"element vertex {cleaned['splats']}\n".encode() in ply[:2000]
+    spz = fetched("SPZ", cleaned["version"])
+    assert spz == studied.http.get(f"{url}/scene?format=spz&version={cleaned['version']}").content
+    page.get_by_role("combobox", name="Version").select_option(str(before["version"]))
+    until(lambda: shown_version(page) == before["version"], "an earlier version")
+    assert f"element vertex {before['splats']}\n".encode() in fetched("PLY", before["version"])[:2000]
+    assert violations(page) == []
+    back = {"version": cleaned["version"], "to": before["version"]}
+    assert studied.http.post(f"{url}:revert", json=back).status_code == 200
+
+
 def focused(page: Any) -> str:
     """What has the keyboard's focus: its text, or the label of a field."""
     found: str = page.evaluate(

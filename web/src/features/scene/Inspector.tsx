@@ -2,7 +2,7 @@
 
 import { type JSX, useEffect, useRef, useState } from "react";
 
-import { revert } from "../../shared/api/calls";
+import { address, revert } from "../../shared/api/calls";
 import type { Capture, Closure, Reconstruction, Sensor, Version } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
 import { nameOf, progressText } from "../../shared/state/capture";
@@ -10,6 +10,7 @@ import { count, decibel, duration, percent } from "../../shared/state/format";
 import { isEnded } from "../../shared/state/store";
 import { toast } from "../../shared/state/toasts";
 import { ActionButton } from "../../shared/ui/access";
+import { DownloadLink } from "../../shared/ui/DownloadLink";
 import { Icon } from "../../shared/ui/icons";
 import { JobBadge, JobReason, Meter, Segmented, Stat, trackingMeaning, Warnings } from "../../shared/ui/parts";
 import { BookmarksPanel } from "./BookmarksPanel";
@@ -175,6 +176,7 @@ export function Inspector(props: InspectorProps): JSX.Element {
         free={!props.ride && props.comparison === null}
         whole={shown?.whole ?? false}
       />
+      {shown !== null && <Downloads job={job} version={shown.version} />}
       <BookmarksPanel
         key={capture.id}
         capture={capture}
@@ -187,6 +189,20 @@ export function Inspector(props: InspectorProps): JSX.Element {
       />
       <ScreenshotTool onScreenshot={props.onScreenshot} />
     </aside>
+  );
+}
+
+/** The splats of the version that is on the canvas, all of them. */
+function Downloads({ job, version }: { job: Reconstruction; version: number }): JSX.Element {
+  return (
+    <div className="row" role="group" aria-label={`Download version ${version}`}>
+      <span className="dim">Version {version} as</span>
+      {(["ply", "spz"] as const).map((format) => (
+        <DownloadLink key={format} href={address.scene(job.id, format, version)}>
+          {format.toUpperCase()}
+        </DownloadLink>
+      ))}
+    </div>
   );
 }
 

@@ -332,7 +332,9 @@ export const address = {
     `${API}/devices/${encodeURIComponent(device)}/profile/calibration${query({ kind, file })}`,
   recording: (id: string): string => `${API}/captures/${id}/recording`,
   sidecar: (id: string): string => `${API}/captures/${id}/recording/sidecar`,
-  scene: (id: string, format: "ply" | "spz"): string => `${API}/reconstructions/${id}/scene${query({ format })}`,
+  /** Of the newest version unless another is named. */
+  scene: (id: string, format: "ply" | "spz", version?: number): string =>
+    `${API}/reconstructions/${id}/scene${query({ format, version })}`,
   changes: (id: string, asked: { level: number; version?: number | undefined; since?: string | undefined }): string =>
     `${API}/reconstructions/${id}/scene/changes${query(asked)}`,
   report: (id: string): string => `${API}/reconstructions/${id}/report`,

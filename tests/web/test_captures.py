@@ -1,12 +1,13 @@
 """The Captures page: found, looked at, reconstructed once more, compared, deleted and brought back."""
 
 import re
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from browsing import STEPS, Studied, address, finished, until
+from browsing import STEPS, Studied, address, finished, until, violations
 
 from spiked.export import KINDS
 
@@ -223,6 +224,27 @@ def test_deleted_and_brought_back(studied: Studied, visit: Callable[..., Any]) -
     row.wait_for()
     assert studied.http.get(f"captures/{capture_id}").json()["deleted_at"] is None
     studied.http.delete(f"captures/{capture_id}")
+
+
+def test_captures_without_a_name_are_told_apart_by_time(studied: Studied, visit: Callable[..., Any]) -> None:
+    plan = {"source": "sim:?width=64&height=48", "frames": 64, "reconstruct": False}
+    ids: list[str] = []
+    for _ in range(2):
+        before = int(time.time())
+        until(lambda before=before: int(time.time()) > before, "another second")
+        ids.append(studied.http.post("captures", json=plan).json()["id"])
+        until(lambda: studied.http.get(f"captures/{ids[-1]}").json()["state"] == "complete", "a capture more")
+    page = visit(f"{studied.address}?page=captures")
+    links = page.get_by_role("rowheader").get_by_role("link", name=re.compile(r"^sim:, \d\d:\d\d:\d\d$"))
+    until(lambda: links.count() == 2, "both are listed")
+    names = links.all_inner_texts()
+    assert names[0] > names[1], "the newest first"
+    page.get_by_role("checkbox", name=f"Select {names[0]}").check()
+    links.first.click()
+    assert page.get_by_label("Name of the capture").get_attribute("placeholder") == names[0]
+    assert violations(page) == []
+    for one in ids:
+        studied.http.delete(f"captures/{one}")
 
 
 def test_deleted_ones_are_listed_restored_and_deleted_for_good(studied: Studied, visit: Callable[..., Any]) -> None:

@@ -6,7 +6,7 @@ import * as calls from "../../shared/api/calls";
 import type { Capture, CaptureChange, Reconstruction } from "../../shared/api/types";
 import { useDenied } from "../../shared/state/access";
 import { attempt } from "../../shared/state/attempt";
-import { nameOf, numberOf, sourceOf } from "../../shared/state/capture";
+import { nameOf, numberOf } from "../../shared/state/capture";
 import { adjust, go, useRoute } from "../../shared/state/route";
 import {
   isFinished,
@@ -147,7 +147,7 @@ function Head({ capture }: { capture: Capture }): JSX.Element {
       <input
         className="title"
         aria-label="Name of the capture"
-        placeholder={sourceOf(capture)}
+        placeholder={nameOf({ ...capture, name: "" })}
         maxLength={200}
         readOnly={readOnly !== null}
         {...name}

@@ -7,7 +7,10 @@ import { count, duration, percent, when } from "./format";
 export const sourceOf = (capture: Capture): string =>
   capture.origin === "upload" ? "uploaded" : capture.source.replace(/\?.*$/, "").replace(/^(\w+:).*\//, "$1");
 
-export const nameOf = (capture: Capture): string => (capture.name === "" ? sourceOf(capture) : capture.name);
+/** What a capture without a name is called: its source, and when it began. */
+const unnamed = (capture: Capture): string => `${sourceOf(capture)}, ${when(capture.started_at)}`;
+
+export const nameOf = (capture: Capture): string => (capture.name === "" ? unnamed(capture) : capture.name);
 
 /** The number of a reconstruction among those of its capture, the first one first. */
 export function numberOf(job: Reconstruction, all: Iterable<Reconstruction>): string {

@@ -135,6 +135,22 @@ def test_two_reconstructions_are_chosen_and_turned_together(
     assert page.get_by_label("With").evaluate("field => field === document.activeElement"), "the button has gone"
 
 
+def test_a_long_choice_is_told_in_full(
+    studied: Studied, other_id: str, compared: Callable[..., Any], pictures_folder: Path
+) -> None:
+    name = "with half of the steps and all of the splats that the walk along the corridor has left over"
+    studied.http.patch(f"reconstructions/{other_id}", json={"name": name})
+    page = compared(viewport=PHONE, touch=True)
+    told = page.locator(".chosen")
+    told.get_by_text(f"With #2, {name}").wait_for()
+    assert told.evaluate("text => text.scrollWidth <= text.clientWidth"), "it is broken into lines"
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
+    told.scroll_into_view_if_needed()
+    assert violations(page) == []
+    keep(page, pictures_folder / "compare-long.webp")
+    studied.http.patch(f"reconstructions/{other_id}", json={"name": ""})
+
+
 def test_the_divider_is_moved_by_mouse_and_keys(compared: Callable[..., Any], pictures_folder: Path) -> None:
     page = compared("&how=wipe")
     before = stage(page)

@@ -9,6 +9,16 @@ import av
 import pytest
 from browsing import DESKTOP, PHONE, Studied, finished, keep, shown_version, until, violations
 
+LONGEST_ENTRY = """field => {
+    const { paddingLeft, paddingRight, font } = getComputedStyle(field);
+    const pen = document.createElement('canvas').getContext('2d');
+    pen.font = font;
+    const longest = Math.max(...[...field.options].map(one => pen.measureText(one.text).width));
+    const arrow = 20;
+    return longest + arrow + parseFloat(paddingLeft) + parseFloat(paddingRight) - field.clientWidth;
+}"""
+"""By how many pixels the longest entry of a choice is too long for it; its arrow is up to 20 px wide."""
+
 
 def made(page: Any) -> tuple[int, int, int, float]:
     """Width, height and number of the pictures of the video that is downloaded, and how many a second."""
@@ -26,21 +36,22 @@ def test_videos_are_made_as_chosen(
     page = visit(f"{studied.address}?page=scene&capture={studied.capture_id}", viewport=viewport, touch=touch)
     until(lambda: shown_version(page) > 0, "a scene is on the canvas")
     page.locator("summary").filter(has_text="Video").click()
+    assert page.get_by_label("Video of").evaluate(LONGEST_ENTRY) < 0, "each entry is shown whole"
     page.get_by_label("Width", exact=True).fill("160")
     page.get_by_label("Height", exact=True).fill("120")
     page.get_by_label("Pictures a second").fill("10")
     page.get_by_label("Times slower").fill("20")
     of = page.get_by_label("Video of")
-    for kind in ("the scene, along the path, smoothed", "the scene, along the recorded path"):
+    for kind in ("the scene, smoothed path", "the scene, recorded path"):
         of.select_option(label=kind)
         with page.expect_request(re.compile("exports/video")) as asked:
             width, height, pictures, fps = made(page)
         assert (width, height, fps) == (160, 120, 10.0) and 8 <= pictures <= 11, "51 ms, 20 times slower"
         assert ("along=recorded" in asked.value.url) == ("recorded" in kind)
-    of.select_option(label="the recording, in slow motion")
+    of.select_option(label="the recording, slow motion")
     page.get_by_label("Frames of a picture").fill("8")
     assert made(page) == (320, 200, 10, 10.0)
-    of.select_option(label="the scene, through the bookmarks")
+    of.select_option(label="the scene, through bookmarks")
     page.get_by_text("Save two or more bookmarks").wait_for()
     for preset in ("Left", "Right"):
         page.get_by_role("button", name=preset, exact=True).click()
@@ -87,7 +98,7 @@ def test_a_video_that_cannot_be_made_is_told(studied: Studied, visit: Callable[.
     page = visit(f"{studied.address}?page=scene&capture={studied.capture_id}")
     until(lambda: shown_version(page) > 0, "a scene is on the canvas")
     page.locator("summary").filter(has_text="Video").click()
-    page.get_by_label("Video of").select_option(label="the recording, in slow motion")
+    page.get_by_label("Video of").select_option(label="the recording, slow motion")
     page.get_by_label("Times slower").fill("0.001")
     page.get_by_text("show it more slowly").wait_for()
     page.get_by_label("Times slower").fill("20")

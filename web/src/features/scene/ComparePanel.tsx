@@ -108,10 +108,16 @@ function Choice({
     const from = captures[one.capture_id];
     return `${from === undefined ? "an older capture" : nameOf(from)}, ${calledOf(one)}`;
   };
+  // Entries of the list may be longer than the panel is wide.
+  const chosen =
+    other === null || other.id === job.id
+      ? null
+      : `With ${other.capture_id === capture.id ? nameOfNear(other) : nameOfFar(other)}` +
+        (comparison?.version == null ? "" : `, its version ${comparison.version}`);
   const value = comparison === null ? "" : `${comparison.job?.id ?? ""}.${comparison.version ?? ""}`;
   return (
     <>
-      <label className="row">
+      <label className="wide">
         <span className="dim">With</span>
         <select
           ref={field}
@@ -151,6 +157,7 @@ function Choice({
           )}
         </select>
       </label>
+      {chosen !== null && <p className="dim hint chosen">{chosen}</p>}
     </>
   );
 }

@@ -51,7 +51,7 @@ function Making({ capture, job, version, sensor, path, bookmarks }: VideoProps):
   const through = marks.map((one) => poseOfView(one.camera)).map((one) => [...one.position, ...one.quaternion_wxyz]);
   return (
     <>
-      <label className="row">
+      <label className="wide">
         <span className="dim">Of</span>
         <select aria-label="Video of" value={kind} onChange={(event) => setKind(event.target.value as Kind)}>
           {KINDS.map((one) => (

@@ -3,22 +3,22 @@
 export const KINDS = [
   {
     value: "smooth",
-    label: "the scene, along the path, smoothed",
+    label: "the scene, smoothed path",
     hint: "What the camera would have seen of the scene, without the tremor of its path",
   },
   {
     value: "recorded",
-    label: "the scene, along the recorded path",
+    label: "the scene, recorded path",
     hint: "What the camera would have seen of the scene, on its path as it was",
   },
   {
     value: "bookmarks",
-    label: "the scene, through the bookmarks",
+    label: "the scene, through bookmarks",
     hint: "Smoothly from each bookmark of this reconstruction to the next, with the optics of the camera",
   },
   {
     value: "recording",
-    label: "the recording, in slow motion",
+    label: "the recording, slow motion",
     hint: "The rates that the camera has recorded; pictures whose frames were lost are black",
   },
 ] as const;

@@ -340,6 +340,42 @@ def test_a_cleaning_is_undone_after_the_page_was_left(studied: Studied, scene: C
     assert violations(page) == []
 
 
+def test_the_box_stays_in_sight_on_a_phone(scene: Callable[..., Any], pictures_folder: Path) -> None:
+    page = scene(viewport=PHONE, touch=True)
+    page.locator("summary").filter(has_text="Clean").tap()
+    slider = page.get_by_role("slider", name="far")
+    slider.scroll_into_view_if_needed()
+    page.evaluate("() => document.scrollingElement.scrollBy(0, 150)")
+    canvas, field = page.locator(".stage canvas").bounding_box(), slider.bounding_box()
+    bar = page.locator(".bar").bounding_box()
+    assert canvas["y"] >= bar["y"] + bar["height"] - 1 and canvas["height"] > 250, "the whole scene is in sight"
+    assert canvas["y"] + canvas["height"] <= field["y"] < PHONE["height"], "above the sliders"
+    before = still(page)
+    slider.fill("40")
+    until(lambda: unlike(page, before), "the box is drawn")
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
+    assert violations(page) == []
+    keep(page, pictures_folder / "crop-phone.webp")
+
+
+@pytest.mark.parametrize(("viewport", "touch"), [(DESKTOP, False), (PHONE, True)])
+def test_the_end_of_the_panel_is_reached_while_there_is_a_message(
+    scene: Callable[..., Any], viewport: dict[str, int], touch: bool
+) -> None:
+    page = scene(viewport=viewport, touch=touch)
+    shot = page.get_by_role("button", name="Screenshot", exact=True)
+    with page.expect_download():
+        shot.click()
+    message = page.locator(".toast")
+    message.wait_for()
+    page.evaluate(
+        "() => { for (const one of [document.querySelector('.inspector'), document.scrollingElement])"
+        " one.scrollTo(0, one.scrollHeight); }"
+    )
+    end, top = shot.bounding_box(), message.bounding_box()["y"]
+    assert end["y"] + end["height"] <= top, "it is above the message"
+
+
 def test_the_version_that_is_shown_is_downloaded(studied: Studied, scene: Callable[..., Any]) -> None:
     before = studied.reconstruction()
     url = f"reconstructions/{studied.reconstruction_id}"

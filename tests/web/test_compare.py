@@ -142,7 +142,7 @@ def test_a_long_choice_is_told_in_full(
     studied.http.patch(f"reconstructions/{other_id}", json={"name": name})
     page = compared(viewport=PHONE, touch=True)
     told = page.locator(".chosen")
-    told.get_by_text(f"With #2, {name}").wait_for()
+    told.get_by_text(re.compile(rf"^With #2, {name}: \d+.*\d\sdB$")).wait_for()
     assert told.evaluate("text => text.scrollWidth <= text.clientWidth"), "it is broken into lines"
     assert page.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
     told.scroll_into_view_if_needed()
@@ -174,6 +174,8 @@ def test_the_divider_is_moved_by_mouse_and_keys(compared: Callable[..., Any], pi
     drag(page, ".stage > canvas", 60)
     until(lambda: apart(picture(page), first) > 0.01, "the scene beside the divider is turned")
     assert violations(page) == []
+    page.locator(".sorting").wait_for(state="detached")
+    still(page)
     keep(page, pictures_folder / "compare-wipe.webp")
 
 

@@ -108,12 +108,14 @@ function Choice({
     const from = captures[one.capture_id];
     return `${from === undefined ? "an older capture" : nameOf(from)}, ${calledOf(one)}`;
   };
+  const nameOfAny = (one: Reconstruction): string => (one.capture_id === capture.id ? nameOfNear(one) : nameOfFar(one));
   // Entries of the list may be longer than the panel is wide.
   const chosen =
     other === null || other.id === job.id
       ? null
-      : `With ${other.capture_id === capture.id ? nameOfNear(other) : nameOfFar(other)}` +
-        (comparison?.version == null ? "" : `, its version ${comparison.version}`);
+      : comparison?.version == null
+        ? entryOf(nameOfAny(other), other)
+        : `${nameOfAny(other)}, its version ${comparison.version}`;
   const value = comparison === null ? "" : `${comparison.job?.id ?? ""}.${comparison.version ?? ""}`;
   return (
     <>
@@ -157,10 +159,13 @@ function Choice({
           )}
         </select>
       </label>
-      {chosen !== null && <p className="dim hint chosen">{chosen}</p>}
+      {chosen !== null && <p className="dim hint chosen">With {chosen}</p>}
     </>
   );
 }
+
+const entryOf = (name: string, one: Reconstruction): string =>
+  `${name}: ${count(one.splats)} splats, ${decibel(one.psnr_db)}`;
 
 function Reconstructions({
   label,
@@ -176,7 +181,7 @@ function Reconstructions({
     <optgroup label={label}>
       {jobs.map((one) => (
         <option key={one.id} value={`${one.id}.`}>
-          {nameOfJob(one)}: {count(one.splats)} splats, {decibel(one.psnr_db)}
+          {entryOf(nameOfJob(one), one)}
         </option>
       ))}
     </optgroup>

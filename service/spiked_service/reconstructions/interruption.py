@@ -10,15 +10,20 @@ from spiked_service.store.catalogue import Catalogue
 from spiked_service.store.rows import JobState, ReconstructionRow
 
 
-def requeue_interrupted(rows: ReconstructionRepository) -> None:
-    """Queue the jobs that an earlier service left running; they go on from their checkpoints or begin anew."""
+def requeue_interrupted(rows: ReconstructionRepository, adopted: bool) -> None:
+    """Queue the jobs that an earlier service left running; they go on from their checkpoints or begin anew.
+
+    Those on other machines are left to be `adopted`, if there is an executor for it.
+    """
     for row in rows.interrupted():
+        if row.attempt and adopted:
+            continue
         if row.attempts >= QueuePolicy.MOST_ATTEMPTS:
             reason = (
                 f"failed after {row.attempts} attempts, the last of which was interrupted by the end of the service"
             )
             rows.drop_checkpoint(row.id)
-            rows.save(replace(row, state=JobState.FAILED, reason=reason, ended_at=datetime.now(UTC)))
+            rows.save(replace(row, state=JobState.FAILED, reason=reason, ended_at=datetime.now(UTC), attempt=""))
             continue
         rows.save(queued_again(row, f"{_next_start(row, rows)}, because the service ended while it ran"))
 
@@ -27,7 +32,7 @@ def after_crash(
     row: ReconstructionRow, trouble: str, rows: ReconstructionRepository, catalogue: Catalogue, policy: QueuePolicy
 ) -> ReconstructionRow:
     """The row of a job whose worker died: queued again while retries are left and there is a recording."""
-    row = replace(row, ended_at=datetime.now(UTC), eta_s=None)
+    row = replace(row, ended_at=datetime.now(UTC), eta_s=None, attempt="")
     capture = catalogue.captures.find(row.capture_id)
     again = capture is not None and (capture.plan.record or not row.task.reads_recording)
     if again and policy.retry(row.id):

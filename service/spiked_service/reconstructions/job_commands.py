@@ -1,11 +1,20 @@
-"""The command for the worker of a queued job."""
+"""The commands for the workers of jobs."""
 
+from datetime import UTC, datetime
 from pathlib import Path
 
+from spiked.recording.geometry import orientation_questions
+from spiked_service.base.ids import new_id
 from spiked_service.reconstructions.admission import intrinsics_of
 from spiked_service.store.folder import DataFolder
-from spiked_service.store.rows import CaptureRow, ReconstructionRow, Task
-from spiked_service.workers.messages import JobCommand, LocalisationCommand, MergeCommand, ReconstructionCommand
+from spiked_service.store.rows import CaptureRow, JobState, ReconstructionRow, Task
+from spiked_service.workers.messages import (
+    JobCommand,
+    LocalisationCommand,
+    MergeCommand,
+    ReconstructionCommand,
+    RingOpened,
+)
 
 
 def command_of(row: ReconstructionRow, capture: CaptureRow, folder: DataFolder, least_poses: int) -> JobCommand:
@@ -34,6 +43,40 @@ def command_of(row: ReconstructionRow, capture: CaptureRow, folder: DataFolder, 
             )
         case _:
             return _reconstruction(row, capture, folder, least_poses, maps[0] if maps else None)
+
+
+def live_row(capture: CaptureRow) -> ReconstructionRow:
+    """The row of a live reconstruction that begins now."""
+    now = datetime.now(UTC)
+    return ReconstructionRow(
+        new_id(), capture.id, True, JobState.RUNNING, now, options=capture.plan.options, attempts=1, started_at=now
+    )
+
+
+def live_command(
+    row: ReconstructionRow,
+    capture: CaptureRow,
+    opened: RingOpened,
+    folder: DataFolder,
+    first_frame: int,
+    stop_frame: int | None,
+) -> ReconstructionCommand:
+    """What the worker of a live reconstruction is to do: the frames of the ring from `first_frame` to `stop_frame`."""
+    return ReconstructionCommand(
+        capture_id=capture.id,
+        reconstruction_id=row.id,
+        ring=opened.name,
+        recording=None,
+        folder=folder.reconstruction(row.id),
+        can_block=opened.can_block,
+        options=row.options,
+        intrinsics=intrinsics_of(row.options, capture),
+        calibration=opened.calibration,
+        questions=orientation_questions(opened.assumed, opened.sensor),
+        first_frame=first_frame,
+        stop_frame=stop_frame,
+        recorded=capture.plan.record,
+    )
 
 
 def _reconstruction(

@@ -1,7 +1,6 @@
 """Runs one reconstruction in a worker process.
 
-The only module of the package that starts processes. Another executor has to take a `JobCommand`, deliver
-`WorkerEvent`s and one exit, and support `stop`, `dismiss` and `kill_after`, as `WorkerProcess` does.
+Where it runs is the business of an `Executor`.
 """
 
 import time
@@ -10,6 +9,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 
 from spiked.recon import State
+from spiked_service.reconstructions.executor import Executor, Worker
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
@@ -17,6 +17,7 @@ from spiked_service.store.rows import JobState, ReconstructionRow, Stage, Task
 from spiked_service.workers.messages import (
     FramesSkipped,
     JobCommand,
+    NodeFound,
     PlaceCompared,
     PoseEstimated,
     ReconstructionStatus,
@@ -24,7 +25,7 @@ from spiked_service.workers.messages import (
     WorkerError,
     WorkerEvent,
 )
-from spiked_service.workers.process import StandbyWorker, WorkerProcess
+from spiked_service.workers.process import StandbyWorker
 
 _SAVE_S = 5.0
 """Interval at which the row of a running job is saved; changes of stage or version are saved at once."""
@@ -40,6 +41,7 @@ class JobRunner:
     def __init__(
         self,
         row: ReconstructionRow,
+        executor: Executor,
         rows: ReconstructionRepository,
         notifier: Notifier,
         must_yield: Callable[[ReconstructionRow], bool],
@@ -51,11 +53,12 @@ class JobRunner:
         """
         self.row = row
         """The newest row."""
+        self._executor = executor
         self._rows = rows
         self._notifier = notifier
         self._must_yield = must_yield
         self._on_exit = on_exit
-        self._worker: WorkerProcess | None = None
+        self._worker: Worker | None = None
         self._cancelled = False
         self._early = False
         self._held = False
@@ -75,14 +78,13 @@ class JobRunner:
     def start(self, command: JobCommand, standby: StandbyWorker | None) -> None:
         """Save the row and start the worker, or use a standby worker. Raises OSError."""
         command.folder.mkdir(exist_ok=True)
-        self._rows.save(self.row)
-        self._worker = WorkerProcess(
-            command,
-            command.folder / "log",
-            self._handle,
-            lambda trouble: self._on_exit(self, trouble),
-            standby,
-        )
+        self.row = self._rows.save(replace(self.row, attempt=self._executor.attempt(), node=""))
+        self._worker = self._executor.start(self.row, command, self._handle, self._exited, standby)
+
+    def adopt(self, command: JobCommand) -> None:
+        """Follow the worker of a job that an earlier service has started elsewhere."""
+        self._rows.update(self.row)
+        self._worker = self._executor.adopt(self.row, command, self._handle, self._exited)
 
     def cancel(self) -> None:
         """Stop the worker; published versions are kept."""
@@ -107,6 +109,11 @@ class JobRunner:
         if self._worker is not None:
             self._worker.dismiss()
 
+    def detach(self) -> None:
+        """The service ends: a worker on this machine exits at once, others go on."""
+        if self._worker is not None:
+            self._worker.detach()
+
     def kill_after(self, timeout_s: float) -> None:
         """Wait for the worker to exit; kill it after `timeout_s`."""
         if self._worker is not None:
@@ -114,7 +121,7 @@ class JobRunner:
 
     def outcome(self, trouble: str | None) -> ReconstructionRow | None:
         """The row after the exit: over, or queued again from the recording; None if the worker died unexpectedly."""
-        row = replace(self.row, ended_at=datetime.now(UTC), eta_s=None)
+        row = replace(self.row, ended_at=datetime.now(UTC), eta_s=None, attempt="")
         if self._cancelled:
             return replace(row, state=JobState.CANCELLED, stage=Stage.DONE if trouble is None else row.stage, reason="")
         if self._held and not (trouble is None and row.stage is Stage.DONE):
@@ -142,8 +149,14 @@ class JobRunner:
         if self._worker is not None:
             self._worker.stop()
 
+    def _exited(self, trouble: str | None) -> None:
+        self._on_exit(self, trouble)
+
     def _handle(self, event: WorkerEvent) -> None:
         match event:
+            case NodeFound():
+                self.row = replace(self.row, node=event.node)
+                self._save()
             case ReconstructionStatus():
                 self._advance(event)
             case PoseEstimated():
@@ -228,6 +241,7 @@ def queued_again(row: ReconstructionRow, reason: str) -> ReconstructionRow:
         eta_s=None,
         reason=reason,
         ended_at=None,
+        attempt="",
     )
 
 

@@ -6,13 +6,13 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Unpack
 
-from spiked.recording.geometry import orientation_questions
 from spiked_service.base.errors import BusyError
 from spiked_service.base.ids import new_id
-from spiked_service.reconstructions.admission import check, intrinsics_of
+from spiked_service.reconstructions.admission import check
+from spiked_service.reconstructions.executor import Executor, LocalExecutor
 from spiked_service.reconstructions.given import Given
 from spiked_service.reconstructions.interruption import after_crash, requeue_interrupted
-from spiked_service.reconstructions.job_commands import command_of
+from spiked_service.reconstructions.job_commands import command_of, live_command, live_row
 from spiked_service.reconstructions.job_runner import JobRunner, begun_anew
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue_policy import QueuePolicy
@@ -30,7 +30,7 @@ from spiked_service.store.rows import (
     Stage,
     Task,
 )
-from spiked_service.workers.messages import JobCommand, ReconstructionCommand, RingOpened
+from spiked_service.workers.messages import JobCommand, RingOpened
 from spiked_service.workers.process import StandbyWorker
 
 _LOOK_S = 0.5
@@ -50,7 +50,11 @@ class Reconstructions:
         notifier: Notifier,
         policy: QueuePolicy,
         rows: ReconstructionRepository,
+        executor: Executor | None = None,
     ) -> None:
+        """`executor` runs the jobs of the queue; live ones run on this machine, where their ring is."""
+        self._local = LocalExecutor()
+        self._executor = executor or self._local
         self._folder = folder
         self._catalogue = catalogue
         self._notifier = notifier
@@ -63,13 +67,16 @@ class Reconstructions:
         """Poses of the published trajectory of a queued reconstruction, which a restart has to reach."""
         self._closing = False
         self._thread: threading.Thread | None = None
-        requeue_interrupted(rows)
+        requeue_interrupted(rows, adopted=executor is not None)
 
     def start(self) -> None:
         """Start the queue. Call once, after interrupted recordings have been recovered."""
         with self._lock:
             if self._closing:  # the service has stopped meanwhile
                 return
+            for row in self.rows.interrupted():
+                if row.id not in self._jobs:
+                    self._adopt(row)
             thread = threading.Thread(target=self._run_queue, name="queue", daemon=True)
             thread.start()
             self._thread = thread
@@ -85,26 +92,8 @@ class Reconstructions:
         standby: StandbyWorker | None = None,
     ) -> ReconstructionRow:
         """Reconstruct a capture while it runs. `on_end` is called once, when its worker no longer reads the ring."""
-        options = capture.plan.options
-        now = datetime.now(UTC)
-        row = ReconstructionRow(
-            new_id(), capture.id, True, JobState.RUNNING, now, options=options, attempts=1, started_at=now
-        )
-        command = ReconstructionCommand(
-            capture_id=capture.id,
-            reconstruction_id=row.id,
-            ring=opened.name,
-            recording=None,
-            folder=self._folder.reconstruction(row.id),
-            can_block=opened.can_block,
-            options=options,
-            intrinsics=intrinsics_of(options, capture),
-            calibration=opened.calibration,
-            questions=orientation_questions(opened.assumed, opened.sensor),
-            first_frame=first_frame,
-            stop_frame=stop_frame,
-            recorded=capture.plan.record,
-        )
+        row = live_row(capture)
+        command = live_command(row, capture, opened, self._folder, first_frame, stop_frame)
         with self._lock:
             self._begin(row, command, standby, on_end)
         return row
@@ -239,7 +228,7 @@ class Reconstructions:
             jobs = list(self._jobs.values())
             self._wake.notify_all()
         for job in jobs:
-            job.dismiss()
+            job.detach()
 
     def join(self, timeout_s: float) -> None:
         """Wait for dismissed workers; kill those that have not exited after `timeout_s`."""
@@ -294,14 +283,7 @@ class Reconstructions:
         standby: StandbyWorker | None = None,
         on_end: Callable[[ReconstructionRow], None] | None = None,
     ) -> None:
-        job = JobRunner(
-            row,
-            self.rows,
-            self._notifier,
-            self._must_yield,
-            lambda job, trouble: self._ended(job, trouble, on_end),
-        )
-        self._jobs[row.id] = job
+        job = self._runner(row, self._local if row.live else self._executor, on_end)
         try:
             job.start(command, standby)
         except OSError as error:
@@ -309,6 +291,26 @@ class Reconstructions:
             reason = f"its worker cannot be started: {error.strerror}"
             self.rows.save(replace(row, state=JobState.FAILED, reason=reason, ended_at=datetime.now(UTC)))
             raise
+
+    def _adopt(self, row: ReconstructionRow) -> None:
+        """Follow a job that runs elsewhere since before the service was started."""
+        capture = self._catalogue.captures.find(row.capture_id)
+        if capture is None:
+            reason = "its capture has been removed"
+            self.rows.save(
+                replace(row, state=JobState.CANCELLED, reason=reason, ended_at=datetime.now(UTC), attempt="")
+            )
+        else:
+            self._runner(row, self._executor).adopt(command_of(row, capture, self._folder, 0))
+
+    def _runner(
+        self, row: ReconstructionRow, executor: Executor, on_end: Callable[[ReconstructionRow], None] | None = None
+    ) -> JobRunner:
+        def ended(job: JobRunner, trouble: str | None) -> None:
+            self._ended(job, trouble, on_end)
+
+        self._jobs[row.id] = JobRunner(row, executor, self.rows, self._notifier, self._must_yield, ended)
+        return self._jobs[row.id]
 
     def _must_yield(self, row: ReconstructionRow) -> bool:
         """Whether a job that begins to refine must return to the queue, from which it restarts with its recording."""

@@ -324,6 +324,10 @@ class ReconstructionRow:
     """Device whose calibration is used instead of that of the recording; it lies in its folder."""
     turn: str = ""
     """Its turn among queued ones of its priority; empty: its id."""
+    attempt: str = ""
+    """Id of the attempt that runs on another machine, whose token is worth nothing once this has changed."""
+    node: str = ""
+    """The machine that runs it or ran it last; empty: that of the service."""
 
 
 class ReconstructionEdit(TypedDict, total=False):

@@ -282,6 +282,13 @@ class RecordingEnded(BaseModel):
     """The acquisition died."""
 
 
+class NodeFound(BaseModel):
+    """A machine has taken the job."""
+
+    type: Literal["node"] = "node"
+    node: str
+
+
 class ReconstructionStatus(BaseModel):
     """Progress of a reconstruction."""
 
@@ -417,6 +424,7 @@ WorkerEvent = Annotated[
     | Warned
     | RecordingFailed
     | RecordingEnded
+    | NodeFound
     | ReconstructionStatus
     | PoseEstimated
     | FramesSkipped

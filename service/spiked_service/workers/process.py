@@ -1,6 +1,8 @@
 """The service's end of a worker process: starts it, sends its command, receives its events."""
 
 import logging
+import os
+import signal
 import subprocess
 import sys
 import threading
@@ -102,8 +104,12 @@ class WorkerProcess:
             except BrokenPipeError:
                 return  # it has exited already
 
+    def detach(self) -> None:
+        """The service ends, and with it its workers."""
+        self.dismiss()
+
     def kill_after(self, timeout_s: float) -> None:
-        """Wait for it to exit; kill it after `timeout_s`."""
+        """Wait for it to exit; kill it after `timeout_s`, with the processes that it has started."""
         _wait_or_kill(self._process, timeout_s)
         self._listener.join()
 
@@ -161,7 +167,7 @@ def _wait_or_kill(process: subprocess.Popen[bytes], timeout_s: float) -> None:
     try:
         process.wait(timeout_s)
     except subprocess.TimeoutExpired:
-        process.kill()
+        os.killpg(process.pid, signal.SIGKILL)  # it leads its group, and was not waited for yet
         process.wait()
 
 

@@ -37,6 +37,8 @@ from spiked_service.captures.captures import Captures
 from spiked_service.captures.reconcile import open_catalogue, reconcile
 from spiked_service.captures.recovery import Recovery
 from spiked_service.captures.uploads import Uploads
+from spiked_service.cluster.cluster import Cluster
+from spiked_service.cluster.configured import cluster_of
 from spiked_service.events.bus import Bus
 from spiked_service.events.logging import configure_logs, logger, set_level
 from spiked_service.operations.metrics import Metrics
@@ -44,9 +46,10 @@ from spiked_service.operations.metrics_sources import metrics_source_of
 from spiked_service.operations.runtime_folder import RuntimeFolder
 from spiked_service.operations.systemd import SystemdNotifier
 from spiked_service.operations.webhooks import Webhooks
+from spiked_service.reconstructions.executor import Executor
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue import Reconstructions
-from spiked_service.reconstructions.queue_policy import QueuePolicy
+from spiked_service.reconstructions.queue_policy import REMOTE_DELAYS_S, QueuePolicy
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.results.view_renderer import ViewRenderer
 from spiked_service.settings.reload import ReloadableSettings
@@ -79,7 +82,11 @@ class Daemon:
             health = Health()
             self.heartbeat = EventLoopHeartbeat()
             health.add("event loop", self.heartbeat.check, life=True)
-            data_store = open_data_store(now.data, BusNotifier(bus))
+            cluster = cluster_of(now, now.data or default_folder())
+            if cluster is not None:
+                cluster.url = now.executor_url or _address(now, self.port)
+                ends.callback(cluster.close)
+            data_store = open_data_store(now.data, BusNotifier(bus), cluster)
             ends.callback(data_store.close)
             health.add("catalogue", data_store.check_catalogue)
             health.add("disk", data_store.check_disk)
@@ -90,7 +97,7 @@ class Daemon:
                 ends.callback(zmq.close)
                 health.add("zmq", zmq.check, life=True)
                 endpoints = zmq.endpoints
-            self.services = build_services(settings, tokens, data_store, bus, health, endpoints)
+            self.services = build_services(settings, tokens, data_store, bus, health, endpoints, cluster)
             ends.callback(Webhooks(bus, lambda: settings.now.webhooks).close)
             self._config = server_config(create_app(self.services), settings)
             self._ends = ends.pop_all()
@@ -103,9 +110,7 @@ class Daemon:
     @property
     def address(self) -> str:
         """URL for a browser on this machine."""
-        now = self.services.settings.now
-        name = f"[{now.host}]" if ":" in now.host else now.host
-        return f"{'https' if now.tls_certificate else 'http'}://{name}:{self.port}/"
+        return _address(self.services.settings.now, self.port)
 
     def run(self) -> None:
         """Serve until SIGINT or SIGTERM."""
@@ -132,8 +137,16 @@ class Daemon:
         self._ends.close()
 
 
-def open_data_store(data: Path | None, notifier: Notifier) -> DataStore:
-    """Open and reconcile the data folder, and start its maintenance. Raises ConfigurationError or StoreError."""
+def _address(settings: Settings, port: int) -> str:
+    name = f"[{settings.host}]" if ":" in settings.host else settings.host
+    return f"{'https' if settings.tls_certificate else 'http'}://{name}:{port}/"
+
+
+def open_data_store(data: Path | None, notifier: Notifier, executor: Executor | None = None) -> DataStore:
+    """Open and reconcile the data folder, and start its maintenance; `executor` runs jobs, if not this machine.
+
+    Raises ConfigurationError or StoreError.
+    """
     folder = DataFolder(data)
     try:
         folder.sweep()
@@ -144,9 +157,9 @@ def open_data_store(data: Path | None, notifier: Notifier) -> DataStore:
         folder.close()
         raise
     disk_space = DiskSpace(folder, catalogue)
-    policy = QueuePolicy()
+    policy = QueuePolicy() if executor is None else QueuePolicy(delays_s=REMOTE_DELAYS_S)
     rows = ReconstructionRepository(folder, catalogue, notifier, policy)
-    reconstructions = Reconstructions(folder, catalogue, notifier, policy, rows)
+    reconstructions = Reconstructions(folder, catalogue, notifier, policy, rows, executor)
     captures = Captures(folder, catalogue, disk_space, reconstructions, notifier)
     retention = Retention(folder, catalogue, captures.removal, lambda text: notifier.log("info", text))
     recovery = Recovery(folder, catalogue, rows, notifier, orphans)
@@ -160,6 +173,7 @@ def build_services(
     bus: Bus,
     health: Health,
     zmq: Endpoints | None = None,
+    cluster: Cluster | None = None,
 ) -> Services:
     """The parts that the application uses, with the limits of the settings, now and after each reload."""
     captures, reconstructions, folder = data_store.captures, data_store.reconstructions, data_store.folder
@@ -189,6 +203,7 @@ def build_services(
         idempotency_keys=IdempotencyKeys(data_store.catalogue),
         event_clients=event_clients,
         zmq=zmq,
+        cluster=cluster,
     )
 
 

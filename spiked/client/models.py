@@ -1830,6 +1830,10 @@ class ReconstructionOut(BaseModel):
     part: Annotated[FrameRangeOut | None, Field(description="Frames that are localised; null: all.")]
     live: bool
     state: JobState
+    node: Annotated[
+        str,
+        Field(description="The machine that runs it or ran it last; empty: that of the service."),
+    ]
     stage: Stage
     progress: Annotated[float, Field(description="0 to 1.")]
     tracking_state: State

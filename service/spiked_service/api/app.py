@@ -16,6 +16,7 @@ from spiked_service.api.openapi import describe
 from spiked_service.api.paths import register_path_kinds
 from spiked_service.api.problems import install
 from spiked_service.api.reports import Reports
+from spiked_service.api.routes.attempts import attempt_routes
 from spiked_service.api.routes.captures import capture_routes
 from spiked_service.api.routes.cleaning import cleaning_routes
 from spiked_service.api.routes.configuration import configuration_routes
@@ -90,6 +91,7 @@ def _api(services: Services) -> APIRouter:
     api.include_router(cleaning_routes(reconstructions.rows, results, once))
     api.include_router(scale_routes(reconstructions.rows, results, captures, once))
     api.include_router(reconstruction_record_routes(reconstructions.rows, once))
+    api.include_router(attempt_routes(services.cluster))
     api.include_router(doctor_routes(folder.path, captures))
     api.include_router(option_routes())
     api.include_router(upload_routes(services.uploads, captures, services.sources, profiles, once))

@@ -16,6 +16,7 @@ from spiked_service.api.paths import allowed_methods
 from spiked_service.base.errors import BusyError
 from spiked_service.base.limits import OverloadedError
 from spiked_service.captures.uploads import UploadBusyError, UploadError, UploadOffsetError, UploadTooLargeError
+from spiked_service.cluster.remote_worker import FencedError
 from spiked_service.results.frame_images import FrameNotRecordedError
 from spiked_service.results.rate_statistics import NotInImageError
 from spiked_service.store.catalogue import StoreError, UnknownIdError
@@ -90,6 +91,7 @@ _STATUS: dict[type[SpikedError], HTTPStatus] = {
     NoPoseError: HTTPStatus.NOT_FOUND,
     NothingError: HTTPStatus.NOT_FOUND,
     GoneError: HTTPStatus.NOT_FOUND,
+    FencedError: HTTPStatus.GONE,
     FrameNotRecordedError: HTTPStatus.NOT_FOUND,
     NotInImageError: HTTPStatus.NOT_FOUND,
     ForbiddenError: HTTPStatus.FORBIDDEN,
@@ -125,6 +127,7 @@ _WHAT_TO_DO: dict[int, str] = {
     404: "list the ids with GET",
     405: "use a method of the Allow header",
     408: "send the request again, without long pauses in its body",
+    410: "end: another attempt has begun, or the job has ended",
     409: "read the state with GET, and repeat the request when the state allows it",
     411: "send Content-Length",
     413: "send a smaller body; upload recordings in chunks",

@@ -11,6 +11,7 @@ from spiked_service.base.health import Health
 from spiked_service.base.limits import ConcurrencyLimit
 from spiked_service.captures.captures import Captures
 from spiked_service.captures.uploads import Uploads
+from spiked_service.cluster.cluster import Cluster
 from spiked_service.events.bus import Bus
 from spiked_service.operations.metrics import Metrics
 from spiked_service.reconstructions.queue import Reconstructions
@@ -42,3 +43,5 @@ class Services:
     """Limits concurrent clients of the events."""
     zmq: Endpoints | None
     """None if ZeroMQ is turned off."""
+    cluster: Cluster | None = None
+    """Runs jobs on other machines; None if they run here."""

@@ -79,9 +79,9 @@ class Report(BaseModel):
     """What has happened since the last report, maybe nothing."""
 
     agent: Annotated[str, Field(min_length=1, max_length=64)]
-    first: Annotated[int, Field(ge=0, le=1 << 53)]
-    """Number of the first of the events. Those that were reported before are skipped."""
-    events: list[WorkerEvent]
+    sequence: Annotated[int, Field(ge=0, le=1 << 53)] = 0
+    """Counts the reports with events, from 1: one that was sent again is skipped."""
+    events: list[WorkerEvent] = []
     files: list[StoredFile] | None = None
     """All files of the job's folder, where a version among the events needs them; their content is stored."""
 
@@ -99,8 +99,8 @@ class Manifest(BaseModel):
     node: str
     trouble: str | None
     """Why the worker failed, as a sentence; None after success."""
-    first: int
-    """Number of the first of the events."""
+    reports: int
+    """Number of the last report with events. One that has not arrived is made good for by these events:"""
     events: list[WorkerEvent]
-    """The events that the outcome depends on: versions, errors and the last status."""
+    """Those that the outcome depends on: versions, errors and the last status."""
     files: list[StoredFile]

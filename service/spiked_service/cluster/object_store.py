@@ -118,7 +118,7 @@ class ObjectStore:
         return f"{self._root.rstrip('/')}/{name}"
 
     def _make_parent(self, name: str) -> None:
-        if self.local:
+        if "file" in self._protocols():
             Path(self._at(name)).parent.mkdir(parents=True, exist_ok=True)
 
     def _size(self, name: str) -> int | None:

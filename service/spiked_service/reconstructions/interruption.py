@@ -23,9 +23,14 @@ def requeue_interrupted(rows: ReconstructionRepository, adopted: bool) -> None:
                 f"failed after {row.attempts} attempts, the last of which was interrupted by the end of the service"
             )
             rows.drop_checkpoint(row.id)
-            rows.save(replace(row, state=JobState.FAILED, reason=reason, ended_at=datetime.now(UTC), attempt=""))
+            rows.save(failed(row, reason))
             continue
         rows.save(queued_again(row, f"{_next_start(row, rows)}, because the service ended while it ran"))
+
+
+def failed(row: ReconstructionRow, reason: str) -> ReconstructionRow:
+    """The row of a job that fails now."""
+    return replace(row, state=JobState.FAILED, reason=reason, ended_at=datetime.now(UTC), eta_s=None, attempt="")
 
 
 def after_crash(
@@ -39,7 +44,7 @@ def after_crash(
         return queued_again(row, f"{trouble}; {_next_start(row, rows)} (attempt {row.attempts + 1})")
     rows.drop_checkpoint(row.id)
     tried = f", the last of {row.attempts} attempts" if row.attempts > 1 else ""
-    return replace(row, state=JobState.FAILED, reason=f"{trouble}{tried}")
+    return failed(row, f"{trouble}{tried}")
 
 
 def _next_start(row: ReconstructionRow, rows: ReconstructionRepository) -> str:

@@ -11,7 +11,7 @@ from spiked_service.base.ids import new_id
 from spiked_service.reconstructions.admission import check
 from spiked_service.reconstructions.executor import Executor, LocalExecutor
 from spiked_service.reconstructions.given import Given
-from spiked_service.reconstructions.interruption import after_crash, requeue_interrupted
+from spiked_service.reconstructions.interruption import after_crash, failed, requeue_interrupted
 from spiked_service.reconstructions.job_commands import command_of, live_command, live_row
 from spiked_service.reconstructions.job_runner import JobRunner, begun_anew
 from spiked_service.reconstructions.notifier import Notifier
@@ -53,8 +53,7 @@ class Reconstructions:
         executor: Executor | None = None,
     ) -> None:
         """`executor` runs the jobs of the queue; live ones run on this machine, where their ring is."""
-        self._local = LocalExecutor()
-        self._executor = executor or self._local
+        self._executor = executor or LocalExecutor()
         self._folder = folder
         self._catalogue = catalogue
         self._notifier = notifier
@@ -257,12 +256,10 @@ class Reconstructions:
             if not self.policy.due(row.id):
                 continue
             capture = self._catalogue.captures.find(row.capture_id)
-            ready = not row.task.reads_recording or (
-                capture is not None and capture.recording is not None and capture.recording.frames > 0
-            )
+            recorded = capture is not None and capture.recording is not None and capture.recording.frames > 0
+            ready = recorded or not row.task.reads_recording
             if capture is None or (capture.state.over and not ready):
-                why = row.reason or "the capture has no recording"
-                self.rows.save(replace(row, state=JobState.FAILED, reason=why, ended_at=datetime.now(UTC)))
+                self.rows.save(failed(row, row.reason or "the capture has no recording"))
             elif ready:
                 self._begin_queued(row, capture)
 
@@ -283,34 +280,35 @@ class Reconstructions:
         standby: StandbyWorker | None = None,
         on_end: Callable[[ReconstructionRow], None] | None = None,
     ) -> None:
-        job = self._runner(row, self._local if row.live else self._executor, on_end)
+        job = self._runner(row, LocalExecutor() if row.live else self._executor, on_end)
         try:
             job.start(command, standby)
         except OSError as error:
             del self._jobs[row.id]
-            reason = f"its worker cannot be started: {error.strerror}"
-            self.rows.save(replace(row, state=JobState.FAILED, reason=reason, ended_at=datetime.now(UTC)))
+            self.rows.save(failed(row, f"its worker cannot be started: {error.strerror}"))
             raise
 
     def _adopt(self, row: ReconstructionRow) -> None:
         """Follow a job that runs elsewhere since before the service was started."""
         capture = self._catalogue.captures.find(row.capture_id)
         if capture is None:
-            reason = "its capture has been removed"
-            self.rows.save(
-                replace(row, state=JobState.CANCELLED, reason=reason, ended_at=datetime.now(UTC), attempt="")
-            )
+            self.rows.save(failed(row, "its capture has been removed"))
         else:
             self._runner(row, self._executor).adopt(command_of(row, capture, self._folder, 0))
 
     def _runner(
         self, row: ReconstructionRow, executor: Executor, on_end: Callable[[ReconstructionRow], None] | None = None
     ) -> JobRunner:
-        def ended(job: JobRunner, trouble: str | None) -> None:
-            self._ended(job, trouble, on_end)
-
-        self._jobs[row.id] = JobRunner(row, executor, self.rows, self._notifier, self._must_yield, ended)
-        return self._jobs[row.id]
+        job = JobRunner(
+            row,
+            executor,
+            self.rows,
+            self._notifier,
+            self._must_yield,
+            lambda job, trouble: self._ended(job, trouble, on_end),
+        )
+        self._jobs[row.id] = job
+        return job
 
     def _must_yield(self, row: ReconstructionRow) -> bool:
         """Whether a job that begins to refine must return to the queue, from which it restarts with its recording."""

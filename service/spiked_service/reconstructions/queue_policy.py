@@ -9,6 +9,9 @@ from spiked_service.workers.backoff import Backoff
 _DELAYS_S = (1.0, 5.0)
 """Delays before the retries of a reconstruction whose worker died; after the last retry it has failed."""
 
+REMOTE_DELAYS_S = (1.0, 5.0, 15.0, 30.0, 60.0)
+"""The same for other machines, which are switched off and taken away more often than workers die here."""
+
 
 class QueuePolicy:
     """Decides which reconstructions run. Not thread-safe; `limit` may be changed at any time.

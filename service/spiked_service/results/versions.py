@@ -25,7 +25,8 @@ _NEWEST = 3
 """Newest versions, always kept, so that the files exist for readers that have just read the index."""
 _EARLIER = 16
 """Earlier versions kept, spread over time; at twice as many, every second one is removed."""
-_INDEX = "published.json"
+INDEX = "published.json"
+"""File that lists the versions, replaced after their files are written."""
 
 
 class _Index(BaseModel):
@@ -195,7 +196,7 @@ class Publisher:
         kept = _thinned([*self._versions, published], self._protected)
         without_slots = [one.model_copy(update={"slots": None}) for one in kept[:-_NEWEST]]
         kept = without_slots + kept[-_NEWEST:]
-        write_atomically(self._folder / _INDEX, _Index(versions=kept).model_dump_json().encode())
+        write_atomically(self._folder / INDEX, _Index(versions=kept).model_dump_json().encode())
         earlier, self._versions = self._versions, kept
         gone = {one.version: one for one in earlier}.keys() - {one.version for one in kept}
         slots = {one.slots for one in kept}
@@ -248,7 +249,7 @@ def _thinned(published: list[Published], held: set[int]) -> list[Published]:
 def versions(folder: Path) -> list[Published]:
     """The versions in a folder, oldest first."""
     try:
-        return _Index.model_validate_json((folder / _INDEX).read_bytes()).versions
+        return _Index.model_validate_json((folder / INDEX).read_bytes()).versions
     except FileNotFoundError:
         return []
 

@@ -27,9 +27,16 @@ from spiked.errors import ConfigurationError
 
 _PREFIX = "SPIKED_"
 NOT_SETTINGS = frozenset(
-    {"SPIKED_CONFIG", "SPIKED_CLIENT_TOKEN", "SPIKED_ADDRESS", "SPIKED_SPLAT_TRANSFORM", "SPIKED_FUZZ_SECONDS"}
+    {
+        "SPIKED_CONFIG",
+        "SPIKED_CLIENT_TOKEN",
+        "SPIKED_ADDRESS",
+        "SPIKED_SPLAT_TRANSFORM",
+        "SPIKED_FUZZ_SECONDS",
+        "SPIKED_SCRATCH",
+    }
 )
-"""Environment variables with our prefix that say something else: to examples, the page's build, and tests."""
+"""Environment variables with our prefix that say something else: to examples, agents, the page's build, and tests."""
 _PASSED_ON: set[str] = set()
 """Switches that `pass_on` has put into the environment of this process: they were not set in it."""
 _SWITCHES = ("render", "simd")
@@ -65,6 +72,16 @@ class Renderer(StrEnum):
 
     CPU = "cpu"
     CUDA = "cuda"
+
+
+class JobEngine(StrEnum):
+    """What starts jobs."""
+
+    LOCAL = "local"
+    """This machine."""
+    RAY = "ray"
+    SUBMITIT = "submitit"
+    """Slurm, or processes of this machine."""
 
 
 class InstructionSet(StrEnum):
@@ -106,6 +123,15 @@ def _addresses(values: list[str]) -> list[str]:
         parts = urlsplit(value)
         if parts.scheme not in ("http", "https") or not parts.hostname or not _has_port(parts):
             raise ValueError(f"{value!r} is no address: write http://HOST/PATH or https://HOST/PATH")
+    return values
+
+
+def _pairs(values: list[str]) -> list[str]:
+    """Texts NAME=VALUE. Raises ValueError for anything else."""
+    for value in values:
+        name, sign, _ = value.partition("=")
+        if not sign or not name.isidentifier():
+            raise ValueError(f"{value!r} is no pair: write NAME=VALUE")
     return values
 
 
@@ -190,9 +216,31 @@ class Settings(BaseSettings):
     reconstruction_workers: int = Field(
         1,
         ge=1,
-        le=64,
+        le=1000,
         description="Reconstructions at a time; live ones count, but never wait.",
         json_schema_extra=_LIVE,
+    )
+    executor: JobEngine = Field(
+        JobEngine.LOCAL, description="What runs queued reconstructions: local, ray, or submitit for Slurm."
+    )
+    executor_address: str | None = Field(
+        None, description="Ray's head, HOST:PORT or ray://HOST:PORT; for submitit slurm or local; found if not set."
+    )
+    executor_store: str | None = Field(
+        None,
+        description="Where other machines find and leave files: a shared folder file:///PATH, or s3://BUCKET/PREFIX; "
+        "the folder cluster of `data` if not set.",
+    )
+    executor_url: str | None = Field(
+        None, description="Address at which other machines reach this service; its own if not set."
+    )
+    executor_cpus: int = Field(1, ge=1, le=1024, description="Cores of a job on other machines.")
+    executor_gpus: float = Field(0, ge=0, le=64, description="GPUs of a job on other machines.")
+    executor_lease_s: float = Field(
+        60.0, ge=2, le=86_400, description="Silence of another machine after which its job begins again."
+    )
+    executor_options: Annotated[Words, AfterValidator(_pairs)] = Field(
+        [], description="NAME=VALUE for submitit, such as slurm_partition=gpu."
     )
     retention_days: float | None = Field(
         None,

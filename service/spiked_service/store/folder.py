@@ -12,6 +12,10 @@ from spiked.recon.checkpoint_file import CHECKPOINT
 from spiked_service.base.ids import is_id
 
 _LOCK = "lock"
+CAPTURE_ROW = "capture.json"
+"""Name of the copy of a capture's row in its folder."""
+RECONSTRUCTION_ROW = "reconstruction.json"
+"""Name of the copy of a reconstruction's row in its folder."""
 UPLOAD_SUFFIXES = ".part", ".json", ".dat", ".npz"
 """Files of an upload: its bytes, sidecar, recording if it is converted, and calibration."""
 
@@ -85,7 +89,7 @@ class DataFolder:
 
     def capture_row(self, capture_id: str) -> Path:
         """Copy of the catalogue's row of a capture."""
-        return self.capture(capture_id) / "capture.json"
+        return self.capture(capture_id) / CAPTURE_ROW
 
     def reconstruction(self, reconstruction_id: str) -> Path:
         """Folder of a reconstruction: its versions, timeline and log."""
@@ -93,7 +97,7 @@ class DataFolder:
 
     def reconstruction_row(self, reconstruction_id: str) -> Path:
         """Copy of the catalogue's row of a reconstruction."""
-        return self.reconstruction(reconstruction_id) / "reconstruction.json"
+        return self.reconstruction(reconstruction_id) / RECONSTRUCTION_ROW
 
     def checkpoint(self, reconstruction_id: str) -> Path:
         """Folder of the checkpoint of a reconstruction that has not ended; it may not exist."""

@@ -142,7 +142,7 @@ class WorkerProcess:
     def _take(self, line: bytes) -> None:
         event = worker_events.validate_json(line)
         if isinstance(event, Logged):
-            _relay(event)
+            relay(event)
         else:
             self._on_event(event)
 
@@ -171,7 +171,7 @@ def _wait_or_kill(process: subprocess.Popen[bytes], timeout_s: float) -> None:
         process.wait()
 
 
-def _relay(line: Logged) -> None:
+def relay(line: Logged) -> None:
     """Log a worker's line in this process."""
     level = logging.getLevelNamesMapping().get(line.level.upper(), logging.WARNING)
     logger(line.logger, **line.known).log(level, line.event)

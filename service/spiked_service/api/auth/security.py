@@ -29,6 +29,8 @@ COOKIE = "spiked_token"
 _OPEN = frozenset({"/healthz", "/readyz"})
 """Health checks, which need no token and reveal nothing about captures."""
 _EVENTS = "/api/v1/events"
+_ATTEMPTS = "/api/v1/attempts/"
+"""Requests of agents, which bring the token of an attempt; the routes check it."""
 _POLICY_VIOLATION = 1008
 """Close code for a client without the scope that it needs (RFC 6455, 7.4.1)."""
 _log = logger("spiked.security")
@@ -102,6 +104,10 @@ class Security:
         refusal = self._refusal(request)
         if refusal is not None:
             await _refuse(refusal, scope, receive, _with_headers(send))
+            return
+        if request.path.startswith(_ATTEMPTS):
+            scope.setdefault("state", {})["caller"] = Caller(request.address, "agent", TokenScope.OPERATE)
+            await self._app(scope, self._limited(request, receive), _with_headers(send))
             return
         given = request.token()
         try:

@@ -165,6 +165,7 @@ class ReconstructionOut(Out):
     part: FrameRangeOut | None = Field(description="Frames that are localised; null: all.")
     live: bool
     state: JobState
+    node: str = Field(description="The machine that runs it or ran it last; empty: that of the service.")
     stage: Stage
     progress: float = Field(description="0 to 1.")
     tracking_state: State

@@ -133,6 +133,7 @@ function Row({
         {name} {job.name !== "" && <b>{job.name}</b>} {when(job.created_at)}{" "}
         {job.live && <span className="dim">live</span>}
         {job.task !== "reconstruct" && <span className="dim">{TASKS[job.task]}</span>}
+        {job.node !== "" && <span className="dim">on {job.node}</span>}
         {job.notes !== "" && (
           <span className="dim notes" title={job.notes}>
             {job.notes}

@@ -25,6 +25,7 @@ export function Progress({ job }: { job: Reconstruction | null }): JSX.Element {
     <Panel title="Reconstruction" aside={<JobBadge job={job} />}>
       <dl className="stats">
         <Stat name="Stage">{job.stage}</Stat>
+        {job.node !== "" && <Stat name="Machine">{job.node}</Stat>}
         <Stat name="Poses">{count(job.poses)}</Stat>
         <Stat name="Splats">{count(job.splats)}</Stat>
         <Stat name="PSNR" hint="Of the training views">

@@ -3812,6 +3812,11 @@ export interface components {
             /** Live */
             live: boolean;
             state: components["schemas"]["JobState"];
+            /**
+             * Node
+             * @description The machine that runs it or ran it last; empty: that of the service.
+             */
+            node: string;
             stage: components["schemas"]["Stage"];
             /**
              * Progress

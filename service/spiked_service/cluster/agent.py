@@ -1,0 +1,154 @@
+"""Works for one attempt on the machine that an engine has chosen: fetches files, runs the worker, stores results.
+
+The worker is the same process as on the machine of the service.
+"""
+
+import os
+import secrets
+import shutil
+import socket
+import threading
+from pathlib import Path
+
+from spiked.errors import SpikedError
+from spiked_service.cluster.agent_reports import AgentReports, RefusedError, ServiceClient
+from spiked_service.cluster.job_files import INPUTS, LOG, MANIFEST, OUTPUTS, files_in, moved
+from spiked_service.cluster.messages import AttemptWork, Begin, Manifest, Order, StoredFile
+from spiked_service.cluster.object_store import ObjectStore, stored_file
+from spiked_service.cluster.scratch import scratch_folder
+from spiked_service.results.versions import INDEX
+from spiked_service.workers.messages import JobCommand, VersionPublished, WorkerEvent
+from spiked_service.workers.process import WorkerProcess
+
+_LOOK_S = 0.1
+"""Interval at which the orders of the service are looked at."""
+
+
+def run_agent(url: str, attempt: str, token: str) -> None:
+    """Work for an attempt to its end. Returns early if the attempt is over.
+
+    Raises SpikedError and OSError if its results cannot be stored: the service then begins another attempt.
+    """
+    service, agent = ServiceClient(url, attempt, token), secrets.token_hex(8)
+    try:
+        work = service.begin(Begin(agent=agent, node=socket.gethostname()))
+        with scratch_folder() as folder, AgentReports(service, agent, work) as reports:
+            _Attempt(attempt, work, reports, folder).run()
+    except RefusedError as error:
+        print(f"attempt {attempt}: {error}", flush=True)
+    finally:
+        service.close()
+
+
+class _Attempt:
+    """An attempt with its worker, in a folder of its own."""
+
+    def __init__(self, attempt: str, work: AttemptWork, reports: AgentReports, folder: Path) -> None:
+        self._attempt = attempt
+        self._work = work
+        self._reports = reports
+        self._folder = folder
+        self._job = folder / "job"
+        self._store = ObjectStore(work.store)
+        self._stored: set[str] = set()
+        """Hashes of what is stored."""
+        self._trouble: str | None = None
+        self._exited = threading.Event()
+
+    def run(self) -> None:
+        """Raises RefusedError once the attempt is over for the service, ObjectStoreError and OSError."""
+        command = self._fetch()
+        if command is not None:
+            self._run_worker(command)
+        self._reports.check()
+        manifest = Manifest(
+            attempt=self._attempt,
+            node=socket.gethostname(),
+            trouble=self._trouble,
+            files=self._store_files(),
+            reports=self._reports.flush(),
+            events=self._reports.kept,
+        )
+        self._store.put(f"{self._attempt}/{MANIFEST}", manifest.model_dump_json().encode())
+        self._reports.end()
+
+    def _fetch(self) -> JobCommand | None:
+        """Fetch the inputs. Return the command for the worker, None if they cannot be had."""
+        inputs, command = self._work.inputs, self._work.command
+        assert isinstance(command, JobCommand)
+        recording = self._folder / "recording"
+        self._job.mkdir()
+        try:
+            for place, files in ((self._job, inputs.folder), (recording, inputs.recording)):
+                for stored in files:
+                    self._store.fetch(f"{INPUTS}/{stored.sha256}", place / stored.name, stored)
+        except (SpikedError, OSError) as error:
+            self._trouble = f"its files cannot be fetched on {socket.gethostname()}: {error}"
+            return None
+        return moved(command, self._job, None if inputs.in_place else recording)
+
+    def _run_worker(self, command: JobCommand) -> None:
+        worker = WorkerProcess(command, self._job / LOG, self._take, self._worker_ended)
+        told = Order.GO_ON
+        try:
+            while not self._exited.wait(_LOOK_S):
+                if self._reports.lost or self._reports.order is Order.LEAVE:
+                    return
+                if self._reports.order is not told:
+                    told = self._reports.order
+                    worker.stop()
+        finally:
+            worker.dismiss()
+            worker.kill_after(self._work.grace_s)
+
+    def _worker_ended(self, trouble: str | None) -> None:
+        self._trouble = trouble
+        self._exited.set()
+
+    def _take(self, event: WorkerEvent) -> None:
+        """An event of the worker, on its thread: the files of a version are stored before it is reported."""
+        self._reports.add(event, self._store_files() if isinstance(event, VersionPublished) else None)
+
+    def _store_files(self) -> list[StoredFile]:
+        """Store what has changed in the folder of the job. Return all of it."""
+        snapshot = self._folder / "snapshot"
+        found = []
+        try:
+            _link(self._job, snapshot)
+            for path in [*files_in(snapshot), *(one for one in [snapshot / LOG] if one.exists())]:
+                stored = stored_file(path, path.relative_to(snapshot).as_posix())
+                if stored.sha256 not in self._stored:
+                    self._store.put_file(path, f"{self._attempt}/{OUTPUTS}/{stored.sha256}", stored)
+                    self._stored.add(stored.sha256)
+                found.append(stored)
+        finally:
+            shutil.rmtree(snapshot, ignore_errors=True)
+        return found
+
+
+def _link(folder: Path, snapshot: Path) -> None:
+    """Give the files of a folder that its worker still writes a second name, as they are at one moment.
+
+    Files of a version never change and may be removed; the others are small and copied. The index is replaced after the
+    files that it names are there, so that what it names is found if it is still the same afterwards.
+    """
+    while True:
+        shutil.rmtree(snapshot, ignore_errors=True)
+        before = _content(folder / INDEX)
+        try:
+            for path in [*files_in(folder), *(one for one in [folder / LOG] if one.exists())]:
+                target = snapshot / path.relative_to(folder)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                if path.name.startswith(("scene-", "trajectory-", "path-")):
+                    os.link(path, target)
+                else:
+                    shutil.copyfile(path, target)
+        except FileNotFoundError:
+            continue  # a version was removed meanwhile, because there is a newer one
+        if _content(folder / INDEX) == before:
+            snapshot.mkdir(exist_ok=True)
+            return
+
+
+def _content(path: Path) -> bytes:
+    return path.read_bytes() if path.exists() else b""

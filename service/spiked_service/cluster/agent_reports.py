@@ -1,0 +1,173 @@
+"""What an agent tells the service: events and signs of life, on a thread that also keeps the lease."""
+
+import threading
+import time
+from contextlib import suppress
+from types import TracebackType
+
+import httpx
+
+from spiked.errors import SpikedError
+from spiked_service.cluster.messages import (
+    AttemptWork,
+    Begin,
+    Order,
+    Report,
+    ReportAnswer,
+    StoredFile,
+)
+from spiked_service.workers.messages import Logged, PoseEstimated, ReconstructionStatus, WorkerEvent
+
+_BEGIN_S = 60.0
+"""How long an agent tries to reach the service before it has a lease."""
+_PAUSE_S = 0.5
+"""Pause between two attempts to reach the service."""
+_ANSWER_S = 10.0
+"""Time for one answer."""
+_MOST_EVENTS = 500
+"""Events kept while the service does not answer; then only those that the outcome depends on are."""
+_REFUSED = (401, 403, 404, 409, 410, 422)
+"""Status codes after which it is no use to ask again."""
+
+
+class RefusedError(SpikedError):
+    """The attempt is over: another one has begun, the job has ended, or the lease has expired."""
+
+
+class UnansweredError(RefusedError):
+    """The service has not answered within the lease."""
+
+
+class ServiceClient:
+    """The routes of an attempt."""
+
+    def __init__(self, url: str, attempt: str, token: str) -> None:
+        self._http = httpx.Client(
+            base_url=url.rstrip("/"), headers={"Authorization": f"Bearer {token}"}, timeout=_ANSWER_S
+        )
+        self._path = f"/api/v1/attempts/{attempt}"
+
+    def begin(self, asked: Begin) -> AttemptWork:
+        """Take the attempt. Raises RefusedError."""
+        return AttemptWork.model_validate_json(
+            self.post(":begin", asked.model_dump_json(), time.monotonic() + _BEGIN_S)
+        )
+
+    def post(self, route: str, body: str, until_s: float) -> bytes:
+        """Post, again until the time `until_s` of the monotonic clock. Raises RefusedError, UnansweredError."""
+        why = "it was not asked in time"
+        while True:
+            try:
+                answer = self._http.post(self._path + route, content=body, headers={"Content-Type": "application/json"})
+                if answer.is_success:
+                    return answer.content
+                if answer.status_code in _REFUSED:
+                    raise RefusedError(f"the service refuses it: {answer.text}")
+                why = f"it answers {answer.status_code}"
+            except httpx.HTTPError as error:
+                why = str(error) or type(error).__name__
+            if time.monotonic() > until_s:
+                raise UnansweredError(f"the service has not answered within the lease: {why}")
+            time.sleep(_PAUSE_S)
+
+    def close(self) -> None:
+        """Close its connections."""
+        self._http.close()
+
+
+class AgentReports:
+    """Reports events in order and renews the lease. A context manager; `add` and `order` are for any thread."""
+
+    def __init__(self, service: ServiceClient, agent: str, work: AttemptWork) -> None:
+        self._service = service
+        self._agent = agent
+        self._work = work
+        self._lock = threading.Lock()
+        self._sending = threading.Lock()
+        self._events: list[WorkerEvent] = []
+        self._files: list[StoredFile] | None = None
+        self._unsent: Report | None = None
+        self._sequence = 0
+        self._renewed_s = time.monotonic()
+        self._over = threading.Event()
+        self._refused: RefusedError | None = None
+        self.kept: list[WorkerEvent] = []
+        """Events that the outcome depends on."""
+        self.order = Order.GO_ON
+        """What the service wants."""
+        self._thread = threading.Thread(target=self._run, name="reports", daemon=True)
+
+    def __enter__(self) -> "AgentReports":
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._thread.join()
+
+    @property
+    def lost(self) -> bool:
+        """Whether the attempt is over for the service."""
+        return self._refused is not None
+
+    def check(self) -> None:
+        """Raises RefusedError if the attempt is over for the service."""
+        if self._refused is not None:
+            raise self._refused
+
+    def add(self, event: WorkerEvent, files: list[StoredFile] | None) -> None:
+        """Report an event soon, with all files of the job if they have changed."""
+        with self._lock:
+            self._files = files or self._files
+            if len(self._events) >= _MOST_EVENTS:
+                self._events = [one for one in self._events if not isinstance(one, PoseEstimated | Logged)]
+                self._events = _without_old_status(self._events)
+            self._events.append(event)
+            if not isinstance(event, PoseEstimated | Logged):
+                self.kept = _without_old_status([*self.kept, event])
+
+    def flush(self) -> int:
+        """Report what there is, if the service answers. Return the number of the last report. Raises RefusedError."""
+        with suppress(UnansweredError):
+            self._send()
+        return self._sequence
+
+    def end(self) -> None:
+        """The manifest is stored; a service that does not answer finds it later. Raises RefusedError."""
+        with suppress(UnansweredError):
+            self._post(":end", Report(agent=self._agent))
+
+    def _run(self) -> None:
+        while not self._over.wait(self._work.report_s):
+            try:
+                self._send()
+            except RefusedError as error:
+                self._refused = error
+                return
+
+    def _send(self) -> None:
+        with self._sending:
+            with self._lock:
+                if self._unsent is None and self._events:
+                    self._sequence += 1
+                    self._unsent = Report(
+                        agent=self._agent, sequence=self._sequence, events=self._events, files=self._files
+                    )
+                    self._events, self._files = [], None
+                told = self._unsent or Report(agent=self._agent)
+            self.order = ReportAnswer.model_validate_json(self._post(":report", told)).order
+            self._unsent = None
+
+    def _post(self, route: str, told: Report) -> bytes:
+        sent_s = time.monotonic()
+        answer = self._service.post(route, told.model_dump_json(), self._renewed_s + self._work.lease_s)
+        self._renewed_s = sent_s
+        return answer
+
+
+def _without_old_status(events: list[WorkerEvent]) -> list[WorkerEvent]:
+    """Events without the status messages that a later one replaces; the last one stays in its place."""
+    last = next((one for one in reversed(events) if isinstance(one, ReconstructionStatus)), None)
+    return [one for one in events if not isinstance(one, ReconstructionStatus) or one is last]

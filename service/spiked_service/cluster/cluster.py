@@ -1,0 +1,120 @@
+"""The executor of jobs on other machines: attempts by id, their tokens, their engine."""
+
+import hashlib
+import hmac
+import secrets
+from pathlib import Path
+from threading import Lock
+
+from spiked.errors import ConfigurationError
+from spiked_service.base.ids import new_id
+from spiked_service.cluster.engine import Engine, EngineOptions
+from spiked_service.cluster.object_store import ObjectStore
+from spiked_service.cluster.remote_worker import FencedError, RemoteWorker, Terms
+from spiked_service.reconstructions.executor import OnEvent, OnExit, Worker
+from spiked_service.store.rows import ReconstructionRow
+from spiked_service.workers.messages import JobCommand
+from spiked_service.workers.process import StandbyWorker
+
+_KEY = "attempts.key"
+"""File with the key that tokens are made with."""
+
+
+class Cluster:
+    """Runs jobs by an engine on other machines. Thread-safe.
+
+    An attempt has a token, made of its id and a key of the data folder: whoever brings it works for that attempt and
+    nothing else. Once the job has another attempt or has ended, the token is refused, which fences off the old one.
+    """
+
+    def __init__(self, folder: Path, store: str, engine: EngineOptions, terms: Terms) -> None:
+        """`folder` is for its key and its log. Raises ConfigurationError for a store that cannot be used."""
+        self._store = ObjectStore(store)
+        self._terms = terms
+        self._key = _key(folder / _KEY)
+        self._engine = Engine(engine, folder / "engine.log", self._engine_ended)
+        self._attempts: dict[str, RemoteWorker] = {}
+        self._lock = Lock()
+        self.url = ""
+        """Address at which agents reach the service."""
+
+    def attempt(self) -> str:
+        """A new id for the next start of a job."""
+        return new_id()
+
+    def start(
+        self,
+        row: ReconstructionRow,
+        command: JobCommand,
+        on_event: OnEvent,
+        on_exit: OnExit,
+        standby: StandbyWorker | None,
+    ) -> Worker:
+        """Stage the files of a job and submit its attempt."""
+        return self._worker(row, command, on_event, on_exit, adopted=False)
+
+    def adopt(self, row: ReconstructionRow, command: JobCommand, on_event: OnEvent, on_exit: OnExit) -> Worker:
+        """Wait for the agent of an attempt that was submitted before; it has a lease from now."""
+        return self._worker(row, command, on_event, on_exit, adopted=True)
+
+    def worker(self, attempt: str, token: str) -> RemoteWorker:
+        """The living attempt that this is the token of. Raises FencedError."""
+        with self._lock:
+            worker = self._attempts.get(attempt)
+        if worker is None or not hmac.compare_digest(self.token(attempt).encode(), token.encode()):
+            raise FencedError("this attempt is over, or the token is not its own")
+        return worker
+
+    def token(self, attempt: str) -> str:
+        """The token of an attempt."""
+        return hmac.new(self._key, attempt.encode(), hashlib.sha256).hexdigest()
+
+    def close(self) -> None:
+        """End the process of the engine; what it has started goes on."""
+        self._engine.close()
+
+    def _worker(
+        self, row: ReconstructionRow, command: JobCommand, on_event: OnEvent, on_exit: OnExit, adopted: bool
+    ) -> RemoteWorker:
+        def submit() -> None:
+            self._engine.submit(row.attempt, [self.url, row.attempt, self.token(row.attempt)])
+
+        def withdraw(after_s: float) -> None:
+            with self._lock:
+                self._attempts.pop(row.attempt, None)
+            self._engine.cancel(row.attempt, after_s)
+
+        with self._lock:
+            worker = RemoteWorker(
+                row.attempt,
+                command,
+                self._store.below(row.id),
+                self._terms,
+                None if adopted else submit,
+                withdraw,
+                on_event,
+                on_exit,
+            )
+            self._attempts[row.attempt] = worker
+        return worker
+
+    def _engine_ended(self, attempt: str, reason: str) -> None:
+        with self._lock:
+            worker = self._attempts.get(attempt)
+        if worker is not None:
+            worker.engine_ended(reason)
+
+
+def _key(path: Path) -> bytes:
+    """The key of the tokens, made at the first start. Raises ConfigurationError."""
+    try:
+        if not path.exists():
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            path.touch(0o600)
+            path.write_bytes(secrets.token_bytes(32))
+        key = path.read_bytes()
+    except OSError as error:
+        raise ConfigurationError(f"{path} cannot be used: {error.strerror}") from error
+    if len(key) != 32:
+        raise ConfigurationError(f"{path} is damaged: remove it; attempts that run now begin again")
+    return key

@@ -1,0 +1,69 @@
+"""Agents as Ray actors: detached ones, which outlive the engine and end with their attempt."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+import ray
+
+from spiked_service.cluster.agent import run_agent
+from spiked_service.cluster.engine import EngineOptions
+
+_NAMESPACE = "spiked"
+"""Of the names of the actors."""
+
+
+class _Agent:
+    """One attempt."""
+
+    def run(self, arguments: Sequence[str]) -> None:
+        """Work for the attempt to its end, then end this process."""
+        run_agent(*arguments)
+        exit_actor: Any = ray.actor.exit_actor
+        exit_actor()
+
+
+class RayTasks:
+    """Attempts by the names of their actors."""
+
+    def __init__(self, options: EngineOptions) -> None:
+        ray.init(
+            address=options.address or None,
+            namespace=_NAMESPACE,
+            log_to_driver=False,
+            include_dashboard=False,
+        )
+        self._options = options
+        self._running: dict[Any, str] = {}
+
+    def submit(self, attempt: str, arguments: Sequence[str]) -> None:
+        """Create the actor; Ray waits for the resources."""
+        resources = {"num_cpus": self._options.cpus, "num_gpus": self._options.gpus}
+        remote: Any = ray.remote(_Agent)
+        agent = remote.options(name=attempt, lifetime="detached", max_restarts=0, **resources)
+        self._running[agent.remote().run.remote(list(arguments))] = attempt
+
+    def cancel(self, attempt: str) -> None:
+        """Kill the actor, which takes the worker along."""
+        with suppress(ValueError):  # it has ended
+            ray.kill(ray.get_actor(attempt))
+
+    def ended(self) -> list[tuple[str, str]]:
+        """Attempts whose actors have ended, in whatever way."""
+        done, _ = (
+            ray.wait(list(self._running), num_returns=len(self._running), timeout=0) if self._running else ([], [])
+        )
+        found = []
+        for task in done:
+            reason = "the agent has ended without a result"
+            try:
+                ray.get(task)
+            except ray.exceptions.RayError as error:
+                reason = f"Ray has ended it: {type(error).__name__}"
+            found.append((self._running.pop(task), reason))
+        return found
+
+
+def tasks(options: EngineOptions) -> RayTasks:
+    """The tasks of a cluster."""
+    return RayTasks(options)

@@ -1,0 +1,53 @@
+"""Agents as jobs of Slurm, or as processes of this machine, by submitit."""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import submitit
+
+from spiked_service.cluster.agent import run_agent
+from spiked_service.cluster.engine import EngineOptions
+
+
+class SubmititTasks:
+    """Attempts by their jobs."""
+
+    def __init__(self, options: EngineOptions) -> None:
+        self._folder = Path(options.folder)
+        self._executor = submitit.AutoExecutor(folder=self._folder / "%j", cluster=options.address or None)
+        given: dict[str, Any] = {name: _number(value) for name, value in options.options.items()}
+        self._executor.update_parameters(
+            **{"name": "spiked", "timeout_min": 24 * 60, "cpus_per_task": options.cpus}
+            | ({"gpus_per_node": int(options.gpus)} if options.gpus else {})
+            | given
+        )
+        self._jobs: dict[str, Any] = {}
+
+    def submit(self, attempt: str, arguments: Sequence[str]) -> None:
+        """Submit the job; Slurm waits for the resources."""
+        self._jobs[attempt] = self._executor.submit(run_agent, *arguments)
+
+    def cancel(self, attempt: str) -> None:
+        """Cancel the job. One of an earlier engine has no job here: its agent is refused and exits."""
+        job = self._jobs.pop(attempt, None)
+        if job is not None:
+            if not job.done():
+                job.cancel()
+            shutil.rmtree(job.paths.folder, ignore_errors=True)
+
+    def ended(self) -> list[tuple[str, str]]:
+        """Attempts whose jobs have ended, in whatever way."""
+        over = [attempt for attempt, job in self._jobs.items() if job.done()]
+        return [(attempt, f"its job has ended: {self._jobs[attempt].state}") for attempt in over]
+
+
+def _number(value: str) -> int | str:
+    """Parameters such as `mem_gb` are numbers."""
+    return int(value) if value.isdigit() else value
+
+
+def tasks(options: EngineOptions) -> SubmititTasks:
+    """The tasks of a cluster."""
+    return SubmititTasks(options)

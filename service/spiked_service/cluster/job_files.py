@@ -1,0 +1,75 @@
+"""The files of a job: what an attempt begins with, and its command with the paths of another machine."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from spiked.recon.checkpoint_file import CHECKPOINT
+from spiked_service.cluster.messages import Inputs, StoredFile
+from spiked_service.cluster.object_store import ObjectStore, stored_file
+from spiked_service.store.folder import CAPTURE_ROW, RECONSTRUCTION_ROW
+from spiked_service.workers.messages import JobCommand, MergeCommand
+
+INPUTS = "inputs"
+"""Folder of the objects that attempts begin with."""
+OUTPUTS = "outputs"
+"""Folder of the objects that an attempt has made, below its own."""
+MANIFEST = "manifest.json"
+"""Written last below the folder of an attempt."""
+LOG = "log"
+"""The worker's log in the folder of a job."""
+_OF_THE_SERVICE = frozenset({CAPTURE_ROW, RECONSTRUCTION_ROW, "thumbnail.webp", LOG})
+"""Files of the service, which no worker reads."""
+
+
+def recording_of(command: JobCommand) -> Path | None:
+    """The recording that a job reads."""
+    return None if isinstance(command, MergeCommand) else command.recording
+
+
+def files_in(folder: Path) -> Iterator[Path]:
+    """Files of a job or a capture that belong to its results or its inputs: no checkpoint, nothing unfinished."""
+    for path in sorted(folder.rglob("*")):
+        parts = path.relative_to(folder).parts
+        hidden = any(part.startswith(".") for part in parts) or path.suffix == ".part"
+        if path.is_file() and not hidden and parts[0] != CHECKPOINT and parts[0] not in _OF_THE_SERVICE:
+            yield path
+
+
+def stage(command: JobCommand, store: ObjectStore) -> Inputs:
+    """Store what a job begins with, in the store of the job. Raises ObjectStoreError and OSError."""
+    recording = recording_of(command)
+    in_place = store.local or recording is None
+    return Inputs(
+        recording=[] if in_place or recording is None else _put(recording.parent, store),
+        folder=_put(command.folder, store),
+        in_place=in_place,
+    )
+
+
+def _put(folder: Path, store: ObjectStore) -> list[StoredFile]:
+    found = []
+    for path in files_in(folder):
+        stored = stored_file(path, path.relative_to(folder).as_posix())
+        store.put_file(path, f"{INPUTS}/{stored.sha256}", stored)
+        found.append(stored)
+    return found
+
+
+def moved(command: JobCommand, folder: Path, recording_folder: Path | None) -> JobCommand:
+    """The command with the folder of the job elsewhere, and that of the recording, too, unless it is None."""
+    places = [(command.folder, folder)]
+    recording = recording_of(command)
+    if recording is not None and recording_folder is not None:
+        places.append((recording.parent, recording_folder))
+
+    def place(value: object) -> object:
+        if isinstance(value, tuple):
+            return tuple(place(one) for one in value)
+        if isinstance(value, Path):
+            for old, new in places:
+                if value.is_relative_to(old):
+                    return new / value.relative_to(old)
+        return value
+
+    fields = {name: place(getattr(command, name)) for name in type(command).model_fields}
+    return command.model_copy(update=fields)

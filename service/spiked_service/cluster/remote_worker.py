@@ -1,0 +1,267 @@
+"""The service's end of an attempt on another machine: its lease, its events, its results."""
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
+from pydantic import ValidationError
+
+from spiked.errors import SpikedError
+from spiked_service.cluster.job_files import MANIFEST, OUTPUTS, files_in, stage
+from spiked_service.cluster.messages import (
+    AttemptWork,
+    Begin,
+    Inputs,
+    Manifest,
+    Order,
+    Report,
+    ReportAnswer,
+    StoredFile,
+)
+from spiked_service.cluster.object_store import ObjectStore
+from spiked_service.events.logging import logger
+from spiked_service.results.versions import INDEX
+from spiked_service.workers.messages import JobCommand, Logged, NodeFound, WorkerEvent
+from spiked_service.workers.process import relay
+
+_log = logger("spiked.cluster")
+_LOOK_S = 0.5
+"""Interval at which lease and orders are checked."""
+_OVERDUE = 1.5
+"""The service waits this many leases for an agent, so that its worker has ended before another attempt begins."""
+REPORT_S = 1.0
+"""Interval of an agent's reports, and at most a fifth of the lease."""
+
+
+class FencedError(SpikedError):
+    """The attempt is over, or another agent has it."""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What holds for every attempt."""
+
+    lease_s: float
+    grace_s: float = 10.0
+
+    @property
+    def report_s(self) -> float:
+        """Interval of reports."""
+        return min(REPORT_S, self.lease_s / 5)
+
+
+class RemoteWorker:
+    """An attempt at a job. Its thread stages the files, submits it, takes what agents report, and ends it.
+
+    `begin`, `report` and `end` are called for requests of the agent, on any thread.
+    """
+
+    pid = None
+
+    def __init__(
+        self,
+        attempt: str,
+        command: JobCommand,
+        store: ObjectStore,
+        terms: Terms,
+        submit: Callable[[], None] | None,
+        withdraw: Callable[[float], None],
+        on_event: Callable[[WorkerEvent], None],
+        on_exit: Callable[[str | None], None],
+    ) -> None:
+        """`store` is that of the job. `submit` gives the attempt to the engine; None for one that it has already.
+
+        `withdraw` has the engine end what is left of it after so many seconds.
+        """
+        self._attempt = attempt
+        self._command = command
+        self._store = store
+        self._terms = terms
+        self._submit = submit
+        self._withdraw = withdraw
+        self._on_event = on_event
+        self._on_exit = on_exit
+        self._inputs: Inputs | None = None
+        self._have: dict[str, str] = {}
+        """Hashes of the files in the folder of the job, by name."""
+        self._agent: str | None = None
+        self._taken = 0
+        """Number of the last report that was taken, and ..."""
+        self._complete = submit is not None
+        """... whether none was missed."""
+        self._order = Order.GO_ON
+        self._left_s: float | None = None
+        self._seen_s = time.monotonic()
+        self._messages: queue.SimpleQueue[Report | str | None] = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        self._detached = False
+        self._stored = False
+        """Whether its agent has stored all and is about to exit."""
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"attempt {attempt}", daemon=True)
+        self._thread.start()
+
+    def begin(self, asked: Begin) -> AttemptWork:
+        """Give the work to an agent. Raises FencedError if another one has it or it is over."""
+        with self._lock:
+            if self._ended.is_set() or self._inputs is None or self._agent not in (None, asked.agent):
+                raise FencedError("the attempt is over, or another agent has it")
+            self._seen_s = time.monotonic()
+            if self._agent is None:
+                self._agent = asked.agent
+                self._messages.put(Report(agent=asked.agent, events=[NodeFound(node=asked.node)]))
+            return AttemptWork(
+                command=self._command,
+                inputs=self._inputs,
+                store=self._store.uri,
+                lease_s=self._terms.lease_s,
+                report_s=self._terms.report_s,
+                grace_s=self._terms.grace_s,
+            )
+
+    def report(self, told: Report) -> ReportAnswer:
+        """Renew the lease and take events. Raises FencedError if another agent has it or it is over."""
+        with self._lock:
+            self._check(told.agent)
+            self._seen_s = time.monotonic()
+            if told.events:
+                self._messages.put(told)
+            return ReportAnswer(order=self._order)
+
+    def end(self, agent: str) -> None:
+        """The manifest is stored. Raises FencedError if another agent has it or it is over."""
+        with self._lock:
+            self._check(agent)
+            self._messages.put("")
+
+    def engine_ended(self, reason: str) -> None:
+        """The engine has nothing of the attempt that runs any more."""
+        self._messages.put(reason or "the engine has ended its task")
+
+    def stop(self) -> None:
+        """Ask it to finish its work and exit."""
+        with self._lock:
+            if self._order is Order.GO_ON:
+                self._order = Order.STOP
+        self._messages.put(None)
+
+    def dismiss(self) -> None:
+        """Ask it to exit; it is withdrawn after the time of grace."""
+        with self._lock:
+            self._order = Order.LEAVE
+            self._left_s = self._left_s or time.monotonic()
+        self._messages.put(None)
+
+    def detach(self) -> None:
+        """The service ends; the attempt goes on."""
+        self._detached = True
+        self._messages.put(None)
+
+    def kill_after(self, timeout_s: float) -> None:
+        """Wait for the exit; withdraw the attempt after `timeout_s`."""
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            self._messages.put("it was withdrawn")
+            self._thread.join()
+
+    def _check(self, agent: str) -> None:
+        if self._ended.is_set() or self._agent not in (None, agent):
+            raise FencedError("the attempt is over, or another agent has it")
+        self._agent = agent  # of an attempt that began before the service did
+
+    def _run(self) -> None:
+        try:
+            trouble = self._follow()
+        except (SpikedError, OSError) as error:
+            _log.warning("attempt failed", attempt=self._attempt, reason=str(error))
+            trouble = str(error)
+        if self._detached:
+            return
+        with self._lock:
+            self._ended.set()
+        with suppress(SpikedError):
+            self._store.remove()
+        self._withdraw(self._terms.grace_s if self._stored else 0.0)
+        self._on_exit(trouble)
+
+    def _follow(self) -> str | None:
+        """Follow the attempt to its end. Return the trouble of its worker."""
+        if self._submit is not None:
+            inputs = stage(self._command, self._store)
+            self._have = {stored.name: stored.sha256 for stored in inputs.folder}
+            with self._lock:
+                self._inputs, self._seen_s = inputs, time.monotonic()
+            if not (self._detached or self._left_s):
+                self._submit()
+        elif self._store.get(f"{self._attempt}/{MANIFEST}") is not None:
+            return self._finish("")  # it has ended meanwhile
+        while not self._detached:
+            try:
+                message = self._messages.get(timeout=_LOOK_S)
+            except queue.Empty:
+                message = None
+            if isinstance(message, Report):
+                self._take(message)
+            elif message is not None or self._overdue():
+                return self._finish(message or "its machine does not answer any more")
+            elif message is None and self._left_s and self._agent is None:
+                return "it was ended before it began"
+        return None
+
+    def _overdue(self) -> bool:
+        """Whether the lease has expired, or the time of grace; one that waits in the engine has no lease yet."""
+        now_s = time.monotonic()
+        if self._left_s and now_s - self._left_s > self._terms.grace_s + 2 * self._terms.report_s:
+            return True
+        begun = self._agent is not None or self._submit is None
+        return begun and now_s - self._seen_s > _OVERDUE * self._terms.lease_s
+
+    def _take(self, told: Report) -> None:
+        if told.sequence and told.sequence <= self._taken:
+            return  # its answer was lost
+        if told.files is not None:
+            self._fetch(told.files)
+        self._deliver(told.events)
+        self._complete = self._complete and told.sequence in (0, self._taken + 1)
+        self._taken = max(self._taken, told.sequence)
+
+    def _deliver(self, events: list[WorkerEvent]) -> None:
+        for event in events:
+            if isinstance(event, Logged):
+                relay(event)
+            else:
+                self._on_event(event)
+
+    def _finish(self, reason: str) -> str | None:
+        """The trouble of an attempt that is over: as its manifest says, else the reason."""
+        content = self._store.get(f"{self._attempt}/{MANIFEST}")
+        if content is None:
+            return reason or "its agent has ended without a result"
+        try:
+            manifest = Manifest.model_validate_json(content)
+        except ValidationError:
+            return "the manifest of its results cannot be read"
+        self._fetch(manifest.files)
+        self._stored = True
+        if not (self._complete and manifest.reports == self._taken):
+            self._deliver(manifest.events)  # again, which changes nothing for those that have arrived
+        return manifest.trouble
+
+    def _fetch(self, files: list[StoredFile]) -> None:
+        """Bring the folder of the job to what the attempt has, the index of the versions last."""
+        folder = self._command.folder
+        names = {stored.name for stored in files}
+        for stored in sorted(files, key=lambda one: one.name == INDEX):
+            path = folder / stored.name
+            if self._have.get(stored.name) != stored.sha256:
+                self._store.fetch(f"{self._attempt}/{OUTPUTS}/{stored.sha256}", path, stored)
+                self._have[stored.name] = stored.sha256
+        for path in files_in(folder):
+            if (
+                path.name.startswith(("scene-", "trajectory-", "path-"))
+                and path.relative_to(folder).as_posix() not in names
+            ):
+                path.unlink(missing_ok=True)

@@ -1,0 +1,272 @@
+"""Jobs on other machines, with submitit's local executor: agents are real processes, files go through a real store."""
+
+import json
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+import pytest
+from spiked_service.cluster.cluster import Cluster
+from spiked_service.cluster.engine import EngineOptions
+from spiked_service.cluster.remote_worker import Terms
+from spiked_service.results.versions import newest, versions
+from waiting import until
+
+from spiked.recording import RecordingWriter
+from spiked.sensor import Intrinsics, Sensor
+from spiked.simulate import MotionKind, SimulatedCamera
+
+pytest.importorskip("submitit")
+
+SHORT = {"steps": 20}
+LONG = {"steps": 200_000}
+LEASE_S = 30.0
+SHORT_LEASE_S = 4.0
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of a camera that moves."""
+    path = tmp_path_factory.mktemp("recordings") / "moving.dat"
+    sensor = Sensor(160, 96, 20_000.0, intrinsics=Intrinsics.from_fov(160, 96, 60))
+    camera = SimulatedCamera(sensor, seed=4, motion=MotionKind.ARC, flow_px=0.3, parallax=0.5)
+    with RecordingWriter(path, sensor) as writer:
+        writer.append(camera.next_frames(500))
+    return path
+
+
+class Lab:
+    """A service whose jobs run elsewhere, at one address over its restarts."""
+
+    def __init__(self, daemon: Callable[..., Any], moving: Path, scratch: Path, lease_s: float) -> None:
+        self._lease_s = lease_s
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self._port = free.getsockname()[1]
+        self._daemon = daemon
+        self._moving = moving
+        self.scratch = scratch
+        self.start()
+        source = f"replay:{moving}?pace=0"
+        self.capture = self.post("captures", device=source, reconstruct=False)["id"]
+        until(lambda: self.get(f"captures/{self.capture}")["state"] == "complete", "the capture is complete")
+
+    def start(self) -> None:
+        settings = {
+            "executor": "submitit",
+            "executor_address": "local",
+            "executor_lease_s": str(self._lease_s),
+            "reconstruction_workers": "2",
+            "source_folders": str(self._moving.parent),
+        }
+        flags = [part for name, value in settings.items() for part in ("--set", f"{name}={value}")]
+        source = f"replay:{self._moving}?pace=0"
+        self.one = self._daemon("--port", str(self._port), "--device", source, "--no-capture", *flags)
+
+    def get(self, path: str) -> Any:
+        return self.one.http.get(path).raise_for_status().json()
+
+    def post(self, path: str, **body: Any) -> Any:
+        answer = self.one.http.post(path, json=body)
+        assert answer.is_success, answer.text
+        return answer.json()
+
+    def submit(self, options: dict[str, Any]) -> str:
+        return str(self.post("reconstructions", capture_id=self.capture, options=options)["id"])
+
+    def job(self, job: str) -> Any:
+        return self.get(f"reconstructions/{job}")
+
+    def reached(self, job: str, wanted: Callable[[Any], bool], what: str) -> Any:
+        until(lambda: wanted(self.job(job)), f"{what}: {self.job(job)}")
+        return self.job(job)
+
+    def folder(self, job: str) -> Path:
+        return Path(self.one.data) / "reconstructions" / job
+
+    def attempt(self, job: str) -> str:
+        return str(json.loads((self.folder(job) / "reconstruction.json").read_text())["attempt"])
+
+    def processes(self, word: str) -> list[psutil.Process]:
+        """Processes of attempts of this test: workers, or agents."""
+        found = []
+        for process in psutil.process_iter(["cmdline"]):
+            with suppress(psutil.Error):
+                line = process.info["cmdline"] or []
+                if word in line and process.environ().get("SPIKED_SCRATCH") == str(self.scratch):
+                    found.append(process)
+        return found
+
+    def agents(self) -> list[psutil.Process]:
+        return self.processes("submitit.core._submit")
+
+    def workers(self) -> list[psutil.Process]:
+        return [one for one in self.processes("spiked_service.workers") if one.cmdline()[-1] == "reconstruction"]
+
+    def nothing_left(self) -> bool:
+        """Whether no process, folder or object of an attempt is left."""
+        cluster = Path(self.one.data) / "cluster"
+        objects = [one for one in (cluster / "jobs").rglob("*") if one.is_file()]
+        return not (self.agents() or self.workers() or objects or list(self.scratch.iterdir()))
+
+
+@pytest.fixture
+def lab(
+    request: pytest.FixtureRequest,
+    daemon: Callable[..., Any],
+    moving: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[Lab]:
+    """A lab; its parameter is the lease in seconds."""
+    scratch = tmp_path_factory.mktemp("scratch")
+    monkeypatch.setenv("SPIKED_SCRATCH", str(scratch))
+    one = Lab(daemon, moving, scratch, getattr(request, "param", LEASE_S))
+    yield one
+    for process in one.agents():
+        with suppress(psutil.Error):
+            process.kill()
+
+
+def complete(row: Any) -> bool:
+    assert row["state"] != "failed", row["reason"]
+    return bool(row["state"] == "complete")
+
+
+def test_jobs_elsewhere_end_as_those_here(lab: Lab) -> None:
+    jobs = [lab.submit(SHORT) for _ in range(3)]
+    for job in jobs:
+        row = lab.reached(job, complete, "it is complete")
+        assert row["node"] == socket.gethostname()
+        published = newest(lab.folder(job))
+        assert published is not None and published.version == row["version"] > 0 and row["poses"] == 500
+        for one in versions(lab.folder(job)):
+            assert (lab.folder(job) / one.scene).stat().st_size == one.scene_bytes
+        assert len(lab.get(f"reconstructions/{job}/versions")["items"]) == len(versions(lab.folder(job)))
+        assert lab.get(f"reconstructions/{job}/timeline")["work"]["work_s"]
+        assert lab.attempt(job) == ""
+    until(lab.nothing_left, "nothing is left of the attempts")
+
+
+def test_a_killed_agent_or_worker_costs_an_attempt_and_nothing_else(lab: Lab) -> None:
+    first, second = lab.submit(LONG), lab.submit(LONG)
+    for job in (first, second):
+        lab.reached(job, lambda row: row["version"] > 0, "it has published")
+    before = {job: (lab.job(job)["version"], lab.attempt(job)) for job in (first, second)}
+    agent, other = lab.agents()
+    worker = next(one for one in lab.workers() if one.ppid() == other.pid)
+    agent.kill()
+    worker.kill()
+    for job in (first, second):
+        lab.reached(job, lambda row, job=job: lab.attempt(job) not in ("", before[job][1]), "another attempt has begun")
+        row = lab.reached(job, lambda row, job=job: row["version"] > before[job][0], "it publishes again")
+        assert row["state"] == "running"
+        assert [one["version"] for one in lab.get(f"reconstructions/{job}/versions")["items"]][:1] == [1]
+    for job in (first, second):
+        lab.post(f"reconstructions/{job}:cancel")
+        lab.reached(job, lambda row: row["state"] == "cancelled", "it is cancelled")
+    until(lab.nothing_left, "nothing is left of the attempts")
+
+
+def test_a_restart_of_the_service_costs_no_attempt(lab: Lab) -> None:
+    job = lab.submit(LONG)
+    lab.reached(job, lambda row: row["version"] > 0, "it has published")
+    attempt = lab.attempt(job)
+    lab.one.process.send_signal(signal.SIGKILL)
+    lab.one.process.wait()
+    lab.start()
+    assert lab.job(job)["state"] == "running"
+    version = lab.job(job)["version"]
+    row = lab.reached(job, lambda row: row["version"] > version, "it publishes again")
+    assert (row["state"], lab.attempt(job)) == ("running", attempt)
+    lab.one.close()  # an orderly end leaves it alone, too
+    assert lab.workers()
+    lab.start()
+    lab.reached(job, lambda row: row["version"] > version + 1, "it publishes again")
+    assert lab.attempt(job) == attempt
+
+
+@pytest.mark.parametrize("lab", [SHORT_LEASE_S], indirect=True)
+def test_what_ends_while_the_service_is_down_is_taken_at_its_start(lab: Lab) -> None:
+    job = lab.submit(SHORT)
+    until(lab.workers, "its worker runs")
+    lab.one.process.kill()
+    lab.one.process.wait()
+    store = Path(lab.one.data) / "cluster" / "jobs" / job
+    until(lambda: not lab.agents(), "the agent has given up")
+    kept = list(store.glob("*/manifest.json"))
+    lab.start()
+    row = lab.reached(job, complete, "it is complete")
+    published = newest(lab.folder(job))
+    assert published is not None and row["version"] == published.version
+    if kept:  # it was done within the lease
+        assert json.loads((lab.folder(job) / "reconstruction.json").read_text())["attempts"] == 1
+    until(lab.nothing_left, "nothing is left of the attempts")
+
+
+@pytest.mark.parametrize("lab", [SHORT_LEASE_S], indirect=True)
+def test_a_silent_agent_is_fenced_off(lab: Lab) -> None:
+    job = lab.submit(LONG)
+    lab.reached(job, lambda row: row["version"] > 0, "it has published")
+    attempt, agent, worker = lab.attempt(job), lab.agents()[0], lab.workers()[0]
+    agent.suspend()
+    lab.reached(job, lambda row: lab.attempt(job) not in ("", attempt), "another attempt has begun")
+    lab.reached(job, lambda row: row["node"] != "" and len(lab.workers()) > 0, "it runs again")
+    with suppress(psutil.NoSuchProcess):
+        agent.resume()
+    until(lambda: not worker.is_running() or worker.status() == psutil.STATUS_ZOMBIE, "the old worker has ended")
+    assert lab.job(job)["state"] == "running"
+
+
+def test_a_job_that_is_cancelled_is_gone_within_ten_seconds(lab: Lab) -> None:
+    job, waiting = lab.submit(LONG), lab.submit(LONG)
+    lab.reached(job, lambda row: row["stage"] == "refining", "it refines")
+    begun = time.monotonic()
+    for one in (job, waiting):
+        lab.post(f"reconstructions/{one}:cancel")
+        row = lab.reached(one, lambda row: row["state"] != "running", "it has ended")
+        assert row["state"] == "cancelled"
+    until(lab.nothing_left, "nothing is left of the attempts")
+    assert lab.job(job)["version"] > 0
+    assert time.monotonic() - begun < 120, "leases and graces are long over"
+
+
+def test_agents_without_the_token_of_a_living_attempt_are_refused(lab: Lab) -> None:
+    job = lab.submit(LONG)
+    lab.reached(job, lambda row: row["version"] > 0, "it has published")
+    attempt = lab.attempt(job)
+    folder = Path(lab.one.data) / "cluster"
+    engine = EngineOptions("submitit", 1, 0)
+    token = Cluster(folder, (folder / "jobs").as_uri(), engine, Terms(LEASE_S)).token(attempt)
+    http = httpx.Client(base_url=f"{lab.one.address}api/v1/attempts")
+
+    def post(route: str, given: str, **body: object) -> httpx.Response:
+        return http.post(route, json=body, headers={"Authorization": f"Bearer {given}"})
+
+    assert post(f"/{attempt}:report", "guess", agent="a").status_code == 410
+    assert post(f"/{attempt}:begin", token, agent="another", node="n").status_code == 410
+    assert post(f"/{attempt}:report", token, agent="another").status_code == 410
+    assert post(f"/{attempt}:end", token, agent="another").status_code == 410
+    assert post(f"/{attempt}:report", token, agent="a", files=[{"name": "../x"}]).status_code == 422
+    assert post(f"/{attempt}:report", token).status_code == 422
+    assert post(f"/{job}:report", token, agent="a").status_code == 410, "the token of another"
+    assert lab.job(job)["state"] == "running"
+    lab.post(f"reconstructions/{job}:cancel")
+    lab.reached(job, lambda row: row["state"] == "cancelled", "it is cancelled")
+    assert post(f"/{attempt}:report", token, agent="a").status_code == 410, "it is over"
+
+
+def test_a_service_whose_jobs_run_here_refuses_agents(daemon: Callable[..., Any]) -> None:
+    attempt = "01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10"
+    one = daemon()
+    assert one.http.post(f"attempts/{attempt}:report", json={"agent": "a"}).status_code == 401
+    headers = {"Authorization": "Bearer guess"}
+    answer = one.http.post(f"attempts/{attempt}:report", json={"agent": "a"}, headers=headers)
+    assert answer.status_code == 410
+    assert answer.json()["what_to_do"]

@@ -24,7 +24,7 @@ from spiked_service.store.catalogue import Catalogue, Page, StoreError, UnknownI
 from spiked_service.store.disk_space import DiskSpace, recording_bytes
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import CaptureEdit, CaptureRow, Plan
-from spiked_service.store.snapshot import Snapshot
+from spiked_service.store.snapshot import CaptureSummary, Snapshot
 from spiked_service.workers.messages import PreviewTaken
 
 _CLOSE_S = 1.0
@@ -195,13 +195,20 @@ class Captures:
 
     def snapshot(self, row: CaptureRow) -> Snapshot:
         """A row with its current counters and reconstructions."""
+        jobs = self._reconstructions.rows.of(row.id)
+        summary = self.summary(row)
+        ids = tuple(job.id for job in jobs)
+        return Snapshot(summary.row, summary.counters, ids, summary.ring, jobs)
+
+    def summary(self, row: CaptureRow) -> CaptureSummary:
+        """A row with its current counters and the ids of its reconstructions, which are not read."""
         with self._lock:
             live = self._live.get(row.id)
         row = row if live is None else live.row
         counters = row.counters if live is None or row.state.over else live.counters()
         opened = None if live is None or row.state.over else live.opened
         ring = None if opened is None else opened.name
-        return Snapshot(row, counters, self._reconstructions.rows.of(row.id), ring)
+        return CaptureSummary(row, counters, self._reconstructions.rows.ids_of(row.id), ring)
 
     def list(
         self,

@@ -27,7 +27,7 @@ from spiked_service.store.rows import (
     Quality,
     ReconstructionRow,
 )
-from spiked_service.store.snapshot import Snapshot
+from spiked_service.store.snapshot import CaptureSummary
 
 _Check = tuple[Callable[[str], None], str]
 """A check and the id of its capture, reconstruction or upload."""
@@ -65,7 +65,7 @@ class Recovery:
         work += [(self._recover_capture, one) for one in self._orphans.captures]
         work += [(self._check_files, row.id) for row in self._catalogue.captures.where() if row.state.over]
         work += [(self._recover_reconstruction, one) for one in self._orphans.reconstructions]
-        work += [(self._check_reconstruction, row.id) for row in self._catalogue.reconstructions.where()]
+        work += [(self._check_reconstruction, one) for one in self._catalogue.ended_or_lost_reconstructions()]
         work += [(self._set_upload_aside, one) for one in self._orphans.uploads]
         self._each(work, closing)
 
@@ -93,7 +93,7 @@ class Recovery:
             verdict=verdict,
             ended_at=datetime.now(UTC),
         )
-        self._notifier.capture(Snapshot(row, row.counters, self._rows.of(capture_id)))
+        self._notifier.capture(CaptureSummary(row, row.counters, self._rows.ids_of(capture_id)))
 
     def _recover_capture(self, capture_id: str) -> None:
         path = self._folder.recording(capture_id)

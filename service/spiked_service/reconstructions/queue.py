@@ -317,7 +317,7 @@ class Reconstructions:
             if capture is None or not capture.plan.record:
                 return False
             others = [job.row for job in self._jobs.values() if job.row.id != row.id]
-            return self.policy.must_yield(row, others, bool(self.rows.queued()))
+            return self.policy.must_yield(row, others, any(True for _ in self.rows.queued()))
 
     def _ended(self, job: JobRunner, trouble: str | None, on_end: Callable[[ReconstructionRow], None] | None) -> None:
         with self._lock:

@@ -1,16 +1,17 @@
 """Places and expected completion times of queued reconstructions."""
 
 import statistics
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 from spiked.recon.time_left import typical_work_s
+from spiked_service.reconstructions.queue_order import QueueOrder
 from spiked_service.store.catalogue import Catalogue
-from spiked_service.store.rows import JobState, ReconstructionRow, Task
+from spiked_service.store.rows import CaptureRow, JobState, ReconstructionRow, Task
 
-NEXT = "state = ? ORDER BY priority DESC, coalesce(nullif(json_extract(document, '$.turn'), ''), id)"
-"""SQL condition and order of the queue; the parameter is a state."""
+FRONT = 100
+"""Jobs whose times are estimated one by one, and whose changes of place are published; the others have the mean."""
 _RECENT = 8
 """Complete reconstructions that the pace is estimated from."""
 _MERGE_SHARE, _LOCALISATION_SHARE = 0.2, 0.1
@@ -21,24 +22,44 @@ _CHANGE_SHARE = 0.2
 """... or by a smaller share of it, are not published."""
 
 
+@dataclass(frozen=True)
+class Front:
+    """The jobs at the front of the queue, and when those behind them can begin."""
+
+    rows: Sequence[ReconstructionRow]
+    """With places and the seconds to their completion, where known."""
+    begins_s: float
+    """Seconds until the next one behind them begins; infinite if not known."""
+    each_s: float
+    """Mean seconds from one completion to the next."""
+
+    def placed(self, row: ReconstructionRow, place: int) -> ReconstructionRow:
+        """A queued row with its place in the queue and the seconds to its completion, where known."""
+        known = next((one for one in self.rows if one.id == row.id), None)
+        if known is not None:
+            return replace(row, queue_place=known.queue_place, eta_s=known.eta_s)
+        end_s = self.begins_s + self.each_s * max(1, place - len(self.rows))
+        return replace(row, queue_place=place, eta_s=None if row.held or end_s == float("inf") else end_s)
+
+
 class QueueEstimates:
     """Estimates places and times of the queue. Not thread-safe."""
 
-    def __init__(self, catalogue: Catalogue) -> None:
+    def __init__(self, catalogue: Catalogue, order: QueueOrder) -> None:
         self._catalogue = catalogue
+        self._order = order
         self._published: dict[str, tuple[int | None, float | None]] = {}
 
-    def queued(self, running: Sequence[ReconstructionRow], limit: int) -> list[ReconstructionRow]:
-        """Queued rows, the next one first, with their place and the seconds to their completion, where known.
-
-        `running` are the rows with a worker; at most `limit` run at a time.
-        """
-        rows = self._catalogue.reconstructions.where(NEXT, (str(JobState.QUEUED),))
+    def front(self, running: Sequence[ReconstructionRow], limit: int) -> Front:
+        """The front of the queue; `running` are the rows with a worker; at most `limit` run at a time."""
+        rows = self._order.first(FRONT)
         if not rows:
-            return []
+            return Front((), 0.0, float("inf"))
         free_s = sorted(_remaining_s(row) for row in running)[max(0, len(running) - limit) :]
         free_s = [0.0] * (limit - len(free_s)) + free_s
-        paces = self._paces(running)
+        over = self._recent()
+        efforts = self._efforts([*running, *over, *rows])
+        paces = _paces([*running, *over], efforts)
         pace = statistics.median(paces) if paces else float("inf")
         found = []
         for place, row in enumerate(rows, 1):
@@ -46,53 +67,69 @@ class QueueEstimates:
                 found.append(replace(row, queue_place=place, eta_s=None))
                 continue
             free_s.sort()
-            end_s = free_s[0] = free_s[0] + pace * (self._effort(row) or float("inf"))
+            end_s = free_s[0] = free_s[0] + pace * efforts.get(row.id, float("inf"))
             found.append(replace(row, queue_place=place, eta_s=end_s if end_s < float("inf") else None))
-        return found
+        known = [efforts[row.id] for row in rows if row.id in efforts]
+        each_s = pace * statistics.mean(known) / limit if known else float("inf")
+        return Front(found, min(free_s), each_s)
 
-    def changed(self, queued: Iterable[ReconstructionRow]) -> list[ReconstructionRow]:
-        """Rows whose place or time differs from what the last call returned."""
+    def changed(self, front: Front, told_id: str | None = None) -> list[ReconstructionRow]:
+        """Rows of the front whose place or time differs from what the last call returned, and those that have left it
+        and are still queued; the row of `told_id` in any case, if it is queued."""
         before, self._published, changed = self._published, {}, []
-        for row in queued:
+        before.pop(told_id or "", None)
+        for row in front.rows:
             place, eta_s = before.get(row.id, (None, None))
             if row.queue_place == place and _alike(row.eta_s, eta_s):
                 self._published[row.id] = (place, eta_s)
             else:
                 self._published[row.id] = (row.queue_place, row.eta_s)
                 changed.append(row)
+        behind = {one for one in (*before, told_id) if one is not None and one not in self._published}
+        for row_id, place in self._order.places(behind).items():
+            behind_row = self._catalogue.reconstructions.find(row_id)
+            if behind_row is not None:
+                changed.append(front.placed(behind_row, place))
         return changed
 
-    def forget(self, reconstruction_id: str) -> None:
-        """Let `changed` return this row again."""
-        self._published.pop(reconstruction_id, None)
-
-    def _paces(self, running: Sequence[ReconstructionRow]) -> list[float]:
-        """Seconds per unit of effort, of running and recently completed rows."""
-        over = self._catalogue.reconstructions.where(
+    def _recent(self) -> list[ReconstructionRow]:
+        """Rows that were completed last."""
+        return self._catalogue.reconstructions.where(
             "state = ? ORDER BY id DESC LIMIT ?", (str(JobState.COMPLETE), _RECENT)
         )
-        now, found = datetime.now(UTC), []
-        for row in (*running, *over):
-            effort = self._effort(row) if row.task.reconstructs else None
-            if row.started_at is not None and effort is not None:
-                left_s = 0.0 if row.ended_at else _remaining_s(row)
-                found.append((((row.ended_at or now) - row.started_at).total_seconds() + left_s) / effort)
-        return [pace for pace in found if pace < float("inf")]
 
-    def _effort(self, row: ReconstructionRow) -> float | None:
-        """Seconds of work on a reference machine; None while the recording is not closed."""
-        capture = self._catalogue.captures.find(row.capture_id)
-        if capture is None or capture.sensor is None or capture.recording is None or not capture.recording.frames:
-            return None
-        width, height, frames = capture.sensor.width, capture.sensor.height, capture.recording.frames
-        match row.task:
-            case Task.MERGE:
-                share = _MERGE_SHARE
-            case Task.LOCALISE:
-                share = _LOCALISATION_SHARE * (min(row.part.count, frames) / frames if row.part else 1)
-            case _:
-                share = 1.0
-        return share * typical_work_s(width, height, frames, row.options.steps)
+    def _efforts(self, rows: Sequence[ReconstructionRow]) -> dict[str, float]:
+        """Seconds of work on a reference machine, by row, without those whose recording is not closed."""
+        ids = tuple({row.capture_id for row in rows})
+        marks = ", ".join("?" * len(ids))
+        captures = {one.id: one for one in self._catalogue.captures.where(f"id IN ({marks})", ids)}
+        found = {row.id: _effort(row, captures.get(row.capture_id)) for row in rows}
+        return {row_id: effort for row_id, effort in found.items() if effort}
+
+
+def _paces(rows: Sequence[ReconstructionRow], efforts: dict[str, float]) -> list[float]:
+    """Seconds per unit of effort, of running and recently completed rows."""
+    now, found = datetime.now(UTC), []
+    for row in rows:
+        if row.started_at is not None and row.task.reconstructs and row.id in efforts:
+            left_s = 0.0 if row.ended_at else _remaining_s(row)
+            found.append((((row.ended_at or now) - row.started_at).total_seconds() + left_s) / efforts[row.id])
+    return [pace for pace in found if pace < float("inf")]
+
+
+def _effort(row: ReconstructionRow, capture: CaptureRow | None) -> float | None:
+    """Seconds of work on a reference machine; None while the recording is not closed."""
+    if capture is None or capture.sensor is None or capture.recording is None or not capture.recording.frames:
+        return None
+    width, height, frames = capture.sensor.width, capture.sensor.height, capture.recording.frames
+    match row.task:
+        case Task.MERGE:
+            share = _MERGE_SHARE
+        case Task.LOCALISE:
+            share = _LOCALISATION_SHARE * (min(row.part.count, frames) / frames if row.part else 1)
+        case _:
+            share = 1.0
+    return share * typical_work_s(width, height, frames, row.options.steps)
 
 
 def _remaining_s(row: ReconstructionRow) -> float:

@@ -2,7 +2,7 @@
 
 import shutil
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Unpack
@@ -13,7 +13,8 @@ from spiked.render import Camera
 from spiked.sensor import Sensor
 from spiked_service.base.errors import BusyError
 from spiked_service.reconstructions.notifier import Notifier
-from spiked_service.reconstructions.queue_estimates import NEXT, QueueEstimates
+from spiked_service.reconstructions.queue_estimates import Front, QueueEstimates
+from spiked_service.reconstructions.queue_order import QueueOrder
 from spiked_service.reconstructions.queue_policy import QueuePolicy
 from spiked_service.results.pinned_map import pin
 from spiked_service.results.published import Published
@@ -37,7 +38,8 @@ class ReconstructionRepository:
         self._catalogue = catalogue
         self._notifier = notifier
         self._policy = policy
-        self._estimates = QueueEstimates(catalogue)
+        self._order = QueueOrder(catalogue)
+        self._estimates = QueueEstimates(catalogue, self._order)
         self._lock = threading.RLock()
         self._running: dict[str, ReconstructionRow] = {}
         self._unsaved: dict[str, ReconstructionRow] = {}
@@ -61,15 +63,23 @@ class ReconstructionRepository:
         page = self._catalogue.reconstruction_page(limit, cursor, capture_id, state)
         return Page(self._current(page.items), page.next_cursor)
 
+    def in_turn(self, limit: int = 50, cursor: str | None = None) -> Page[ReconstructionRow]:
+        """A page of the queue, the next one first, with its length. Raises UnknownIdError; see `QueueOrder.page`."""
+        page = self._order.page(limit, cursor)
+        return Page(self._current(page.items), page.next_cursor, page.total)
+
+    def ids_of(self, capture_id: str) -> tuple[str, ...]:
+        """Ids of the reconstructions of a capture, oldest first."""
+        found = self._catalogue.read("SELECT id FROM reconstructions WHERE capture_id = ? ORDER BY id", (capture_id,))
+        return tuple(row_id for (row_id,) in found)
+
     def of(self, capture_id: str) -> tuple[ReconstructionRow, ...]:
         """Reconstructions of a capture, oldest first."""
         return tuple(self._current(self._catalogue.reconstructions_of(capture_id)))
 
-    def queued(self) -> list[ReconstructionRow]:
+    def queued(self) -> Iterator[ReconstructionRow]:
         """Queued reconstructions that may begin, the next one first, without those that could not be saved."""
-        rows = self._catalogue.reconstructions.where(NEXT, (str(JobState.QUEUED),))
-        with self._lock:
-            return [row for row in rows if row.id not in self._unsaved and not row.held]
+        return (row for row in self._order.released() if row.id not in self._unsaved)
 
     def interrupted(self) -> list[ReconstructionRow]:
         """Reconstructions that an earlier service left running."""
@@ -100,7 +110,7 @@ class ReconstructionRepository:
         """Save a new row. Raises StoreError, and then there is none."""
         with self._lock:
             self._catalogue.reconstructions.put(row)
-            self._publish_queue()
+            self._publish_queue(row.id)
             return self._current([row])[0]
 
     def save(self, row: ReconstructionRow) -> ReconstructionRow:
@@ -129,10 +139,10 @@ class ReconstructionRepository:
         """Publish a row that was written, and what changed in the queue."""
         self._set_running(row)
         if row.state is JobState.QUEUED and row.id not in self._unsaved:
-            self._estimates.forget(row.id)  # published with its place by `_publish_queue`
+            self._publish_queue(row.id)  # with its place
         else:
             self._notifier.job(row)
-        self._publish_queue()
+            self._publish_queue()
 
     def publish_edit(self, reconstruction_id: str, version: int, edit: Callable[[Publisher], Published]) -> Published:
         """Publish another version of a reconstruction that has ended, made of its newest, `version`.
@@ -204,7 +214,7 @@ class ReconstructionRepository:
                     f"reconstruction {row.id} is {row.state}: only those that wait in the queue can be held or moved"
                 )
             edited = replace(
-                row,
+                row if place is None else self._order.moved(row, int(f"{place}")),
                 name=row.name if name is None else f"{name}",
                 notes=row.notes if notes is None else f"{notes}",
                 held=row.held if held is None else bool(held),
@@ -212,19 +222,7 @@ class ReconstructionRepository:
             written = self._write(edited)
             self._texts[row.id] = edited.name, edited.notes
             self._tell(written)
-            if isinstance(place, int):
-                self._move(row.id, place)
             return self.get(row.id)
-
-    def _move(self, reconstruction_id: str, place: int) -> None:
-        """Give a queued row a place; those in between take the priorities and turns of their neighbours."""
-        before = self._catalogue.reconstructions.where(NEXT, (str(JobState.QUEUED),))
-        after = [row for row in before if row.id != reconstruction_id]
-        after.insert(place - 1, next(row for row in before if row.id == reconstruction_id))
-        with self._catalogue.transaction():
-            for row, taken in zip(after, before, strict=True):
-                self._catalogue.reconstructions.put(replace(row, priority=taken.priority, turn=taken.turn or taken.id))
-        self._publish_queue()
 
     def _named(self, row: ReconstructionRow) -> ReconstructionRow:
         name, notes = self._texts.get(row.id, (row.name, row.notes))
@@ -306,22 +304,24 @@ class ReconstructionRepository:
     def _current(self, rows: Sequence[ReconstructionRow]) -> list[ReconstructionRow]:
         with self._lock:
             found = [self._running.get(row.id) or self._unsaved.get(row.id, row) for row in rows]
-            waits = any(row.state is JobState.QUEUED for row in found)
-            placed = {row.id: row for row in self._placed()} if waits else {}
-            return [placed.get(row.id, row) for row in found]
+            queued = [row.id for row in found if row.state is JobState.QUEUED and row.id not in self._unsaved]
+            if not queued:
+                return found
+            front, places = self._front(), self._order.places(queued)
+            return [front.placed(row, places[row.id]) if row.id in places else row for row in found]
 
-    def _placed(self) -> Sequence[ReconstructionRow]:
-        """Queued rows with their places and times."""
-        return self._estimates.queued([*self._running.values()], self._policy.limit)
+    def _front(self) -> Front:
+        """The front of the queue, with places and times."""
+        return self._estimates.front([*self._running.values()], self._policy.limit)
 
-    def _publish_queue(self) -> None:
-        """Publish changed places and times of the queue."""
+    def _publish_queue(self, told_id: str | None = None) -> None:
+        """Publish changed places and times of the queue, and in any case the row of `told_id`, if it is queued."""
         try:
-            placed = self._placed()
+            changed = self._estimates.changed(self._front(), told_id)
         except StoreError as error:
             self._notifier.log("error", str(error))
             return
-        for row in self._estimates.changed(placed):
+        for row in changed:
             self._notifier.job(row)
 
 

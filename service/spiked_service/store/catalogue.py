@@ -200,6 +200,16 @@ class Catalogue:
         """Reconstructions of a capture, oldest first."""
         return self.reconstructions.where("capture_id = ? ORDER BY id", (capture_id,))
 
+    def ended_or_lost_reconstructions(self) -> list[str]:
+        """Ids of the reconstructions that have ended, and of those whose capture is missing."""
+        over = tuple(str(state) for state in JobState if state.over)
+        found = self.read(
+            f"SELECT id FROM reconstructions WHERE state IN ({', '.join('?' * len(over))}) UNION "
+            "SELECT id FROM reconstructions WHERE capture_id NOT IN (SELECT id FROM captures)",
+            over,
+        )
+        return [row_id for (row_id,) in found]
+
     def put_version(self, row: VersionRow, kept: set[int]) -> None:
         """Save a version and delete those that are not kept."""
         with self.transaction() as connection:

@@ -1,6 +1,7 @@
 """The schemas of the catalogue, and how a file of an earlier one becomes one of today."""
 
 import sqlite3
+from collections.abc import Iterator
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
@@ -34,12 +35,32 @@ MIGRATIONS = (
     CREATE INDEX captures_by_group ON captures (json_extract(document, '$.group'));
     CREATE INDEX reconstructions_by_state_and_age ON reconstructions (state, id);
     """,
+    """
+    CREATE TABLE queue (
+        urgency INTEGER NOT NULL, turn TEXT NOT NULL, id TEXT NOT NULL UNIQUE, held INTEGER NOT NULL,
+        PRIMARY KEY (urgency, turn, id)
+    ) WITHOUT ROWID;
+    CREATE TRIGGER queue_follows AFTER INSERT ON reconstructions BEGIN
+        DELETE FROM queue WHERE id = NEW.id;
+        INSERT INTO queue SELECT -coalesce(json_extract(NEW.document, '$.priority'), 0),
+            coalesce(nullif(json_extract(NEW.document, '$.turn'), ''), NEW.id), NEW.id,
+            coalesce(json_extract(NEW.document, '$.held'), 0)
+            WHERE json_extract(NEW.document, '$.state') = 'queued';
+    END;
+    CREATE TRIGGER queue_forgets AFTER DELETE ON reconstructions BEGIN
+        DELETE FROM queue WHERE id = OLD.id;
+    END;
+    INSERT INTO queue SELECT -coalesce(json_extract(document, '$.priority'), 0),
+        coalesce(nullif(json_extract(document, '$.turn'), ''), id), id, coalesce(json_extract(document, '$.held'), 0)
+        FROM reconstructions WHERE state = 'queued';
+    """,
 )
 """Script n migrates a catalogue from schema n to n + 1; the schema is the file's user_version.
 
 A script that has been released is never changed. Every schema from the second on keeps the table `history`, so that a
 release that does not know a schema can name the one that wrote it. `tests/service/store/schemas` holds a catalogue of
-each former one.
+each former one. The table `queue` holds the order of the queued reconstructions, which are written by INSERT OR REPLACE
+only: real columns, because SQLite reads a row's document for a column that is made of it, index or not.
 """
 
 
@@ -74,11 +95,21 @@ def copy_before_migration(connection: sqlite3.Connection, path: Path) -> Path | 
     return target
 
 
+def _statements(script: str) -> Iterator[str]:
+    """The statements of a script; a trigger is one with those inside of it."""
+    statement = ""
+    for part in script.split(";"):
+        statement += f"{part};"
+        if sqlite3.complete_statement(statement):
+            yield statement
+            statement = ""
+
+
 def migrate(connection: sqlite3.Connection) -> None:
     """Apply the scripts that a catalogue lacks, within the open transaction, and note which release did it."""
     before = schema_of(connection)
     for number in range(before, len(MIGRATIONS)):
-        for statement in MIGRATIONS[number].split(";"):
+        for statement in _statements(MIGRATIONS[number]):
             connection.execute(statement)
         connection.execute(f"PRAGMA user_version = {number + 1}")
     if before < len(MIGRATIONS):

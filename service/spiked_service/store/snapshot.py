@@ -11,13 +11,13 @@ _SILENT = (DeviceState.ABSENT, DeviceState.ARMED, DeviceState.LOST)
 
 
 @dataclass(frozen=True)
-class Snapshot:
-    """A capture with its live counters and its reconstructions."""
+class CaptureSummary:
+    """A capture with its live counters and the ids of its reconstructions."""
 
     row: CaptureRow
     counters: Counters | None
     """Counters now or at the end."""
-    reconstructions: tuple[ReconstructionRow, ...]
+    reconstruction_ids: tuple[str, ...]
     """Oldest first."""
     ring: str | None = None
     """Name of the ring in shared memory, while it can be read."""
@@ -41,3 +41,11 @@ class Snapshot:
     def reason(self) -> str:
         """Why it failed, else what it waits for."""
         return self.row.reason or self.waits_for
+
+
+@dataclass(frozen=True)
+class Snapshot(CaptureSummary):
+    """A capture with its live counters and its reconstructions."""
+
+    reconstructions: tuple[ReconstructionRow, ...] = ()
+    """Oldest first."""

@@ -8,6 +8,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import PlainTextResponse
 from fastapi.routing import APIRoute
 
+from spiked.errors import ConfigurationError
 from spiked_service.api import files
 from spiked_service.api.idempotency import IdempotencyKey
 from spiked_service.api.problems import problems
@@ -70,16 +71,22 @@ def reconstruction_routes(
         )
         return accepted(row, request, response)
 
-    @router.get("", responses=problems())
+    @router.get("", responses=problems(404))
     def list_reconstructions(
         limit: Limit = 50,
         cursor: Cursor = None,
         capture_id: Annotated[str | None, Query(min_length=1, max_length=64)] = None,
         state: JobState | None = None,
+        in_turn: Annotated[
+            bool, Query(description="List the whole queue instead, the next to begin first, and count it.")
+        ] = False,
     ) -> ReconstructionPage:
-        """Reconstructions, newest first."""
-        page = rows.page(limit, cursor, capture_id, state)
-        return ReconstructionPage(items=[ReconstructionOut.of(row) for row in page.items], next_cursor=page.next_cursor)
+        """Reconstructions, newest first, or the queue in its order."""
+        if in_turn and (capture_id is not None or state not in (None, JobState.QUEUED)):
+            raise ConfigurationError("in_turn lists the whole queue: leave out capture_id and state")
+        page = rows.in_turn(limit, cursor) if in_turn else rows.page(limit, cursor, capture_id, state)
+        items = [ReconstructionOut.of(row) for row in page.items]
+        return ReconstructionPage(items=items, next_cursor=page.next_cursor, total=page.total)
 
     @router.get("/{reconstruction_id:id}", responses=problems(404))
     def get_reconstruction(reconstruction_id: str) -> ReconstructionOut:

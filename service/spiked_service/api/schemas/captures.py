@@ -32,7 +32,7 @@ from spiked_service.api.schemas.base import (
 from spiked_service.results.rate_statistics import RateStatistics
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.rows import CaptureState, Counters, Grade, Origin, Quality, Recorded
-from spiked_service.store.snapshot import Snapshot
+from spiked_service.store.snapshot import CaptureSummary
 
 
 class ConsumerOut(Out):
@@ -405,7 +405,7 @@ class CaptureOut(Out):
     )
 
     @classmethod
-    def of(cls, snapshot: Snapshot) -> "CaptureOut":
+    def of(cls, snapshot: CaptureSummary) -> "CaptureOut":
         """All that is known."""
         row = snapshot.row
         return cls(
@@ -426,7 +426,7 @@ class CaptureOut(Out):
             deleted_at=row.deleted_at,
             frames_planned=row.frames_planned,
             recording=RecordingOut.of(row.recording),
-            reconstruction_ids=[one.id for one in snapshot.reconstructions],
+            reconstruction_ids=list(snapshot.reconstruction_ids),
             counters=CountersOut.of(snapshot.counters),
             sensor=SensorOut.of(row.sensor),
             group=row.group,

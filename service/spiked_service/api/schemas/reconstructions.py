@@ -131,7 +131,7 @@ class ReconstructionChange(In):
         ge=1,
         le=LARGEST_INTEGER,
         description="Its new place in the queue, 1 is the next; beyond the end: the last. Only while it waits there. "
-        "It takes the priority of that place.",
+        "It takes the priority of the one that has this place.",
     )
 
 
@@ -198,7 +198,9 @@ class ReconstructionOut(Out):
 
 
 class ReconstructionPage(PageOut[ReconstructionOut]):
-    """Reconstructions, newest first."""
+    """Reconstructions, newest first, or the queue in its order."""
+
+    total: int | None = Field(None, description="Reconstructions in the queue; null unless it is listed in its order.")
 
 
 class VersionOut(Out):

@@ -34,8 +34,8 @@ from spiked.simulate.record import simulate
 FRAMES = 256
 
 
-def fill(data: Path, jobs: int, captures: int) -> list[str]:
-    """Write the catalogue; ids of the captures."""
+def fill(data: Path, jobs: int, captures: int) -> tuple[list[str], str]:
+    """Write the catalogue; ids of the captures, and of the job that is not held."""
     made = simulate(SimulatedCamera(Sensor(64, 48, 20_000.0), seed=1), data.parent / "made", "one", FRAMES, views=0)
     sensor = open_recording(made).sensor
     folder = DataFolder(data)
@@ -52,10 +52,11 @@ def fill(data: Path, jobs: int, captures: int) -> list[str]:
             recorded = Recorded(FRAMES, FRAMES * sensor.frame_bytes)
             catalogue.captures.put(replace(row, sensor=sensor, recording=recorded, ended_at=began))
         options = ReconstructionOptions(steps=20)
-        for number in range(jobs):
+        job_ids = [new_id() for _ in range(jobs)]
+        for number, job_id in enumerate(job_ids):
             catalogue.reconstructions.put(
                 ReconstructionRow(
-                    new_id(),
+                    job_id,
                     ids[number % captures],
                     False,
                     JobState.QUEUED,
@@ -67,7 +68,7 @@ def fill(data: Path, jobs: int, captures: int) -> list[str]:
             )
     catalogue.close()
     folder.close()
-    return ids
+    return ids, job_ids[2]
 
 
 def timed(rounds: int, ask: Callable[[], httpx.Response]) -> str:
@@ -101,7 +102,6 @@ def ask_all(http: httpx.Client, captures: list[str], rounds: int) -> None:
         (f"reconstructions/{last}", {}),
         ("devices", {}),
         ("system", {}),
-        ("health", {}),
     ]
     print("| request | median, ms | worst |\n|---|---|---|")
     for path, params in gets:
@@ -144,7 +144,7 @@ def main() -> None:
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         data = Path(scratch) / "data"
-        captures = fill(data, given.jobs, given.captures)
+        captures, first = fill(data, given.jobs, given.captures)
         begun = time.monotonic()
         command = [sys.executable, "-m", "spiked_service", "serve", "--port", "0", "--no-capture", "--data", f"{data}"]
         daemon = subprocess.Popen([*command, "--runtime", f"{scratch}/run"], stdout=subprocess.PIPE, text=True)
@@ -155,9 +155,10 @@ def main() -> None:
             serves = time.monotonic()
             print(f"address after {serves - begun:.1f} s")
             with httpx.Client(base_url=f"{found[0]}api/v1/", timeout=300) as http:
-                while not http.get("reconstructions", params={"state": "complete", "limit": 1}).json()["items"]:
+                while (job := http.get(f"reconstructions/{first}").json())["started_at"] is None:
+                    if time.monotonic() > serves + 120:
+                        raise SystemExit(f"the first job has not begun after two minutes: {job}")
                     time.sleep(0.02)
-                job = http.get("reconstructions", params={"state": "complete", "limit": 1}).json()["items"][0]
                 first_s = datetime.fromisoformat(job["started_at"]).timestamp() - (
                     time.time() - time.monotonic() + serves
                 )

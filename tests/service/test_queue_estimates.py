@@ -11,7 +11,8 @@ from spiked_service.api.bus_notifier import BusNotifier
 from spiked_service.captures.archive import DataStore
 from spiked_service.daemon import open_data_store
 from spiked_service.events.bus import Bus, Message, Topic
-from spiked_service.reconstructions.queue_estimates import QueueEstimates
+from spiked_service.reconstructions.queue_estimates import Front, QueueEstimates
+from spiked_service.reconstructions.queue_order import QueueOrder
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.catalogue import Catalogue, StoreError
 from spiked_service.store.rows import (
@@ -112,17 +113,17 @@ def test_times_left_follow_from_those_that_run_and_those_that_are_over(tmp_path:
         plan = Plan("sim:")
         capture = CaptureRow(f"capture{number}", Origin.LIVE, plan, CaptureState.COMPLETE, BEGAN, sensor=SENSOR)
         catalogue.captures.put(replace(capture, recording=recording))
-    estimates = QueueEstimates(catalogue)
+    estimates = QueueEstimates(catalogue, QueueOrder(catalogue))
     for number in (2, 3):
         catalogue.reconstructions.put(row(number, JobState.QUEUED, priority=number))
     running = row(1, JobState.RUNNING, frames=1000, started_at=datetime.now(UTC))
-    assert [(one.id, one.queue_place, one.eta_s) for one in estimates.queued([running], 1)] == [
+    assert [(one.id, one.queue_place, one.eta_s) for one in estimates.front([running], 1).rows] == [
         ("job3", 1, None), ("job2", 2, None),
     ]  # fmt: skip
     over_row = row(0, JobState.COMPLETE, frames=1000, started_at=BEGAN, ended_at=BEGAN + timedelta(seconds=40))
     catalogue.reconstructions.put(over_row)
     running = replace(running, eta_s=40.0)
-    first, second = estimates.queued([running], 1)
+    first, second = estimates.front([running], 1).rows
     work = [
         typical_work_s(SENSOR.width, SENSOR.height, frames, ReconstructionOptions().steps)
         for frames in (1000, 2000, 500)
@@ -131,15 +132,15 @@ def test_times_left_follow_from_those_that_run_and_those_that_are_over(tmp_path:
     assert short_s < 40 < long_s
     assert first.eta_s == pytest.approx(40 + short_s, abs=1)
     assert second.eta_s == pytest.approx(40 + short_s + long_s, abs=2)
-    first, second = estimates.queued([running], 2)  # two at a time: one begins at once
+    first, second = estimates.front([running], 2).rows  # two at a time: one begins at once
     assert first.eta_s == pytest.approx(short_s, abs=1) and second.eta_s == pytest.approx(short_s + long_s, abs=2)
-    assert [one.id for one in estimates.changed([first, second])] == ["job3", "job2"]
-    assert estimates.changed([replace(first, eta_s=short_s + 1), second]) == []
+    assert [one.id for one in estimates.changed(Front([first, second], 0.0, 1.0))] == ["job3", "job2"]
+    assert estimates.changed(Front([replace(first, eta_s=short_s + 1), second], 0.0, 1.0)) == []
     moved = replace(second, queue_place=1)
-    assert estimates.changed([moved]) == [moved]
+    assert estimates.changed(Front([moved], 0.0, 1.0)) == [moved]
     quick = row(3, JobState.QUEUED, priority=3, options=ReconstructionOptions(steps=0))
     catalogue.reconstructions.put(quick)
-    first = estimates.queued([], 1)[0]
+    first = estimates.front([], 1).rows[0]
     assert first.eta_s is not None and 0 < first.eta_s < 10, "no step to take"
     catalogue.close()
 

@@ -46,7 +46,10 @@ def test_queued_ones_are_moved(service: Any, waiting: list[str]) -> None:
     assert order(service, [*waiting, urgent]) == [urgent, a, b, c]
     change(urgent, queue_place=3)
     assert order(service, [*waiting, urgent]) == [a, b, urgent, c]
-    assert service.client.reconstruction(a).priority == 5, "it has the place, and with it the priority"
+    assert service.client.reconstruction(urgent).priority == 0, "it has the place, and with it the priority"
+    listed = service.http.get("reconstructions", params={"in_turn": True, "limit": 3}).json()
+    assert ([one["id"] for one in listed["items"]], listed["total"]) == ([a, b, urgent], 4)
+    assert service.http.get("reconstructions", params={"in_turn": True, "state": "running"}).status_code == 422
     service.client.cancel_reconstruction(urgent)
     service.client.remove_reconstruction(urgent)
 

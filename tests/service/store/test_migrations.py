@@ -53,7 +53,8 @@ def test_a_former_catalogue_becomes_one_of_today(dump: Path, tmp_path: Path) -> 
     assert tables(tmp_path / "old.sqlite") == tables(tmp_path / "new.sqlite")
     with closing(sqlite3.connect(tmp_path / "old.sqlite")) as connection:
         assert schema_of(connection) == len(MIGRATIONS)
-        assert connection.execute("SELECT program FROM history").fetchall() == [(installed_version(),)]
+        newest = "SELECT program FROM history ORDER BY schema DESC LIMIT 1"
+        assert connection.execute(newest).fetchall() == [(installed_version(),)]
     check_rows(Catalogue(tmp_path / "old.sqlite"))
 
 
@@ -89,6 +90,14 @@ def test_a_newer_catalogue_names_the_release_that_reads_it(tmp_path: Path) -> No
         connection.execute(f"PRAGMA user_version = {len(MIGRATIONS) + 1}")
     with pytest.raises(StoreError, match=rf"newer spiked \(7\.1\.0\), with schema {len(MIGRATIONS) + 1}"):
         Catalogue(path)
+
+
+def test_the_order_of_a_former_queue_is_kept(tmp_path: Path) -> None:
+    catalogue = Catalogue(made_of(SCHEMAS[1], tmp_path / "old.sqlite"))
+    found = catalogue.read("SELECT id, -urgency, held FROM queue ORDER BY urgency, turn, id")
+    assert [(row_id[9:13], priority, held) for row_id, priority, held in found] == [
+        ("a472", 7, 0), ("a46e", 0, 0), ("a471", 0, 1), ("a470", 0, 0),
+    ]  # fmt: skip
 
 
 def test_groups_and_recent_jobs_are_found_by_an_index(tmp_path: Path) -> None:

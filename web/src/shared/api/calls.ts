@@ -181,11 +181,11 @@ export const reconstruction = (id: string): Promise<Reconstruction> =>
 export const reconstructions = async (captureId: string): Promise<Reconstruction[]> =>
   (await answered(client.GET("/api/v1/reconstructions", { params: { query: { capture_id: captureId, limit: 100 } } })))
     .items;
-/** Running and queued reconstructions of all captures. */
+/** Running reconstructions of all captures, and the next ones of the queue. */
 export const unfinished = async (): Promise<Reconstruction[]> => {
-  const states = ["running", "queued"] as const;
-  const pages = states.map((state) =>
-    answered(client.GET("/api/v1/reconstructions", { params: { query: { state, limit: 100 } } })),
+  const asked = [{ state: "running" }, { in_turn: true }] as const;
+  const pages = asked.map((which) =>
+    answered(client.GET("/api/v1/reconstructions", { params: { query: { ...which, limit: 100 } } })),
   );
   return (await Promise.all(pages)).flatMap((page) => page.items);
 };

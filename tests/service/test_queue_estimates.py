@@ -137,7 +137,8 @@ def test_times_left_follow_from_those_that_run_and_those_that_are_over(tmp_path:
     assert [one.id for one in estimates.changed(Front([first, second], 0.0, 1.0))] == ["job3", "job2"]
     assert estimates.changed(Front([replace(first, eta_s=short_s + 1), second], 0.0, 1.0)) == []
     moved = replace(second, queue_place=1)
-    assert estimates.changed(Front([moved], 0.0, 1.0)) == [moved]
+    told = estimates.changed(Front([moved], 0.0, 1.0))
+    assert told[0] == moved and [one.id for one in told] == ["job2", "job3"], "one that left the front is told, too"
     quick = row(3, JobState.QUEUED, priority=3, options=ReconstructionOptions(steps=0))
     catalogue.reconstructions.put(quick)
     first = estimates.front([], 1).rows[0]

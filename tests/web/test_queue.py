@@ -1,10 +1,14 @@
 """The queue on the Live page, and names of reconstructions."""
 
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from browsing import PHONE, finished, keep, until, violations
+from spiked_service.base.ids import new_id
+from spiked_service.store.catalogue import Catalogue
+from spiked_service.store.rows import JobState, ReconstructionRow
 
 SOURCE = "sim:?width=160&height=100&pace=0"
 
@@ -63,3 +67,39 @@ def test_queued_ones_are_moved_held_named_and_cancelled(
     assert violations(page) == []
     assert page.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
     keep(page, pictures_folder / "named-phone.webp")
+
+
+def test_of_a_long_queue_the_first_hundred_are_listed(daemon: Callable[..., Any], visit: Callable[..., Any]) -> None:
+    one = daemon("--device", SOURCE, "--no-capture")
+    plan = {"source": SOURCE, "frames": 256, "reconstruct": False}
+    capture = one.http.post("captures", json=plan).json()["id"]
+    assert finished(one.http, capture)["state"] == "complete"
+    one.close()
+    catalogue, ids = Catalogue(one.data / "catalogue.sqlite"), [new_id() for _ in range(300)]
+    with catalogue.transaction():
+        for number, job_id in enumerate(ids, 1):
+            catalogue.reconstructions.put(
+                ReconstructionRow(
+                    job_id, capture, False, JobState.QUEUED, datetime.now(UTC), name=f"job {number}", held=True
+                )
+            )
+    catalogue.close()
+    one = daemon("--device", SOURCE, "--no-capture")
+    page = visit(one.address)
+    links = page.locator("ol.queue a")
+
+    def names() -> list[str]:
+        return links.all_inner_texts()
+
+    until(lambda: names() == [f"job {number}" for number in range(1, 101)], "the front is listed")
+    page.get_by_text("and 200 more").wait_for()
+    job = {"capture_id": capture, "priority": -1}
+    added = [one.http.post("reconstructions", json=job).json() for _ in range(2)]
+    page.get_by_text("and 202 more").wait_for()
+    assert links.count() == 100 and added[1]["queue_place"] == 302
+    page.get_by_role("button", name="Cancel the reconstruction of job 1", exact=True).click()
+    until(lambda: names() == [f"job {number}" for number in range(2, 102)], "the next one moves up")
+    page.get_by_text("and 201 more").wait_for()
+    one.http.patch(f"reconstructions/{ids[299]}", json={"queue_place": 1}).raise_for_status()
+    until(lambda: names() == ["job 300", *(f"job {number}" for number in range(2, 101))], "it has come to the front")
+    assert violations(page) == []

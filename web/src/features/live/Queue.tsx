@@ -6,6 +6,8 @@ import * as calls from "../../shared/api/calls";
 import type { Reconstruction, ReconstructionChange } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
 import { nameOf, progressText } from "../../shared/state/capture";
+import { count } from "../../shared/state/format";
+import { FRONT } from "../../shared/state/queueFront";
 import { activeJobs, storeReconstruction, useService } from "../../shared/state/store";
 import { ActionButton } from "../../shared/ui/access";
 import { NotifySwitch } from "./NotifySwitch";
@@ -15,7 +17,9 @@ import { JobBadge, Panel } from "../../shared/ui/parts";
 
 export function Queue({ shown }: { shown: string | null }): JSX.Element | null {
   const all = useService((state) => state.reconstructions);
-  const jobs = activeJobs(all);
+  const queued = useService((state) => state.queued);
+  const jobs = activeJobs(all).filter((job) => (job.queue_place ?? 0) <= FRONT);
+  const more = queued > FRONT ? queued - jobs.filter((job) => job.state === "queued").length : 0;
   if (jobs.every((job) => job.live && job.capture_id === shown)) return null;
   return (
     <Panel title="Reconstructions under way" aside={<NotifySwitch />}>
@@ -24,6 +28,7 @@ export function Queue({ shown }: { shown: string | null }): JSX.Element | null {
           <Turn key={job.id} job={job} />
         ))}
       </ol>
+      {more > 0 && <p className="dim">and {count(more)} more</p>}
     </Panel>
   );
 }

@@ -25,6 +25,7 @@ import type {
   Profile,
   Reconstruction,
   ReconstructionChange,
+  ReconstructionPage,
   RevertRequest,
   Scale,
   ScaleRequest,
@@ -181,14 +182,17 @@ export const reconstruction = (id: string): Promise<Reconstruction> =>
 export const reconstructions = async (captureId: string): Promise<Reconstruction[]> =>
   (await answered(client.GET("/api/v1/reconstructions", { params: { query: { capture_id: captureId, limit: 100 } } })))
     .items;
-/** Running reconstructions of all captures, and the next ones of the queue. */
-export const unfinished = async (): Promise<Reconstruction[]> => {
-  const asked = [{ state: "running" }, { in_turn: true }] as const;
-  const pages = asked.map((which) =>
-    answered(client.GET("/api/v1/reconstructions", { params: { query: { ...which, limit: 100 } } })),
-  );
-  return (await Promise.all(pages)).flatMap((page) => page.items);
+const queue = (limit: number): Promise<ReconstructionPage> =>
+  answered(client.GET("/api/v1/reconstructions", { params: { query: { in_turn: true, limit } } }));
+/** Running reconstructions of all captures, the next ones of the queue, and the length of the queue. */
+export const unfinished = async (next: number): Promise<{ jobs: Reconstruction[]; queued: number }> => {
+  const [running, waiting] = await Promise.all([
+    answered(client.GET("/api/v1/reconstructions", { params: { query: { state: "running", limit: 100 } } })),
+    queue(next),
+  ]);
+  return { jobs: [...running.items, ...waiting.items], queued: waiting.total ?? waiting.items.length };
 };
+export const queueLength = async (): Promise<number> => (await queue(1)).total ?? 0;
 /** The newest complete reconstructions of all captures. */
 export const complete = async (): Promise<Reconstruction[]> =>
   (await answered(client.GET("/api/v1/reconstructions", { params: { query: { state: "complete", limit: 200 } } })))

@@ -31,6 +31,7 @@ export type UploadRequest = Omit<Schemas["UploadRequest"], "profile"> & {
   profile?: Omit<Schemas["UploadProfile"], "calibration"> | null;
 };
 export type Reconstruction = Schemas["ReconstructionOut"];
+export type ReconstructionPage = Schemas["ReconstructionPage"];
 export type ReconstructionChange = Schemas["ReconstructionChange"];
 export type Scale = Schemas["ScaleOut"];
 export type ScaleRequest = Schemas["ScaleRequest"];

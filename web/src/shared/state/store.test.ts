@@ -6,6 +6,7 @@ import { ApiError } from "../api/http";
 import { progressText } from "./capture";
 import * as notifying from "./notifying";
 import { poses } from "./poses";
+import { adjust } from "./route";
 import {
   isAcquiring,
   newestCapture,
@@ -49,7 +50,7 @@ const pending = <T>(): { promise: Promise<T>; resolve: (value: T) => void } => {
 
 it("keeps older and removed captures, and what messages told meanwhile, when it fetches again", async () => {
   const page = pending<Awaited<ReturnType<typeof calls.captures>>>();
-  const open = pending<Reconstruction[]>();
+  const open = pending<Awaited<ReturnType<typeof calls.unfinished>>>();
   vi.spyOn(calls, "devices").mockResolvedValue([]);
   vi.spyOn(calls, "captures").mockReturnValue(page.promise);
   vi.spyOn(calls, "unfinished").mockReturnValue(open.promise);
@@ -75,7 +76,7 @@ it("keeps older and removed captures, and what messages told meanwhile, when it 
   handleMessage(message("job", { ...job("z", "e", 0), state: "queued" }));
   handleMessage(message("capture", capture("f")));
   page.resolve({ items: [capture("e", { state: "complete" }), capture("b")], next_cursor: "more", total: 9 });
-  open.resolve([{ ...ends, state: "running" }]);
+  open.resolve({ jobs: [{ ...ends, state: "running" }], queued: 0 });
   await again;
   const { captures, reconstructions } = useService.getState();
   expect(Object.keys(captures).sort()).toEqual(["a", "b", "d", "e", "f"]); // c is not there any more
@@ -182,4 +183,33 @@ it("lists those under way in the order of their turns, and says when each comes"
 it("takes a camera as free while its last capture only refines", () => {
   const states = ["starting", "waiting", "streaming", "finishing", "complete"];
   expect(states.map((state) => isAcquiring({ state } as Capture))).toEqual([true, true, true, false, false]);
+});
+
+it("keeps the front of a long queue, and the few behind it that were told of last", async () => {
+  const queued = (place: number, more: Partial<Reconstruction> = {}): void =>
+    handleMessage(message("job", { ...job(`j${place}`, "a", 0), state: "queued", queue_place: place, ...more }));
+  adjust({ capture: "shown" });
+  queued(999, { id: "own", capture_id: "shown" });
+  for (let place = 1; place <= 1000; place += 1) queued(place);
+  queued(50, { queue_place: 1001, version: 2 }); // it has a scene, which may be in view
+  const ids = (): string[] => Object.keys(useService.getState().reconstructions);
+  expect(ids()).toHaveLength(200);
+  expect(ids()).toEqual(expect.arrayContaining(["j1", "j50", "j100", "own", "j902", "j1000"]));
+  expect(useService.getState().queued).toBe(1001);
+
+  vi.spyOn(calls, "devices").mockResolvedValue([]);
+  vi.spyOn(calls, "captures").mockResolvedValue({ items: [], next_cursor: null, total: 0 });
+  vi.spyOn(calls, "unfinished").mockResolvedValue({
+    jobs: [{ ...job("j1", "a", 0), state: "queued", queue_place: 1 }],
+    queued: 1,
+  });
+  const asked = vi
+    .spyOn(calls, "reconstruction")
+    .mockImplementation((id) => Promise.resolve({ ...job(id, "a", 0), state: "cancelled" } as Reconstruction));
+  await refresh();
+  expect(asked).toHaveBeenCalledTimes(99); // of those that could have begun, the end is told
+  expect(ids()).not.toContain("j1000");
+  expect(useService.getState().queued).toBe(1);
+  adjust({ capture: null });
+  vi.restoreAllMocks();
 });

@@ -8,6 +8,8 @@ import { ApiError, UnreachableError, onUnauthorized } from "../api/http";
 import type { Capture, Device, Message, Preview, Reconstruction, SceneEvent, System } from "../api/types";
 import { notifyOfEnd } from "./notifying";
 import { poses } from "./poses";
+import { route } from "./route";
+import { FRONT, isBehind, tooMany } from "./queueFront";
 
 const NEWEST = 20;
 /** Polling interval of REST without a WebSocket. */
@@ -28,7 +30,10 @@ export interface ServiceState {
   devices: Device[];
   /** Known captures by id; the table of all captures asks for its own pages. */
   captures: Record<string, Capture>;
+  /** Known reconstructions by id; of a long queue its front, and few behind it. */
   reconstructions: Record<string, Reconstruction>;
+  /** Length of the queue; while it is no longer than its front, the most that it was. */
+  queued: number;
   system: System | null;
   /** Newest picture of each kind that came over the socket, by capture; of the last ones that sent some. */
   previews: Record<string, Record<string, Preview>>;
@@ -47,6 +52,7 @@ export const useService = create<ServiceState>(() => ({
   devices: [],
   captures: {},
   reconstructions: {},
+  queued: 0,
   system: null,
   previews: {},
   scenes: {},
@@ -148,11 +154,22 @@ export function storeCapture(capture: Capture): void {
   }));
 }
 
+/** Without those behind the front of the queue that are too many; those of the capture in the address go last. */
+function withFewBehind(jobs: Record<string, Reconstruction>): Record<string, Reconstruction> {
+  const forgotten = tooMany(jobs, (job) => (heard.get(job.id) ?? 0) + (job.capture_id === route().capture ? clock : 0));
+  if (forgotten.size === 0) return jobs;
+  for (const id of forgotten) heard.delete(id);
+  return Object.fromEntries(Object.entries(jobs).filter(([id]) => !forgotten.has(id)));
+}
+
 /** Store a reconstruction that a message, or the answer to a change, tells of. */
 export function storeReconstruction(job: Reconstruction): void {
   hear(job.id);
   const before = get().reconstructions[job.id];
-  set((state) => ({ reconstructions: { ...state.reconstructions, [job.id]: job } }));
+  set((state) => ({
+    reconstructions: withFewBehind({ ...state.reconstructions, [job.id]: job }),
+    queued: Math.max(state.queued, job.queue_place ?? 0),
+  }));
   notifyOfEnd(before, job);
 }
 
@@ -238,15 +255,17 @@ export async function refresh(): Promise<void> {
     const [devices, captures, unfinished] = await Promise.all([
       calls.devices(),
       calls.captures({ limit: NEWEST }),
-      calls.unfinished(),
+      calls.unfinished(FRONT),
     ]);
-    const active = activeJobs(get().reconstructions);
+    // Those far behind in the queue have not begun since; the page of their capture asks for them again.
+    const active = activeJobs(get().reconstructions).filter((job) => !isBehind(job));
     // The list ends there: what is older, or removed, is not in it.
     const oldest = captures.next_cursor === null ? "" : (captures.items.at(-1)?.id ?? "");
     set((state) => ({
       devices: devices.map((one) => (isNewer(one.id, asked) && state.devices.find(({ id }) => id === one.id)) || one),
       captures: merged(state.captures, captures.items, asked, (one) => one.id < oldest || one.deleted_at !== null),
-      reconstructions: merged(state.reconstructions, unfinished, asked, isEnded),
+      reconstructions: merged(state.reconstructions, unfinished.jobs, asked, isEnded),
+      queued: unfinished.queued,
       loaded: true,
       refreshed: state.refreshed + 1,
       connectionError: null,
@@ -290,6 +309,7 @@ export const loadComplete = (): Promise<void> => mergeReconstructions(calls.comp
 async function refreshSystem(): Promise<void> {
   try {
     set({ system: await calls.system(), connectionError: null });
+    if (get().queued > FRONT) set({ queued: await calls.queueLength() });
   } catch (error) {
     set({ connectionError: errorText(error) });
   }

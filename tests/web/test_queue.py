@@ -1,12 +1,14 @@
 """The queue on the Live page, and names of reconstructions."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from browsing import PHONE, finished, keep, until, violations
 from spiked_service.base.ids import new_id
+from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.catalogue import Catalogue
 from spiked_service.store.rows import JobState, ReconstructionRow
 
@@ -75,31 +77,29 @@ def test_of_a_long_queue_the_first_hundred_are_listed(daemon: Callable[..., Any]
     capture = one.http.post("captures", json=plan).json()["id"]
     assert finished(one.http, capture)["state"] == "complete"
     one.close()
-    catalogue, ids = Catalogue(one.data / "catalogue.sqlite"), [new_id() for _ in range(300)]
+    catalogue, ids = Catalogue(one.data / "catalogue.sqlite"), [new_id() for _ in range(301)]
+    row = ReconstructionRow("", capture, False, JobState.QUEUED, datetime.now(UTC), ReconstructionOptions(steps=60_000))
     with catalogue.transaction():
-        for number, job_id in enumerate(ids, 1):
-            catalogue.reconstructions.put(
-                ReconstructionRow(
-                    job_id, capture, False, JobState.QUEUED, datetime.now(UTC), name=f"job {number}", held=True
-                )
-            )
+        for number, job_id in enumerate(ids):
+            catalogue.reconstructions.put(replace(row, id=job_id, name=f"job {number}", held=number > 0))
     catalogue.close()
     one = daemon("--device", SOURCE, "--no-capture")
+    until(lambda: one.http.get(f"reconstructions/{ids[0]}").json()["state"] == "running", "the first one begins")
     page = visit(one.address)
     links = page.locator("ol.queue a")
 
-    def names() -> list[str]:
-        return links.all_inner_texts()
+    def is_listed(*numbers: int) -> bool:
+        return bool(links.all_inner_texts() == [f"job {number}" for number in numbers])
 
-    until(lambda: names() == [f"job {number}" for number in range(1, 101)], "the front is listed")
+    until(lambda: is_listed(0, *range(1, 101)), "the one that runs and the front of the queue are listed")
     page.get_by_text("and 200 more").wait_for()
     job = {"capture_id": capture, "priority": -1}
-    added = [one.http.post("reconstructions", json=job).json() for _ in range(2)]
+    places = [one.http.post("reconstructions", json=job).json()["queue_place"] for _ in range(2)]
     page.get_by_text("and 202 more").wait_for()
-    assert links.count() == 100 and added[1]["queue_place"] == 302
+    assert places == [301, 302] and links.count() == 101
     page.get_by_role("button", name="Cancel the reconstruction of job 1", exact=True).click()
-    until(lambda: names() == [f"job {number}" for number in range(2, 102)], "the next one moves up")
+    until(lambda: is_listed(0, *range(2, 102)), "the next one moves up")
     page.get_by_text("and 201 more").wait_for()
-    one.http.patch(f"reconstructions/{ids[299]}", json={"queue_place": 1}).raise_for_status()
-    until(lambda: names() == ["job 300", *(f"job {number}" for number in range(2, 101))], "it has come to the front")
+    one.http.patch(f"reconstructions/{ids[300]}", json={"queue_place": 1}).raise_for_status()
+    until(lambda: is_listed(0, 300, *range(2, 101)), "it comes from far behind to the front")
     assert violations(page) == []

@@ -195,20 +195,13 @@ class Captures:
 
     def snapshot(self, row: CaptureRow) -> Snapshot:
         """A row with its current counters and reconstructions."""
-        jobs = self._reconstructions.rows.of(row.id)
-        summary = self.summary(row)
-        ids = tuple(job.id for job in jobs)
-        return Snapshot(summary.row, summary.counters, ids, summary.ring, jobs)
+        return self.summary(row).with_jobs(self._reconstructions.rows.of(row.id))
 
     def summary(self, row: CaptureRow) -> CaptureSummary:
         """A row with its current counters and the ids of its reconstructions, which are not read."""
         with self._lock:
             live = self._live.get(row.id)
-        row = row if live is None else live.row
-        counters = row.counters if live is None or row.state.over else live.counters()
-        opened = None if live is None or row.state.over else live.opened
-        ring = None if opened is None else opened.name
-        return CaptureSummary(row, counters, self._reconstructions.rows.ids_of(row.id), ring)
+        return _summary(row, live, self._reconstructions.rows.ids_of(row.id))
 
     def list(
         self,
@@ -342,3 +335,11 @@ class Captures:
                     self._notifier.capture(snapshot)
             except StoreError as error:  # the next tick repeats it
                 self._notifier.log("error", f"the states of live captures are not up to date: {error}")
+
+
+def _summary(row: CaptureRow, live: LiveCapture | None, ids: tuple[str, ...]) -> CaptureSummary:
+    """A capture with the ids of its reconstructions; of a live one, its row is newer than `row`."""
+    row = row if live is None else live.row
+    if live is None or row.state.over:
+        return CaptureSummary(row, row.counters, ids)
+    return CaptureSummary(row, live.counters(), ids, None if live.opened is None else live.opened.name)

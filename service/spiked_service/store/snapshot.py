@@ -42,6 +42,10 @@ class CaptureSummary:
         """Why it failed, else what it waits for."""
         return self.row.reason or self.waits_for
 
+    def with_jobs(self, jobs: tuple[ReconstructionRow, ...]) -> "Snapshot":
+        """The same with its reconstructions, oldest first."""
+        return Snapshot(self.row, self.counters, tuple(job.id for job in jobs), self.ring, jobs)
+
 
 @dataclass(frozen=True)
 class Snapshot(CaptureSummary):

@@ -854,7 +854,7 @@ class ReconstructionChange(BaseModel):
     queue_place: Annotated[
         int | None,
         Field(
-            description="Its new place in the queue, 1 is the next; beyond the end: the last. Only while it waits there. It takes the priority of that place."
+            description="Its new place in the queue, 1 is the next; beyond the end: the last. Only while it waits there. It takes the priority of the one that has this place."
         ),
     ] = None
 
@@ -1887,7 +1887,7 @@ class ReconstructionOut(BaseModel):
 
 class ReconstructionPage(BaseModel):
     """
-    Reconstructions, newest first.
+    Reconstructions, newest first, or the queue in its order.
     """
 
     model_config = ConfigDict(
@@ -1897,6 +1897,10 @@ class ReconstructionPage(BaseModel):
     next_cursor: Annotated[
         str | None,
         Field(description="To be given as `cursor` for those that follow; null: there are no more."),
+    ]
+    total: Annotated[
+        int | None,
+        Field(description="Reconstructions in the queue; null unless it is listed in its order."),
     ]
 
 

@@ -643,7 +643,7 @@ export interface paths {
         };
         /**
          * List Reconstructions
-         * @description Reconstructions, newest first.
+         * @description Reconstructions, newest first, or the queue in its order.
          *
          *     Scope of a token: `read`.
          */
@@ -3685,7 +3685,7 @@ export interface components {
             held?: boolean | null;
             /**
              * Queue Place
-             * @description Its new place in the queue, 1 is the next; beyond the end: the last. Only while it waits there. It takes the priority of that place.
+             * @description Its new place in the queue, 1 is the next; beyond the end: the last. Only while it waits there. It takes the priority of the one that has this place.
              */
             queue_place?: number | null;
         };
@@ -3903,7 +3903,7 @@ export interface components {
         };
         /**
          * ReconstructionPage
-         * @description Reconstructions, newest first.
+         * @description Reconstructions, newest first, or the queue in its order.
          */
         ReconstructionPage: {
             /** Items */
@@ -3914,6 +3914,11 @@ export interface components {
              * @example null
              */
             next_cursor: string | null;
+            /**
+             * Total
+             * @description Reconstructions in the queue; null unless it is listed in its order.
+             */
+            total: number | null;
         };
         /**
          * ReconstructionRequest
@@ -8668,6 +8673,8 @@ export interface operations {
                 cursor?: string | null;
                 capture_id?: string | null;
                 state?: components["schemas"]["JobState"] | null;
+                /** @description List the whole queue instead, the next to begin first, and count it. */
+                in_turn?: boolean;
             };
             header?: never;
             path?: never;
@@ -8704,6 +8711,15 @@ export interface operations {
             };
             /** @description The scope of the token does not allow it. */
             403: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/problem+json": components["schemas"]["Problem"];
+                };
+            };
+            /** @description It does not exist, or not yet. */
+            404: {
                 headers: {
                     [name: string]: unknown;
                 };

@@ -1,7 +1,5 @@
 """The service as an object: devices, captures, reconstructions, what they give, uploads, events, settings."""
 
-import hashlib
-import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from http import HTTPStatus
@@ -12,7 +10,7 @@ from urllib.parse import quote
 
 import httpx
 
-from spiked.client.connection import ApiError, Connection, plain
+from spiked.client.connection import Connection, plain
 from spiked.client.editing import EditingMethods
 from spiked.client.events import Event, events_in
 from spiked.client.frames import FrameMethods
@@ -26,7 +24,6 @@ from spiked.client.models import (
     CaptureState,
     DeviceOut,
     DevicesOut,
-    GeometryModel,
     GroupOut,
     IntrinsicsModel,
     JobState,
@@ -38,18 +35,14 @@ from spiked.client.models import (
     ReconstructionPage,
     StatedCameraModel,
     SystemOut,
-    UploadOut,
 )
 from spiked.client.results import ResultMethods
 from spiked.client.settings import SettingMethods
+from spiked.client.uploads import UploadMethods
 from spiked.errors import SpikedError
 from spiked.recording import remove_recording, sidecar_path
 from spiked.whole_files import write_atomically
 
-_CHUNK_BYTES = 8 << 20
-"""Bytes of an upload in one request."""
-_ARRAYS = (".npy", ".npz", ".h5", ".hdf5")
-"""Names of files of arrays, which have no sidecar."""
 _HASH_BYTES = 1 << 20
 """Bytes read at a time."""
 _POLL_S = 0.2
@@ -58,7 +51,7 @@ _T = TypeVar("_T")
 _OVER = (JobState.complete, JobState.cancelled, JobState.failed)
 
 
-class Spiked(MapMethods, ResultMethods, EditingMethods, FrameMethods, SettingMethods):
+class Spiked(MapMethods, ResultMethods, EditingMethods, FrameMethods, SettingMethods, UploadMethods):
     """A client of one service. Usable from any thread, and as a context manager.
 
     Every method raises ApiError when the service refuses, and ServiceUnreachableError when it does not answer.
@@ -275,78 +268,11 @@ class Spiked(MapMethods, ResultMethods, EditingMethods, FrameMethods, SettingMet
         """The reconstruction when it is over. Raises SpikedError if it is not in time."""
         return _wait(lambda: self.reconstruction(reconstruction_id), lambda one: one.state in _OVER, timeout_s)
 
-    def upload(
-        self,
-        path: Path | str,
-        *,
-        name: str | None = None,
-        notes: str = "",
-        geometry: GeometryModel | None = None,
-        form: str | None = None,
-        array: str | None = None,
-        profile: ProfileModel | None = None,
-        device: str | None = None,
-        calibration: Path | str | None = None,
-        progress: Callable[[int, int], None] | None = None,
-    ) -> CaptureOut:
-        """Send a recording, with the sidecar beside it if there is one; it becomes a capture.
-
-        Other files with frames are converted: `form` is `usb`, `pcie`, `array` or `bits`, by default detected; `array`
-        is the name of one of several arrays. `profile` says what `geometry` does not, or that of a `device`, whose
-        calibration is used, too; `calibration` is a file of `spiked calibrate`.
-        `progress` is told of bytes sent and bytes in all. A connection that breaks is taken up where it broke.
-        """
-        path = Path(path)
-        recording = form in (None, "compact", "row_tagged") and path.suffix not in _ARRAYS
-        beside = path.with_suffix(".json")
-        size = path.stat().st_size
-        body = {
-            "name": name or path.name,
-            "notes": notes,
-            "bytes": size,
-            "sidecar": json.loads(beside.read_bytes()) if recording and beside.exists() else None,
-            "geometry": plain(geometry),
-            "sha256": _sha256(path),
-            "form": form,
-            "array": array,
-            "profile": plain(profile),
-            "device": device,
-        }
-        upload = self._connection.post("uploads", body, UploadOut)
-        if calibration is not None:
-            content = Path(calibration).read_bytes()
-            headers = {"Content-Type": "application/octet-stream"}
-            self._connection.request("PUT", f"uploads/{upload.id}/calibration", content=content, headers=headers)
-        with path.open("rb") as file:
-            while upload.offset_bytes < size:
-                offset = file.seek(upload.offset_bytes)
-                chunk = file.read(_CHUNK_BYTES)
-                if not chunk:
-                    raise SpikedError(f"{path} became shorter than {size} bytes while it was sent; send it again")
-                upload = self._send(upload, offset, chunk)
-                if progress is not None:
-                    progress(upload.offset_bytes, size)
-        return self._connection.post(f"uploads/{upload.id}:complete", None, CaptureOut)
-
     def events(self, *, topics: Sequence[str] | None = None, since: int | None = None) -> Iterator[Event]:
         """Messages from now on, or after the number `since`, for as long as they are taken."""
         wanted = ",".join(topics) if topics else None
         with self._connection.stream("events", topics=wanted, since=since) as answer:
             yield from events_in(answer.iter_lines())
-
-    def _send(self, upload: UploadOut, offset: int, chunk: bytes) -> UploadOut:
-        headers = {"Upload-Offset": str(offset), "Content-Type": "application/octet-stream"}
-        try:
-            answer = self._connection.request("PATCH", f"uploads/{upload.id}", content=chunk, headers=headers)
-        except ApiError as error:
-            if error.status != HTTPStatus.CONFLICT:
-                raise
-            # A chunk whose answer was lost had come all the same.
-            now = self._connection.get(f"uploads/{upload.id}", UploadOut)
-            if now.offset_bytes == offset:
-                raise
-            return now
-        return UploadOut.model_validate_json(answer.content)
 
 
 def _download(connection: Connection, capture: CaptureOut, path: Path) -> Path:
@@ -378,11 +304,3 @@ def _wait(ask: Callable[[], _T], over: Callable[[_T], bool], timeout_s: float) -
             raise SpikedError(f"still not over after {timeout_s:g} s: {one}")
         time.sleep(_POLL_S)
     return one
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(_HASH_BYTES):
-            digest.update(block)
-    return digest.hexdigest()

@@ -16,8 +16,6 @@ from spiked_service.workers.messages import ReconstructionCommand
 
 from spiked.errors import ConfigurationError
 
-pytest.importorskip("fsspec")
-
 
 class Far(ObjectStore):
     """A store that other machines do not see as a folder."""

@@ -14,7 +14,7 @@ import typer
 import typer.core
 
 PANELS = {
-    "Live": ("serve", "record", "devices", "health", "backup", "restore", "config", "token"),
+    "Live": ("serve", "record", "devices", "submit", "jobs", "health", "backup", "restore", "config", "token"),
     "Files": ("info", "verify", "cut", "convert", "offset", "simulate", "calibrate", "noise-report"),
     "Scenes": (
         *("reconstruct", "localise", "merge", "scale", "clean", "render", "evaluate", "report", "export"),

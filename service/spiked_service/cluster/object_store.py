@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
+import fsspec
+
 from spiked.errors import ConfigurationError, SpikedError
 from spiked_service.cluster.messages import StoredFile
 
@@ -29,10 +31,6 @@ class ObjectStore:
 
     def __init__(self, uri: str) -> None:
         """Raises ConfigurationError for a URI that cannot be used."""
-        try:
-            import fsspec
-        except ImportError as error:
-            raise ConfigurationError("jobs on other machines need fsspec: pip install 'spiked[cluster]'") from error
         self.uri = uri
         try:
             # Listings are not kept: other machines write, too.

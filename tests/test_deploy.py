@@ -110,6 +110,33 @@ def test_kubernetes_takes_the_manifests() -> None:
         kubernetes_validate.validate(documents[-1], kubernetes_validate.latest_version(), strict=True)
 
 
+def test_kubernetes_takes_the_pods_of_the_ray_cluster() -> None:
+    """KubeRay's own schema is not at hand: its pods are checked, and the fields that this project chose."""
+    kubernetes_validate = pytest.importorskip("kubernetes_validate", reason="needs kubernetes-validate")
+    cluster = yaml.safe_load((DEPLOY / "kubernetes/ray.yaml").read_text())
+    groups = [cluster["spec"]["headGroupSpec"], *cluster["spec"]["workerGroupSpecs"]]
+    for group in groups:
+        pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "one"}, **group["template"]}
+        kubernetes_validate.validate(pod, kubernetes_validate.latest_version(), strict=True)
+        assert pod["spec"]["securityContext"]["runAsNonRoot"]
+    text = (DEPLOY / "kubernetes/ray.yaml").read_text()
+    named = {name.lower() for name in re.findall(r"SPIKED_(EXECUTOR[A-Z_]*)=", text)}
+    assert named == {"executor", "executor_address", "executor_url", "executor_store"} <= set(Settings.model_fields)
+
+
+def test_ray_takes_the_cluster_file() -> None:
+    ray = pytest.importorskip("ray.autoscaler._private.util", reason="needs ray")
+    given = yaml.safe_load((DEPLOY / "ray/cluster.yaml").read_text())
+    ray.validate_config(ray.prepare_config(given))
+    with pytest.raises(Exception, match="setup_command"):
+        ray.validate_config(ray.prepare_config({**given, "setup_command": []}))
+
+
+def test_the_settings_for_slurm_are_settings() -> None:
+    settings = load_settings(file=DEPLOY / "slurm/spiked.toml").settings
+    assert settings.executor == "submitit" and settings.executor_url is not None
+
+
 def test_compose_takes_the_file() -> None:
     pytest.importorskip("check_jsonschema", reason="needs check-jsonschema")
     command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec"]

@@ -3,6 +3,8 @@
 import json
 import signal
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -270,3 +272,32 @@ def test_a_service_whose_jobs_run_here_refuses_agents(daemon: Callable[..., Any]
     answer = one.http.post(f"attempts/{attempt}:report", json={"agent": "a"}, headers=headers)
     assert answer.status_code == 410
     assert answer.json()["what_to_do"]
+
+
+def test_a_killed_engine_costs_no_attempt_that_has_begun(lab: Lab) -> None:
+    job = lab.submit(LONG)
+    row = lab.reached(job, lambda row: row["version"] > 0, "it has published")
+    attempt = lab.attempt(job)
+    (engine,) = lab.processes("spiked_service.cluster.engines")
+    engine.kill()
+    lab.reached(job, lambda now: now["version"] > row["version"], "it publishes again")
+    other = lab.submit(SHORT)
+    lab.reached(other, complete, "another one runs by a new engine")
+    assert lab.attempt(job) == attempt
+    lab.post(f"reconstructions/{job}:cancel")
+    lab.reached(job, lambda now: now["state"] == "cancelled", "it is cancelled")
+    until(lab.nothing_left, "nothing is left, though the new engine does not know it")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("executor", ["submitit", "ray"])
+def test_jobs_outlive_random_kills(executor: str) -> None:
+    if executor == "ray":
+        pytest.importorskip("ray")
+    script = Path(__file__).parents[2] / "evaluation" / "measure_cluster.py"
+    command = [sys.executable, str(script), executor, "--jobs", "40", "--kills", "15", "--every", "3"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=550)
+    assert done.returncode == 0, done.stdout + done.stderr[-3000:]
+    report = json.loads(done.stdout)
+    assert report["states"] == {"complete": 40} and sum(report["kills"].values()) > 5
+    assert (report["left_in_store"], report["processes_left"]) == (0, 0)

@@ -98,11 +98,11 @@ class Cluster:
             self._attempts[row.attempt] = worker
         return worker
 
-    def _engine_ended(self, attempt: str, reason: str) -> None:
+    def _engine_ended(self, attempt: str, reason: str, certain: bool) -> None:
         with self._lock:
             worker = self._attempts.get(attempt)
         if worker is not None:
-            worker.engine_ended(reason)
+            worker.engine_ended(reason, certain)
 
 
 def _key(path: Path) -> bytes:

@@ -38,8 +38,11 @@ class EngineOptions:
 class Engine:
     """The service's end of the process of the engine, which is started when it is needed. Thread-safe."""
 
-    def __init__(self, options: EngineOptions, log: Path, on_end: Callable[[str, str], None]) -> None:
-        """`on_end` gets an attempt that the engine has ended, and the reason, on a thread of this object."""
+    def __init__(self, options: EngineOptions, log: Path, on_end: Callable[[str, str, bool], None]) -> None:
+        """`on_end` gets an attempt that the engine has ended, the reason, and whether it runs no more.
+
+        It is called on a thread of this object.
+        """
         self._options = options
         self._log = log
         self._on_end = on_end
@@ -105,18 +108,18 @@ class Engine:
             for line in process.stdout:
                 with suppress(ValueError):  # a line that was cut off
                     ended = json.loads(line)
-                    self._forget(ended["ended"], ended["reason"])
+                    self._forget(ended["ended"], ended["reason"], True)
         code = process.wait()
         with self._lock:
             lost = set() if self._closed else set(self._submitted)
         if lost:
             _log.warning("engine ended", engine=self._options.kind, code=code, log=str(self._log))
         for attempt in lost:
-            self._forget(attempt, f"the engine {self._options.kind} has ended; see {self._log}")
+            self._forget(attempt, f"the engine {self._options.kind} has ended; see {self._log}", False)
 
-    def _forget(self, attempt: str, reason: str) -> None:
+    def _forget(self, attempt: str, reason: str, certain: bool) -> None:
         with self._lock:
             known = attempt in self._submitted
             self._submitted.discard(attempt)
         if known:
-            self._on_end(attempt, reason)
+            self._on_end(attempt, reason, certain)

@@ -137,9 +137,10 @@ class RemoteWorker:
             self._check(agent)
             self._messages.put("")
 
-    def engine_ended(self, reason: str) -> None:
-        """The engine has nothing of the attempt that runs any more."""
-        self._messages.put(reason or "the engine has ended its task")
+    def engine_ended(self, reason: str, certain: bool) -> None:
+        """The engine has ended the attempt; if that is not `certain`, an agent that has begun may go on."""
+        if self._agent is None or certain:
+            self._messages.put(reason or "the engine has ended its task")
 
     def stop(self) -> None:
         """Ask it to finish its work and exit."""

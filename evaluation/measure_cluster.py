@@ -1,0 +1,274 @@
+"""Jobs on other machines under random kills: `python evaluation/measure_cluster.py ray --jobs 1000 --kills 200`.
+
+Starts a service with an executor (and for Ray a head and two nodes on this machine), queues so many small jobs, and at
+random moments kills a worker, an agent, a node of Ray, the engine's process or the service, which are started again.
+Then it looks whether every job is complete, and whether the files of every version that is listed are there. Prints one
+JSON object; the exit status is 1 if a job is lost or half. With `local` and no kills it is the figure to compare with.
+"""
+
+import argparse
+import json
+import os
+import random
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+from spiked_service.results.versions import versions
+
+from spiked.recording import RecordingWriter
+from spiked.sensor import Intrinsics, Sensor
+from spiked.simulate import MotionKind, SimulatedCamera
+
+LEASE_S = 10
+START_S = 120.0
+RAY = str(Path(sys.executable).with_name("ray"))
+
+
+def recording(path: Path) -> None:
+    """A small recording of a moving camera."""
+    sensor = Sensor(160, 96, 20_000.0, intrinsics=Intrinsics.from_fov(160, 96, 60))
+    camera = SimulatedCamera(sensor, seed=4, motion=MotionKind.ARC, flow_px=0.3, parallax=0.5)
+    with RecordingWriter(path, sensor) as writer:
+        writer.append(camera.next_frames(400))
+
+
+def free_port() -> int:
+    """A port that nobody listens on."""
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+class RayNodes:
+    """A head without cores, and two nodes with one core each, all on this machine."""
+
+    def __init__(self) -> None:
+        self.port = free_port()
+        self._run("--head", f"--port={self.port}", "--num-cpus=0", "--include-dashboard=false")
+        self._nodes = [self._node(), self._node()]
+
+    @property
+    def address(self) -> str:
+        """Of the head."""
+        return f"127.0.0.1:{self.port}"
+
+    def kill(self, random_: random.Random) -> None:
+        """Kill a node with all that runs on it, and start another."""
+        number = random_.randrange(2)
+        with suppress(psutil.Error):
+            for process in [*self._nodes[number].children(recursive=True), self._nodes[number]]:
+                with suppress(psutil.Error):
+                    process.kill()
+        self._nodes[number] = self._node()
+
+    def close(self) -> None:
+        """End all nodes."""
+        subprocess.run([RAY, "stop", "--force"], check=False, capture_output=True)
+
+    def _node(self) -> psutil.Process:
+        before = {one.pid for one in _raylets()}
+        self._run(f"--address={self.address}", "--num-cpus=1")
+        return next(one for one in _raylets() if one.pid not in before)
+
+    @staticmethod
+    def _run(*words: str) -> None:
+        subprocess.run([RAY, "start", "--disable-usage-stats", *words], check=True, capture_output=True)
+
+
+def _raylets() -> list[psutil.Process]:
+    return [one for one in psutil.process_iter(["name"]) if one.info["name"] == "raylet"]
+
+
+class Service:
+    """`spiked serve`, which is started again where it was."""
+
+    def __init__(self, folder: Path, settings: dict[str, str]) -> None:
+        self.data = folder / "data"
+        self._folder = folder
+        self._port = free_port()
+        flags = [part for name, value in settings.items() for part in ("--set", f"{name}={value}")]
+        source = f"replay:{folder / 'small.dat'}?pace=0"
+        self._command = [sys.executable, "-m", "spiked_service", "serve", "--no-capture", "--port", str(self._port)]
+        self._command += ["--device", source, "--data", str(self.data), "--runtime", str(folder / "runtime")]
+        self._command += [*flags, "--set", f"source_folders={folder}", "--set", "log_level=warning"]
+        self.http = httpx.Client(base_url=f"http://127.0.0.1:{self._port}/api/v1", timeout=60)
+        self.source = source
+        self.start()
+
+    def start(self) -> None:
+        """Start it and wait until it answers."""
+        with (self._folder / "service.log").open("ab") as log:
+            self.process = subprocess.Popen(self._command, stdout=log, stderr=log)
+        deadline = time.monotonic() + START_S
+        while True:
+            with suppress(httpx.TransportError):
+                if self.http.get("/system").is_success:
+                    return
+            if self.process.poll() is not None or time.monotonic() > deadline:
+                raise SystemExit(f"the service does not start: {(self._folder / 'service.log').read_text()[-2000:]}")
+            time.sleep(0.1)
+
+    def ask(self, method: str, path: str, **more: Any) -> Any:
+        """A JSON answer."""
+        answer = self.http.request(method, path, **more)
+        answer.raise_for_status()
+        return answer.json()
+
+    def counts(self) -> Counter[str]:
+        """Jobs by state."""
+        found: Counter[str] = Counter()
+        cursor = None
+        while True:
+            page = self.ask("GET", "/reconstructions", params={"limit": 100} | ({"cursor": cursor} if cursor else {}))
+            found.update(job["state"] for job in page["items"])
+            cursor = page["next_cursor"]
+            if cursor is None:
+                return found
+
+    def close(self) -> None:
+        """End it."""
+        self.process.terminate()
+        self.process.wait(30)
+
+
+def processes(scratch: Path, *words: str) -> list[psutil.Process]:
+    """Processes of attempts whose command has one of these words."""
+    found = []
+    for process in psutil.process_iter(["cmdline"]):
+        with suppress(psutil.Error):
+            line = " ".join(process.info["cmdline"] or [])
+            if any(word in line for word in words) and process.environ().get("SPIKED_SCRATCH") == str(scratch):
+                found.append(process)
+    return found
+
+
+def kill(kind: str, service: Service, nodes: RayNodes | None, scratch: Path, random_: random.Random) -> bool:
+    """Kill something of a kind. Return whether there was one."""
+    if kind == "service":
+        service.process.kill()
+        service.process.wait()
+        service.start()
+        return True
+    if kind == "node":
+        assert nodes is not None
+        nodes.kill(random_)
+        return True
+    words = {
+        "worker": ("spiked_service.workers reconstruction",),
+        "agent": ("submitit.core._submit", "ray::_Agent"),
+        "engine": ("spiked_service.cluster.engines",),
+    }[kind]
+    found = processes(scratch, *words)
+    if not found:
+        return False
+    with suppress(psutil.Error):
+        random_.choice(found).kill()
+    return True
+
+
+def broken(service: Service, jobs: list[str]) -> list[str]:
+    """Jobs whose listed versions lack a file, or have one of another size."""
+    found = []
+    for job in jobs:
+        folder = service.data / "reconstructions" / job
+        kept = versions(folder)
+        whole = kept and all(
+            (folder / one.scene).is_file()
+            and (folder / one.scene).stat().st_size == one.scene_bytes
+            and (folder / one.trajectory).is_file()
+            for one in kept
+        )
+        if not whole:
+            found.append(job)
+    return found
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("executor", choices=["local", "ray", "submitit"])
+    parser.add_argument("--jobs", type=int, default=1000)
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--every", type=float, default=4.0, help="mean seconds between two kills")
+    parser.add_argument("--at-once", type=int, default=4, help="jobs that are handed to the engine at a time")
+    parser.add_argument("--store", help="URI of the store; a folder if not given")
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args()
+    random_ = random.Random(asked.seed)
+    with ExitStack() as ends:
+        folder = Path(ends.enter_context(tempfile.TemporaryDirectory(prefix="spiked-cluster-")))
+        scratch = folder / "scratch"
+        scratch.mkdir()
+        os.environ["SPIKED_SCRATCH"] = str(scratch)
+        recording(folder / "small.dat")
+        nodes = RayNodes() if asked.executor == "ray" else None
+        if nodes is not None:
+            ends.callback(nodes.close)
+        settings = {
+            "executor": asked.executor,
+            "reconstruction_workers": str(asked.at_once),
+            "executor_lease_s": str(LEASE_S),
+        }
+        settings |= {"executor_address": "local" if nodes is None else nodes.address}
+        settings |= {"executor_store": asked.store} if asked.store else {}
+        service = Service(folder, settings)
+        ends.callback(service.close)
+        capture = service.ask("POST", "/captures", json={"device": service.source, "reconstruct": False})["id"]
+        while service.ask("GET", f"/captures/{capture}")["state"] != "complete":
+            time.sleep(0.1)
+        body = {"capture_id": capture, "options": {"steps": 0, "threads": 1}}
+        jobs = [service.ask("POST", "/reconstructions", json=body)["id"] for _ in range(asked.jobs)]
+        begun_s = time.monotonic()
+        kinds = ["worker", "worker", "agent", "agent", "engine", "service"] + (["node"] if nodes else [])
+        killed: Counter[str] = Counter()
+        while True:
+            counts = service.counts()
+            if counts["queued"] + counts["running"] == 0:
+                break
+            if killed.total() < asked.kills:
+                time.sleep(random_.expovariate(1 / asked.every))
+                kind = random_.choice(kinds)
+                if kill(kind, service, nodes, scratch, random_):
+                    killed[kind] += 1
+            else:
+                time.sleep(2)
+        wall_s = time.monotonic() - begun_s
+        time.sleep(2 * LEASE_S if asked.executor != "local" else 0)
+        rows = [service.ask("GET", f"/reconstructions/{job}") for job in jobs]
+        left = [str(one) for one in (service.data / "cluster" / "jobs").rglob("*") if one.is_file()]
+        report = {
+            "executor": asked.executor,
+            "jobs": asked.jobs,
+            "states": dict(Counter(row["state"] for row in rows)),
+            "half": broken(service, [row["id"] for row in rows if row["state"] == "complete"]),
+            "versions_differ": [
+                row["id"]
+                for row in rows
+                if row["state"] == "complete"
+                and (kept := versions(service.data / "reconstructions" / row["id"]))
+                and kept[-1].version != row["version"]
+            ],
+            "reasons": dict(Counter(row["reason"] for row in rows if row["state"] != "complete")),
+            "kills": dict(killed),
+            "wall_s": round(wall_s, 1),
+            "s_a_job": round(wall_s / asked.jobs, 3),
+            "left_in_store": len(left),
+            "left_in_scratch": len(list(scratch.iterdir())),
+            "processes_left": len(processes(scratch, "submitit.core._submit", "ray::_Agent", "workers reconstruction")),
+        }
+        print(json.dumps(report))
+    if report["states"] != {"complete": asked.jobs} or report["half"] or report["versions_differ"]:
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -42,8 +42,16 @@ GUARDED = {
     "require_token",
     "tls_certificate",
     "tls_key",
+    "executor",
+    "executor_address",
+    "executor_store",
+    "executor_url",
+    "executor_cpus",
+    "executor_gpus",
+    "executor_lease_s",
+    "executor_options",
 }
-"""Who may use the service, where it listens, and what it reaches."""
+"""Who may use the service, where it listens, what it reaches, and where its jobs run."""
 
 
 def test_every_setting_is_either_guarded_or_editable() -> None:

@@ -26,6 +26,8 @@ _ANSWER_S = 10.0
 """Time for one answer."""
 _MOST_EVENTS = 500
 """Events kept while the service does not answer; then only those that the outcome depends on are."""
+_EVENTS_A_REPORT = 100
+"""Events of one report, which is shorter than the longest request that the service takes."""
 _REFUSED = (401, 403, 404, 409, 410, 422)
 """Status codes after which it is no use to ask again."""
 
@@ -148,17 +150,29 @@ class AgentReports:
                 return
 
     def _send(self) -> None:
+        """Report all events that there are, or at least a sign of life."""
         with self._sending:
-            with self._lock:
-                if self._unsent is None and self._events:
-                    self._sequence += 1
-                    self._unsent = Report(
-                        agent=self._agent, sequence=self._sequence, events=self._events, files=self._files
-                    )
-                    self._events, self._files = [], None
-                told = self._unsent or Report(agent=self._agent)
-            self.order = ReportAnswer.model_validate_json(self._post(":report", told)).order
-            self._unsent = None
+            while True:
+                told = self._next_report()
+                self.order = ReportAnswer.model_validate_json(self._post(":report", told)).order
+                self._unsent = None
+                with self._lock:
+                    if not self._events:
+                        return
+
+    def _next_report(self) -> Report:
+        """The report that was not answered, else one of the next events."""
+        with self._lock:
+            if self._unsent is None and self._events:
+                self._sequence += 1
+                self._unsent = Report(
+                    agent=self._agent,
+                    sequence=self._sequence,
+                    events=self._events[:_EVENTS_A_REPORT],
+                    files=self._files,
+                )
+                self._events, self._files = self._events[_EVENTS_A_REPORT:], None
+            return self._unsent or Report(agent=self._agent)
 
     def _post(self, route: str, told: Report) -> bytes:
         sent_s = time.monotonic()

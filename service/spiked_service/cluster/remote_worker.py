@@ -164,7 +164,7 @@ class RemoteWorker:
     def kill_after(self, timeout_s: float) -> None:
         """Wait for the exit; withdraw the attempt after `timeout_s`."""
         self._thread.join(timeout_s)
-        if self._thread.is_alive():
+        if self._thread.is_alive() and not self._detached:
             self._messages.put("it was withdrawn")
             self._thread.join()
 
@@ -179,6 +179,9 @@ class RemoteWorker:
         except (SpikedError, OSError) as error:
             _log.warning("attempt failed", attempt=self._attempt, reason=str(error))
             trouble = str(error)
+        except Exception:  # on_exit must be called whatever fails here
+            _log.exception("attempt not followed", attempt=self._attempt)
+            trouble = "a report of its agent could not be processed: see the log of the service"
         if self._detached:
             return
         with self._lock:

@@ -1,0 +1,146 @@
+"""Both ends of an attempt, one at a time: what goes wrong between them."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from queue import SimpleQueue
+
+import pytest
+from spiked_service.cluster.agent_reports import AgentReports, ServiceClient, UnansweredError
+from spiked_service.cluster.messages import AttemptWork, Begin, Inputs, Order, Report, ReportAnswer
+from spiked_service.cluster.object_store import ObjectStore
+from spiked_service.cluster.remote_worker import FencedError, RemoteWorker, Terms
+from spiked_service.settings.reconstruction_options import ReconstructionOptions
+from spiked_service.workers.messages import (
+    FramesSkipped,
+    NodeFound,
+    PlaceCompared,
+    ReconstructionCommand,
+    WorkerError,
+    WorkerEvent,
+)
+from waiting import until
+
+TERMS = Terms(lease_s=4.0, grace_s=1.0)
+
+
+@pytest.fixture
+def command(tmp_path: Path) -> ReconstructionCommand:
+    (tmp_path / "job").mkdir()
+    return ReconstructionCommand(
+        ring=None,
+        recording=tmp_path / "recording.dat",
+        folder=tmp_path / "job",
+        can_block=True,
+        options=ReconstructionOptions(),
+        intrinsics=None,
+    )
+
+
+class Attempt:
+    """A worker of the service without an engine, and what it has told."""
+
+    def __init__(self, command: ReconstructionCommand, store: Path, on_event: Callable[[WorkerEvent], None]) -> None:
+        self.submitted = threading.Event()
+        self.withdrawn: list[float] = []
+        self.exits: SimpleQueue[str | None] = SimpleQueue()
+        self.worker = RemoteWorker(
+            "one",
+            command,
+            ObjectStore(store.as_uri()),
+            TERMS,
+            self.submitted.set,
+            self.withdrawn.append,
+            on_event,
+            self.exits.put,
+        )
+
+    def begin(self) -> AttemptWork:
+        assert self.submitted.wait(10)
+        return self.worker.begin(Begin(agent="a", node="there"))
+
+
+def test_a_report_that_is_sent_again_counts_once(command: ReconstructionCommand, tmp_path: Path) -> None:
+    events: list[WorkerEvent] = []
+    one = Attempt(command, tmp_path / "store", events.append)
+    one.begin()
+    told = Report(agent="a", sequence=1, events=[FramesSkipped(frames=9, skipped=1)])
+    one.worker.report(told)
+    one.worker.report(told)
+    one.worker.report(Report(agent="a", sequence=2, events=[WorkerError(reason="no light")]))
+    until(lambda: len(events) >= 3, "all are taken")
+    assert [type(event) for event in events] == [NodeFound, FramesSkipped, WorkerError]
+    one.worker.dismiss()
+    assert one.worker.report(Report(agent="a")).order is Order.LEAVE
+    assert "does not answer" in f"{one.exits.get(timeout=30)}", "it did not leave within the grace"
+    with pytest.raises(FencedError):
+        one.worker.report(Report(agent="a"))
+    assert one.withdrawn == [0.0]
+
+
+def test_an_event_that_cannot_be_taken_ends_the_attempt(command: ReconstructionCommand, tmp_path: Path) -> None:
+    def refuse(event: WorkerEvent) -> None:
+        raise RuntimeError("a fault of this service")
+
+    one = Attempt(command, tmp_path / "store", refuse)
+    one.begin()
+    assert "see the log of the service" in f"{one.exits.get(timeout=30)}"
+
+
+def test_an_attempt_that_the_engine_has_lost_ends_unless_it_has_begun(
+    command: ReconstructionCommand, tmp_path: Path
+) -> None:
+    waiting = Attempt(command, tmp_path / "store", lambda event: None)
+    assert waiting.submitted.wait(10)
+    waiting.worker.engine_ended("the engine has ended", False)
+    assert waiting.exits.get(timeout=30) == "the engine has ended"
+    begun = Attempt(command, tmp_path / "store", lambda event: None)
+    begun.begin()
+    begun.worker.engine_ended("the engine has ended", False)
+    assert begun.worker.report(Report(agent="a")).order is Order.GO_ON
+    begun.worker.engine_ended("its process has ended", True)
+    assert begun.exits.get(timeout=30) == "its process has ended"
+
+
+class Answers(ServiceClient):
+    """A service that answers, or does not, and what it was sent."""
+
+    def __init__(self) -> None:
+        self.sent: list[Report] = []
+        self.silent = False
+
+    def post(self, route: str, body: str, until_s: float) -> bytes:
+        if self.silent:
+            raise UnansweredError("nobody is there")
+        self.sent.append(Report.model_validate_json(body))
+        return ReportAnswer(order=Order.GO_ON).model_dump_json().encode()
+
+
+def work(command: ReconstructionCommand) -> AttemptWork:
+    inputs = Inputs(recording=[], folder=[], in_place=True)
+    return AttemptWork(command=command, inputs=inputs, store="file:///s", lease_s=4, report_s=0.05, grace_s=1)
+
+
+def test_many_events_are_told_in_several_reports_and_in_order(command: ReconstructionCommand) -> None:
+    service = Answers()
+    with AgentReports(service, "a", work(command)) as reports:
+        for number in range(450):
+            reports.add(PlaceCompared(recognised=True, reason=f"{number}"), None)
+        last = reports.flush()
+    told = [one for one in service.sent if one.events]
+    assert [one.sequence for one in told] == list(range(1, last + 1))
+    assert max(len(one.events) for one in told) <= 100
+    reasons = [event.reason for one in told for event in one.events if isinstance(event, PlaceCompared)]
+    assert reasons == [f"{number}" for number in range(450)]
+
+
+def test_an_agent_keeps_what_a_silent_service_was_not_told(command: ReconstructionCommand) -> None:
+    service = Answers()
+    service.silent = True
+    with AgentReports(service, "a", work(command)) as reports:
+        reports.add(WorkerError(reason="no light"), None)
+        until(lambda: reports.lost, "it gives up")
+        assert reports.flush() == 1
+        reports.end()
+        assert [type(event) for event in reports.kept] == [WorkerError]
+    assert service.sent == []

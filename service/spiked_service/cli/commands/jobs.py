@@ -12,7 +12,13 @@ from spiked.client import JobState, ReconstructionOut, Spiked
 from spiked_service.cli.console import messages, output
 from spiked_service.cli.service_client import Address, TokenFile, client
 
-jobs = typer.Typer(help="The jobs of a running service: list and cancel them.", invoke_without_command=True)
+jobs = typer.Typer(
+    help="List the jobs of a running service, newest first: state, machine, progress, time left; and cancel them.\n\n"
+    "Examples:\n\n- `spiked jobs --state running`\n\n"
+    "- `spiked jobs --json --limit 1000 | jq -r 'select(.state == \"failed\") | .reason'`\n\n"
+    "- `spiked jobs cancel 01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10`",
+    invoke_without_command=True,
+)
 
 
 @jobs.callback()
@@ -24,16 +30,7 @@ def listing(
     address: Address = None,
     token_file: TokenFile = None,
 ) -> None:
-    """List the jobs of a running service, newest first: state, machine, progress, time left, and why one failed.
-
-    Examples:
-
-    - `spiked jobs --state running`
-
-    - `spiked jobs --json --limit 1000 | jq -r 'select(.state == "failed") | .reason'`
-
-    - `spiked jobs cancel 01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10`
-    """
+    """List the jobs of a running service, newest first: state, machine, progress, time left, and why one failed."""
     if context.invoked_subcommand is not None:
         return
     with client(address, token_file) as service:
@@ -42,9 +39,10 @@ def listing(
             for job in found:
                 print(json.dumps(job.model_dump(mode="json")))
             return
-        output.print(_table(service, found), soft_wrap=False)
-    if not found:
-        messages.print("there are no such jobs", markup=False)
+        if found:
+            output.print(_table(service, found), soft_wrap=False)
+        else:
+            messages.print("there are no such jobs", markup=False)
 
 
 @jobs.command()

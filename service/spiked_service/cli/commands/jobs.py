@@ -61,7 +61,7 @@ def _table(service: Spiked, found: list[ReconstructionOut]) -> Table:
     names: dict[str, str] = {}
     table = Table(box=None, pad_edge=False)
     for title in ("job", "recording", "state", "machine", "done", "left", ""):
-        table.add_column(title, overflow="fold", no_wrap=title == "job")
+        table.add_column(title, overflow="fold", no_wrap=title != "")
     for job in found:
         if job.capture_id not in names:
             names[job.capture_id] = service.capture(job.capture_id).name
@@ -69,6 +69,7 @@ def _table(service: Spiked, found: list[ReconstructionOut]) -> Table:
         waits = "held" if job.held else "" if job.queue_place is None else f"place {job.queue_place}"
         state = job.stage if job.state == "running" else job.state
         done = f"{100 * job.progress:.0f} %"
-        row = (job.id, names[job.capture_id], str(state.value), job.node, done, left, job.reason or waits)
+        why = waits if job.state == "running" else job.reason or waits  # one that runs tells more on the page
+        row = (job.id, names[job.capture_id], str(state.value), job.node, done, left, why)
         table.add_row(*(Text(part) for part in row))
     return table

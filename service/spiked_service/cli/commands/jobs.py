@@ -5,12 +5,13 @@ from itertools import islice
 from typing import Annotated
 
 import typer
-from rich.table import Table
-from rich.text import Text
 
 from spiked.client import JobState, ReconstructionOut, Spiked
 from spiked_service.cli.console import messages, output
 from spiked_service.cli.service_client import Address, TokenFile, client
+
+_TITLES = ("job", "state", "machine", "done", "left", "recording", "")
+"""Of the columns; the last one, why or where a job waits, is as long as it is."""
 
 jobs = typer.Typer(
     help="List the jobs of a running service, newest first: state, machine, progress, time left; and cancel them.\n\n"
@@ -39,9 +40,9 @@ def listing(
             for job in found:
                 print(json.dumps(job.model_dump(mode="json")))
             return
-        if found:
-            output.print(_table(service, found), soft_wrap=False)
-        else:
+        for line in _lines(service, found) if found else ():
+            output.print(line, markup=False)
+        if not found:
             messages.print("there are no such jobs", markup=False)
 
 
@@ -57,19 +58,18 @@ def cancel(
             service.cancel_reconstruction(one)
 
 
-def _table(service: Spiked, found: list[ReconstructionOut]) -> Table:
+def _lines(service: Spiked, found: list[ReconstructionOut]) -> list[str]:
+    """A line a job in aligned columns, after one with the titles."""
     names: dict[str, str] = {}
-    table = Table(box=None, pad_edge=False)
-    for title in ("job", "recording", "state", "machine", "done", "left", ""):
-        table.add_column(title, overflow="fold", no_wrap=title != "")
+    rows = [_TITLES]
     for job in found:
         if job.capture_id not in names:
             names[job.capture_id] = service.capture(job.capture_id).name
-        left = "" if job.eta_s is None or job.state not in ("queued", "running") else f"{job.eta_s:.0f} s"
+        over = job.state not in ("queued", "running")
+        left = "" if job.eta_s is None or over else f"{job.eta_s:.0f} s"
         waits = "held" if job.held else "" if job.queue_place is None else f"place {job.queue_place}"
         state = job.stage if job.state == "running" else job.state
-        done = f"{100 * job.progress:.0f} %"
         why = waits if job.state == "running" else job.reason or waits  # one that runs tells more on the page
-        row = (job.id, names[job.capture_id], str(state.value), job.node, done, left, why)
-        table.add_row(*(Text(part) for part in row))
-    return table
+        rows.append((job.id, state.value, job.node, f"{100 * job.progress:.0f} %", left, names[job.capture_id], why))
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_TITLES))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]

@@ -192,8 +192,26 @@ def broken(service: Service, jobs: list[str]) -> list[str]:
     return found
 
 
-def main() -> None:
-    """Entry point."""
+def outcome(service: Service, jobs: list[str], scratch: Path) -> dict[str, Any]:
+    """What has become of the jobs, and what is left of their attempts."""
+    rows = [service.ask("GET", f"/reconstructions/{job}") for job in jobs]
+    complete = [row for row in rows if row["state"] == "complete"]
+    newest = {row["id"]: versions(service.data / "reconstructions" / row["id"])[-1:] for row in complete}
+    return {
+        "states": dict(Counter(row["state"] for row in rows)),
+        "half": broken(service, [row["id"] for row in complete]),
+        "versions_differ": [
+            row["id"] for row in complete if [one.version for one in newest[row["id"]]] != [row["version"]]
+        ],
+        "reasons": dict(Counter(row["reason"] for row in rows if row["state"] != "complete")),
+        "left_in_store": sum(one.is_file() for one in (service.data / "cluster" / "jobs").rglob("*")),
+        "left_in_scratch": len(list(scratch.iterdir())),
+        "processes_left": len(processes(scratch, "submitit.core._submit", "ray::_Agent", "workers reconstruction")),
+    }
+
+
+def arguments() -> argparse.Namespace:
+    """Of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("executor", choices=["local", "ray", "submitit"])
     parser.add_argument("--jobs", type=int, default=1000)
@@ -202,7 +220,12 @@ def main() -> None:
     parser.add_argument("--at-once", type=int, default=4, help="jobs that are handed to the engine at a time")
     parser.add_argument("--store", help="URI of the store; a folder if not given")
     parser.add_argument("--seed", type=int, default=0)
-    asked = parser.parse_args()
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Entry point."""
+    asked = arguments()
     random_ = random.Random(asked.seed)
     with ExitStack() as ends:
         folder = Path(ends.enter_context(tempfile.TemporaryDirectory(prefix="spiked-cluster-")))
@@ -243,27 +266,13 @@ def main() -> None:
                 time.sleep(2)
         wall_s = time.monotonic() - begun_s
         time.sleep(2 * LEASE_S if asked.executor != "local" else 0)
-        rows = [service.ask("GET", f"/reconstructions/{job}") for job in jobs]
-        left = [str(one) for one in (service.data / "cluster" / "jobs").rglob("*") if one.is_file()]
         report = {
             "executor": asked.executor,
             "jobs": asked.jobs,
-            "states": dict(Counter(row["state"] for row in rows)),
-            "half": broken(service, [row["id"] for row in rows if row["state"] == "complete"]),
-            "versions_differ": [
-                row["id"]
-                for row in rows
-                if row["state"] == "complete"
-                and (kept := versions(service.data / "reconstructions" / row["id"]))
-                and kept[-1].version != row["version"]
-            ],
-            "reasons": dict(Counter(row["reason"] for row in rows if row["state"] != "complete")),
+            **outcome(service, jobs, scratch),
             "kills": dict(killed),
             "wall_s": round(wall_s, 1),
             "s_a_job": round(wall_s / asked.jobs, 3),
-            "left_in_store": len(left),
-            "left_in_scratch": len(list(scratch.iterdir())),
-            "processes_left": len(processes(scratch, "submitit.core._submit", "ray::_Agent", "workers reconstruction")),
         }
         print(json.dumps(report))
     if report["states"] != {"complete": asked.jobs} or report["half"] or report["versions_differ"]:

@@ -1846,6 +1846,10 @@ class ReconstructionOut(BaseModel):
         Field(description="What it found out about the camera, or had to assume."),
     ]
     priority: int
+    user: Annotated[
+        str,
+        Field(description="Name of the token with which it was queued; empty if none was needed."),
+    ]
     options: ReconstructionOptions
     poses_from: Annotated[
         str,

@@ -20,6 +20,14 @@ def catalogue(tmp_path: Path) -> Iterator[Catalogue]:
     one.close()
 
 
+def join(catalogue: Catalogue, number: int, user: str, priority: int = 0) -> str:
+    """Queue a job of a user as the service does. Return its id."""
+    row_id = f"01a20000-0000-7000-8000-{number:012d}"
+    row = ReconstructionRow(row_id, "capture", False, JobState.QUEUED, BEGAN, priority=priority, user=user)
+    catalogue.reconstructions.put(QueueOrder(catalogue).fair(row))
+    return row_id
+
+
 def add(catalogue: Catalogue, number: int, priority: int = 0) -> str:
     row_id = f"01a20000-0000-7000-8000-{number:012d}"
     catalogue.reconstructions.put(
@@ -79,3 +87,37 @@ def test_there_is_always_a_turn_between_two() -> None:
         high = turn_between(low, high)
         assert low < high < "01a20000"
     assert turn_between("5", None) == turn_between("5", "5") == "58"
+
+
+def users(catalogue: Catalogue) -> str:
+    return "".join(row.user for row in QueueOrder(catalogue).first(1000))
+
+
+def test_users_take_turns_and_each_ones_jobs_keep_their_order(catalogue: Catalogue) -> None:
+    made = [join(catalogue, number, "a") for number in range(6)]
+    assert ids(QueueOrder(catalogue)) == made, "one user alone: in the order of their age"
+    others = [join(catalogue, 10 + number, user) for number, user in enumerate("bbcb")]
+    assert users(catalogue) == "abcababaaa"
+    order = ids(QueueOrder(catalogue))
+    assert [one for one in order if one in made] == made
+    assert [one for one in order if one in others and one != others[2]] == [others[0], others[1], others[3]]
+    join(catalogue, 20, "a")
+    assert users(catalogue) == "abcababaaaa", "the last of who has the most"
+    join(catalogue, 21, "d", priority=1)
+    assert users(catalogue) == "dabcababaaaa", "priorities come first"
+    catalogue.reconstructions.set(made[0], state=JobState.RUNNING)
+    join(catalogue, 22, "e")
+    assert users(catalogue).index("e") <= 4, "nobody waits for more than one job of each other"
+
+
+def test_any_jobs_of_any_users_are_mixed(catalogue: Catalogue) -> None:
+    dice = random.Random(3)
+    made: dict[str, list[str]] = {user: [] for user in "abcde"}
+    for number in range(200):
+        user = dice.choice("aaaaaabbcde")
+        made[user].append(join(catalogue, number, user))
+    order = [(row.id, row.user) for row in QueueOrder(catalogue).first(1000)]
+    for user, jobs in made.items():
+        assert [one for one, of in order if of == user] == jobs
+    waiting = "".join(user for _, user in order)
+    assert waiting.rindex("d") < 5 * (waiting.count("d") + 1), "few jobs are done soon"

@@ -266,4 +266,5 @@ def begun_anew(row: ReconstructionRow, options: ReconstructionOptions) -> Recons
         notes=row.notes,
         poses_from=row.poses_from,
         calibration_from=row.calibration_from,
+        user=row.user,
     )

@@ -73,9 +73,8 @@ class Reconstructions:
         with self._lock:
             if self._closing:  # the service has stopped meanwhile
                 return
-            for row in self.rows.interrupted():
-                if row.id not in self._jobs:
-                    self._adopt(row)
+            for row in [one for one in self.rows.interrupted() if one.id not in self._jobs]:
+                self._adopt(row)
             thread = threading.Thread(target=self._run_queue, name="queue", daemon=True)
             thread.start()
             self._thread = thread
@@ -107,12 +106,12 @@ class Reconstructions:
         map_ids: Sequence[str] = (),
         part: FrameRange | None = None,
         given: Given | None = None,
+        user: str = "",
     ) -> ReconstructionRow:
         """Queue a job of a capture; one that needs the recording waits while the capture runs.
 
         `map_ids` are the reconstructions whose newest versions the `task` uses, two of a merge; they lie in the folder
-        of the job from now on, whatever becomes of them. `part` are the frames to localise.
-        `given` is copied there, too.
+        of the job from now on, as does what is `given`. `part` are the frames to localise. `user` is who asks.
         Raises UnknownIdError, BusyError for a map that is not finished, StoreError, and ConfigurationError for a
         capture without a recording, what is no map, another camera whose lens is not known, poses that are no path.
         """
@@ -127,6 +126,7 @@ class Reconstructions:
             task=task,
             maps=tuple(MapRef(map_id) for map_id in map_ids),
             part=part,
+            user=user,
         )
         try:
             # Before the lock: a path of a minute is a large file, and captures that begin and end wait for the lock.

@@ -9,6 +9,8 @@ from spiked_service.store.rows import ReconstructionRow
 
 _CHUNK = 16
 """Jobs that are read at once where most often the first one is wanted."""
+_USERS = 1000
+"""Users who take turns; more share the last one."""
 _ROWS = "SELECT document FROM queue CROSS JOIN reconstructions USING (id)"
 _IN_TURN = "ORDER BY urgency, turn, id LIMIT ?"
 
@@ -97,6 +99,25 @@ class QueueOrder:
                 high.turn if high is not None and high.urgency == taken.urgency else None,
             ),
         )
+
+    def fair(self, row: ReconstructionRow) -> ReconstructionRow:
+        """The row of a job that joins the queue, with its turn: behind those of its user, and one of each other user.
+
+        So users with many jobs and users with few take turns, and each one's jobs keep their order.
+        """
+        urgency = -row.priority
+        own = "SELECT coalesce(max(turn), '') FROM queue WHERE urgency = ? AND user = ? AND id <> ?"
+        ((low,),) = self._catalogue.read(own, (urgency, row.user, row.id))
+        after = "SELECT turn, user FROM queue WHERE urgency = ? AND turn > ? AND id <> ? ORDER BY turn, id LIMIT ?"
+        high, passed = None, set[str]()
+        for turn, user in self._catalogue.read(after, (urgency, low, row.id, _USERS)):
+            if user in passed:
+                high = turn
+                break
+            passed.add(user)
+            low = turn
+        last = high is None and row.id > low
+        return replace(row, turn="" if last else turn_between(low, high))
 
     def _at(self, place: int) -> Turn | None:
         """The key of the job at a place; None outside of the queue."""

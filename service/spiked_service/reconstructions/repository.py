@@ -107,8 +107,9 @@ class ReconstructionRepository:
         return self._catalogue.versions(self._catalogue.reconstructions.get(reconstruction_id).id)
 
     def add(self, row: ReconstructionRow) -> ReconstructionRow:
-        """Save a new row. Raises StoreError, and then there is none."""
+        """Save a new row, with its turn in the queue. Raises StoreError, and then there is none."""
         with self._lock:
+            row = self._order.fair(row)
             self._catalogue.reconstructions.put(row)
             self._publish_queue(row.id)
             return self._current([row])[0]
@@ -183,7 +184,7 @@ class ReconstructionRepository:
         """
         with self._lock:
             self.check_not_edited(row.id)
-            self._tell(self._write(self._named(row)))
+            self._tell(self._write(self._order.fair(self._named(row))))
 
     def forget_scale(self, row: ReconstructionRow) -> None:
         """Forget the scale of a reconstruction that begins anew, since its unit of length will be another one.

@@ -38,20 +38,22 @@ MIGRATIONS = (
     """
     CREATE TABLE queue (
         urgency INTEGER NOT NULL, turn TEXT NOT NULL, id TEXT NOT NULL UNIQUE, held INTEGER NOT NULL,
-        PRIMARY KEY (urgency, turn, id)
+        user TEXT NOT NULL, PRIMARY KEY (urgency, turn, id)
     ) WITHOUT ROWID;
+    CREATE INDEX queue_by_user ON queue (urgency, user, turn);
     CREATE TRIGGER queue_follows AFTER INSERT ON reconstructions BEGIN
         DELETE FROM queue WHERE id = NEW.id;
         INSERT INTO queue SELECT -coalesce(json_extract(NEW.document, '$.priority'), 0),
             coalesce(nullif(json_extract(NEW.document, '$.turn'), ''), NEW.id), NEW.id,
-            coalesce(json_extract(NEW.document, '$.held'), 0)
+            coalesce(json_extract(NEW.document, '$.held'), 0), coalesce(json_extract(NEW.document, '$.user'), '')
             WHERE json_extract(NEW.document, '$.state') = 'queued';
     END;
     CREATE TRIGGER queue_forgets AFTER DELETE ON reconstructions BEGIN
         DELETE FROM queue WHERE id = OLD.id;
     END;
     INSERT INTO queue SELECT -coalesce(json_extract(document, '$.priority'), 0),
-        coalesce(nullif(json_extract(document, '$.turn'), ''), id), id, coalesce(json_extract(document, '$.held'), 0)
+        coalesce(nullif(json_extract(document, '$.turn'), ''), id), id, coalesce(json_extract(document, '$.held'), 0),
+        ''
         FROM reconstructions WHERE state = 'queued';
     """,
 )

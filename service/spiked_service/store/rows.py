@@ -324,6 +324,8 @@ class ReconstructionRow:
     """Device whose calibration is used instead of that of the recording; it lies in its folder."""
     turn: str = ""
     """Its turn among queued ones of its priority; empty: its id."""
+    user: str = ""
+    """Name of the token with which it was queued; empty if none was needed."""
     attempt: str = ""
     """Id of the attempt that runs on another machine, whose token is worth nothing once this has changed."""
     node: str = ""

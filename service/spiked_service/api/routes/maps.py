@@ -11,7 +11,7 @@ from spiked_service.api.idempotency import IdempotencyKey
 from spiked_service.api.problems import NothingError, NotReadyError, problems
 from spiked_service.api.results import Results
 from spiked_service.api.routes.parameters import NOT_MODIFIED, Version
-from spiked_service.api.routes.reconstructions import accepted
+from spiked_service.api.routes.reconstructions import accepted, user_of
 from spiked_service.api.schemas.reconstructions import (
     LocalisationOut,
     LocaliseRequest,
@@ -55,6 +55,7 @@ def map_routes(reconstructions: Reconstructions, results: Results, route_class: 
             task=Task.LOCALISE,
             map_ids=(reconstruction_id,),
             part=body.part(),
+            user=user_of(request),
         )
         return accepted(row, request, response)
 
@@ -70,10 +71,9 @@ def map_routes(reconstructions: Reconstructions, results: Results, route_class: 
 
         The result is a new reconstruction of its capture; both stay as they are. Recordings are not needed.
         """
-        capture_id = rows.get(reconstruction_id).capture_id
-        options = ReconstructionOptions(seed=body.seed, threads=body.threads)
-        map_ids = (reconstruction_id, body.other)
-        row = reconstructions.submit(capture_id, options, body.priority, task=Task.MERGE, map_ids=map_ids)
+        capture_id, user = rows.get(reconstruction_id).capture_id, user_of(request)
+        options, map_ids = ReconstructionOptions(seed=body.seed, threads=body.threads), (reconstruction_id, body.other)
+        row = reconstructions.submit(capture_id, options, body.priority, task=Task.MERGE, map_ids=map_ids, user=user)
         return accepted(row, request, response)
 
     @router.get("/paths", responses=problems(404))

@@ -59,15 +59,15 @@ def reconstruction_routes(
     ) -> ReconstructionOut:
         """Queue a reconstruction of a recording; live captures precede the queue. With `map` it extends that map."""
         task, map_ids = (Task.RECONSTRUCT, ()) if body.map is None else (Task.EXTEND, (body.map,))
-        device = body.calibration_of
-        given = Given(
-            poses=body.poses,
-            poses_of=body.poses_of,
-            calibration_of=device or "",
-            calibration=None if device is None else calibration_of(device, sources, profiles),
-        )
+        given = _given(body, sources, profiles)
         row = reconstructions.submit(
-            body.capture_id, body.options, body.priority, task=task, map_ids=map_ids, given=given
+            body.capture_id,
+            body.options,
+            body.priority,
+            task=task,
+            map_ids=map_ids,
+            given=given,
+            user=user_of(request),
         )
         return accepted(row, request, response)
 
@@ -139,6 +139,21 @@ def _add_end_routes(router: APIRouter, reconstructions: Reconstructions) -> None
     def remove_reconstruction(reconstruction_id: str) -> None:
         """Delete it with its published versions."""
         reconstructions.remove(reconstruction_id)
+
+
+def _given(body: ReconstructionRequest, sources: Sources, profiles: CameraProfiles) -> Given:
+    device = body.calibration_of
+    return Given(
+        poses=body.poses,
+        poses_of=body.poses_of,
+        calibration_of=device or "",
+        calibration=None if device is None else calibration_of(device, sources, profiles),
+    )
+
+
+def user_of(request: Request) -> str:
+    """Who asks, by the name of the token."""
+    return request.state.caller.name or ""
 
 
 def accepted(row: ReconstructionRow, request: Request, response: Response) -> ReconstructionOut:

@@ -172,6 +172,7 @@ class ReconstructionOut(Out):
     reason: str = Field(description="Why it failed, waits or tracks badly; empty while all is well.")
     warnings: list[str] = Field(description="What it found out about the camera, or had to assume.")
     priority: int
+    user: str = Field(description="Name of the token with which it was queued; empty if none was needed.")
     options: ReconstructionOptions
     poses_from: str = Field(description="Given poses: the id of their reconstruction, or `file`; empty: estimated.")
     calibration_from: str = Field(description="Device of its calibration; empty: that of the recording, if any.")

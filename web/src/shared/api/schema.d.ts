@@ -3836,6 +3836,11 @@ export interface components {
             warnings: string[];
             /** Priority */
             priority: number;
+            /**
+             * User
+             * @description Name of the token with which it was queued; empty if none was needed.
+             */
+            user: string;
             options: components["schemas"]["ReconstructionOptions"];
             /**
              * Poses From

@@ -2,6 +2,7 @@
 
 import os
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -19,6 +20,10 @@ sys.path.append(str(Path(__file__).parent / "usb"))
 from virtual_camera.host import CameraSettings
 from virtual_camera.rig import VirtualCameras, missing
 from virtual_camera.stream import COMPACT_BYTES
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # Started in the background of a shell: commands that tests start would inherit that, and never hear of Ctrl-C.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 START_S = 60.0

@@ -29,8 +29,9 @@ def house(daemon_class: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 
 def names(page: Any) -> list[str]:
+    """Of the captures that are listed; of one without a name its source, without the time that the page adds."""
     found: list[str] = page.locator(".list tbody th a").all_inner_texts()
-    return found
+    return [one.partition(", ")[0] for one in found]
 
 
 def first_of(house: Any, **order: Any) -> list[str]:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from spiked.errors import SpikedError
 from spiked_service.cluster.agent_reports import AgentReports, RefusedError, ServiceClient
-from spiked_service.cluster.job_files import INPUTS, LOG, MANIFEST, OUTPUTS, files_in, moved
+from spiked_service.cluster.job_files import INPUTS, LOG, MANIFEST, OUTPUTS, files_in, moved, of_a_version
 from spiked_service.cluster.messages import AttemptWork, Begin, Manifest, Order, StoredFile
 from spiked_service.cluster.object_store import ObjectStore, stored_file
 from spiked_service.cluster.scratch import scratch_folder
@@ -115,7 +115,7 @@ class _Attempt:
         found = []
         try:
             _link(self._job, snapshot)
-            for path in [*files_in(snapshot), *(one for one in [snapshot / LOG] if one.exists())]:
+            for path in files_in(snapshot, with_log=True):
                 stored = stored_file(path, path.relative_to(snapshot).as_posix())
                 if stored.sha256 not in self._stored:
                     self._store.put_file(path, f"{self._attempt}/{OUTPUTS}/{stored.sha256}", stored)
@@ -136,10 +136,10 @@ def _link(folder: Path, snapshot: Path) -> None:
         shutil.rmtree(snapshot, ignore_errors=True)
         before = _content(folder / INDEX)
         try:
-            for path in [*files_in(folder), *(one for one in [folder / LOG] if one.exists())]:
+            for path in files_in(folder, with_log=True):
                 target = snapshot / path.relative_to(folder)
                 target.parent.mkdir(parents=True, exist_ok=True)
-                if path.name.startswith(("scene-", "trajectory-", "path-")):
+                if of_a_version(path):
                     os.link(path, target)
                 else:
                     shutil.copyfile(path, target)

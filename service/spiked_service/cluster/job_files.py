@@ -17,8 +17,10 @@ MANIFEST = "manifest.json"
 """Written last below the folder of an attempt."""
 LOG = "log"
 """The worker's log in the folder of a job."""
-_OF_THE_SERVICE = frozenset({CAPTURE_ROW, RECONSTRUCTION_ROW, "thumbnail.webp", LOG})
+_OF_THE_SERVICE = frozenset({CAPTURE_ROW, RECONSTRUCTION_ROW, "thumbnail.webp"})
 """Files of the service, which no worker reads."""
+_OF_A_VERSION = ("scene-", "trajectory-", "path-")
+"""How names of files begin that belong to one version: they never change, and go with it."""
 
 
 def recording_of(command: JobCommand) -> Path | None:
@@ -26,12 +28,18 @@ def recording_of(command: JobCommand) -> Path | None:
     return None if isinstance(command, MergeCommand) else command.recording
 
 
-def files_in(folder: Path) -> Iterator[Path]:
+def of_a_version(path: Path) -> bool:
+    """Whether a file belongs to one version."""
+    return path.name.startswith(_OF_A_VERSION)
+
+
+def files_in(folder: Path, *, with_log: bool = False) -> Iterator[Path]:
     """Files of a job or a capture that belong to its results or its inputs: no checkpoint, nothing unfinished."""
+    left_out = _OF_THE_SERVICE if with_log else _OF_THE_SERVICE | {LOG}
     for path in sorted(folder.rglob("*")):
         parts = path.relative_to(folder).parts
         hidden = any(part.startswith(".") for part in parts) or path.suffix == ".part"
-        if path.is_file() and not hidden and parts[0] != CHECKPOINT and parts[0] not in _OF_THE_SERVICE:
+        if path.is_file() and not hidden and parts[0] != CHECKPOINT and parts[0] not in left_out:
             yield path
 
 

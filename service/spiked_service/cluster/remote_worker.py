@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pydantic import ValidationError
 
 from spiked.errors import SpikedError
-from spiked_service.cluster.job_files import MANIFEST, OUTPUTS, files_in, stage
+from spiked_service.cluster.job_files import MANIFEST, OUTPUTS, files_in, of_a_version, stage
 from spiked_service.cluster.messages import (
     AttemptWork,
     Begin,
@@ -264,8 +264,5 @@ class RemoteWorker:
                 self._store.fetch(f"{self._attempt}/{OUTPUTS}/{stored.sha256}", path, stored)
                 self._have[stored.name] = stored.sha256
         for path in files_in(folder):
-            if (
-                path.name.startswith(("scene-", "trajectory-", "path-"))
-                and path.relative_to(folder).as_posix() not in names
-            ):
+            if of_a_version(path) and path.relative_to(folder).as_posix() not in names:
                 path.unlink(missing_ok=True)

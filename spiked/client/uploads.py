@@ -15,8 +15,6 @@ _CHUNK_BYTES = 8 << 20
 """Bytes of an upload in one request."""
 _ARRAYS = (".npy", ".npz", ".h5", ".hdf5")
 """Names of files of arrays, which have no sidecar."""
-_HASH_BYTES = 1 << 20
-"""Bytes read at a time."""
 
 
 class UploadMethods:
@@ -129,8 +127,5 @@ class UploadMethods:
 
 
 def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
     with path.open("rb") as file:
-        while block := file.read(_HASH_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -20,8 +20,6 @@ from spiked.errors import DatasetError
 LOCK_NAME = "spiked-dataset.lock.json"
 _ANY_WRITES = 0o222
 """Bits of a mode that let anybody write."""
-READ_BYTES = 4 << 20
-"""Bytes that are read at a time."""
 
 
 class LockedFile(BaseModel):
@@ -132,14 +130,11 @@ def _checksums(dataset: Dataset, before: Lock | None, progress: Callable[[int, i
 
 
 def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
     try:
         with path.open("rb") as file:
-            while block := file.read(READ_BYTES):
-                digest.update(block)
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror}; copy it anew") from error
-    return digest.hexdigest()
 
 
 def _read(path: Path) -> Lock:

@@ -15,8 +15,6 @@ from spiked_service.cluster.messages import StoredFile
 _Done = TypeVar("_Done")
 _DELAYS_S = (0.2, 1.0, 3.0, 8.0)
 """Delays before an operation is repeated that failed."""
-_CHUNK_BYTES = 1 << 22
-"""Bytes that are hashed at a time."""
 
 
 class ObjectStoreError(SpikedError):
@@ -140,11 +138,8 @@ class ObjectStore:
 
 def sha256_of(path: Path) -> str:
     """Hash of a file's content, in hex."""
-    found = hashlib.sha256()
     with path.open("rb") as file:
-        while chunk := file.read(_CHUNK_BYTES):
-            found.update(chunk)
-    return found.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def stored_file(path: Path, name: str) -> StoredFile:

@@ -11,8 +11,6 @@ GROUND_TRUTH, HELD_OUT, VIEWS = "groundtruth.tum", "views.json", "views"
 """Files and folder of the truth beside a recording."""
 _GEOMETRY = "config.yaml"
 """Of the data sets of SpikeCV, beside a recording without sidecar."""
-_READ_BYTES = 4 << 20
-"""Of a file at once."""
 _DIGEST_BYTES = 16
 """Of BLAKE2b: it tells change, not malice."""
 
@@ -44,8 +42,5 @@ def _inputs(recording: Path) -> list[Path]:
 @cache
 def _content(path: Path, *status: int) -> bytes:
     """The digest of a file; `status` tells the file that was read from a later one."""
-    digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
     with path.open("rb") as file:
-        while block := file.read(_READ_BYTES):
-            digest.update(block)
-    return digest.digest()
+        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=_DIGEST_BYTES)).digest()

@@ -21,8 +21,6 @@ from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.messages import UploadChecked, UploadCommand, UploadConverts
 from spiked_service.workers.roles.recorder import CALIBRATION
 
-_CHUNK_BYTES = 4 << 20
-"""Bytes hashed at a time."""
 _MOST_MEMORY_BYTES = 4 << 30
 """Memory of the worker: a file that unpacks to more ends with an error. Mapped files do not count."""
 
@@ -122,8 +120,5 @@ def _limit_memory() -> None:
 
 
 def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
     with path.open("rb") as file:
-        while chunk := file.read(_CHUNK_BYTES):
-            digest.update(chunk)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()

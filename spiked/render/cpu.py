@@ -45,23 +45,18 @@ class Rasteriser:
             raise ConfigurationError(f"the near plane is at {near:g}: it must be positive")
         self.camera = camera
         k = camera.intrinsics
+        optics = {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy, "width": camera.width, "height": camera.height}
         try:
-            self._native = Renderer(
-                fx=k.fx,
-                fy=k.fy,
-                cx=k.cx,
-                cy=k.cy,
-                width=camera.width,
-                height=camera.height,
-                near=near,
-                threads=threads,
-                **k.lens(),
-            )
+            self._native = self._renderer(near, threads, **optics, **k.lens())
         except ValueError as error:
             raise ConfigurationError(str(error)) from error
         self._inputs: tuple[object, ...] | None = None
         self._shapes: tuple[int, int, int] = (0, 0, 0)
         self._values_shape: tuple[int, ...] = ()
+
+    def _renderer(self, near: float, threads: int, **optics: Any) -> Any:
+        """What does the work."""
+        return Renderer(near=near, threads=threads, **optics)
 
     @property
     def instructions(self) -> str:

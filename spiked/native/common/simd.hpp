@@ -6,6 +6,8 @@
 #include <stdint.h>
 #include <string.h>
 
+#define SPIKED_DEVICE  // before functions that a GPU runs as well, see native/gpu/lane.hpp
+
 #if defined(__SSE2__)
 #include <immintrin.h>
 #elif defined(SPIKED_NEON)

@@ -4,8 +4,6 @@
 namespace spiked {
 namespace {
 
-constexpr float kMargin = 0.01f;  // px; absorbs rounding, costs next to nothing
-
 alignas(64) static constexpr float kFours[16] = {0, 4, 8, 12, 16, 20, 24, 28, 32, 36, 40, 44, 48, 52, 56, 60};
 
 // Columns of blocks that a splat reaches in each row of blocks, empty where first > last.
@@ -18,7 +16,6 @@ struct Columns {
 
 // Fills the columns of `rows` rows of blocks from `row`.
 static void block_columns(const ProjectedSplat& s, const PinholeF& camera, int row, int rows, Columns& out) {
-    const float reach = s.log2_opacity + kLog2Cut;
     const float half_y = s.half_y + kMargin;
     // As far as the ellipse reaches anywhere, which no row goes beyond.
     const float left_most = s.x - s.half_x - (0.5f + 4 * kMargin), right_most = s.x + s.half_x - (0.5f - 4 * kMargin);
@@ -29,9 +26,8 @@ static void block_columns(const ProjectedSplat& s, const PinholeF& camera, int r
         Vec low = lane + (4.0f * (row + at) + 0.5f - s.y), high = low + 3.0f;
         low = max(low, broadcast(-half_y));
         high = min(high, broadcast(half_y));
-        Vec right_dy = clamp(broadcast(s.extreme), low, high), left_dy = clamp(broadcast(-s.extreme), low, high);
-        Vec right = sqrt(max(reach - s.r * s.r * right_dy * right_dy, Vec{})) - s.q * right_dy;
-        Vec left = -sqrt(max(reach - s.r * s.r * left_dy * left_dy, Vec{})) - s.q * left_dy;
+        Vec left, right;
+        extent_in_rows(s, low, high, left, right);
         Vec width = broadcast(camera.width);
         Vec last_pixel = clamp(s.x + right * s.over_p - (0.5f - kMargin), broadcast(-1.0f), width - 1.0f) + 1.0f;
         Vec first_pixel = width - clamp(s.x + left * s.over_p - (0.5f + kMargin), Vec{}, width);

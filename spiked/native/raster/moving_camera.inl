@@ -13,7 +13,7 @@ struct Covered {
     float length;  // of that part
 };
 
-static inline Covered covered_by(const Planes& planes, int64_t at) {
+SPIKED_DEVICE static inline Covered covered_by(const Planes& planes, int64_t at) {
     const float start = planes.start[at], stop = planes.stop[at];
     const float from = start > planes.sub_frame ? start : planes.sub_frame;
     const float to = stop < planes.sub_frame + 1 ? stop : planes.sub_frame + 1;
@@ -22,7 +22,7 @@ static inline Covered covered_by(const Planes& planes, int64_t at) {
     return {length / (stop - start), 0.5f * (from - planes.sub_frame + (to - planes.sub_frame)) - 0.5f, length};
 }
 
-static void cover(const Planes& planes, int64_t count, double* weight, double* square, float* time_reach) {
+SPIKED_DEVICE static inline void cover(const Planes& planes, int64_t count, double* weight, double* square, float* time_reach) {
     constexpr int64_t kRun = 1024;
     double weights = 0, squares = 0;
     float farthest = 0;
@@ -69,7 +69,7 @@ struct SubFrameProjection {
 };
 
 template <bool Bent>
-static inline SubFrameProjection project_sub_frame(const Prepared& s, const PinholeF& camera, const SubFrame& sub_frame,
+SPIKED_DEVICE static inline SubFrameProjection project_sub_frame(const Prepared& s, const PinholeF& camera, const SubFrame& sub_frame,
                                                    int base) {
     SubFrameProjection o;
     o.begin = project_lanes<Bent>(s, camera, sub_frame.begin, base);
@@ -113,7 +113,7 @@ static inline SubFrameProjection project_sub_frame(const Prepared& s, const Pinh
 }
 
 template <bool Bent>
-static void project_moving_by(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame, int count,
+SPIKED_DEVICE static inline void project_moving_by(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame, int count,
                               int first, int last, ProjectedSplat* records, Motion* motions, uint32_t* keys) {
     alignas(64) float out[6][kLanes];
     for (int base = first; base < last; base += kLanes) {
@@ -156,53 +156,63 @@ static void project_moving_by(const Prepared& splats, const PinholeF& camera, co
     }
 }
 
-static void project_moving(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame, int count,
+SPIKED_DEVICE static inline void project_moving(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame, int count,
                            int first, int last, ProjectedSplat* records, Motion* motions, uint32_t* keys) {
     auto* run = camera.lens ? project_moving_by<true> : project_moving_by<false>;
     run(splats, camera, sub_frame, count, first, last, records, motions, keys);
 }
 
+// As unproject_at, by the poses at both ends of the sub-frame.
+template <bool Bent, class Sums>
+SPIKED_DEVICE static inline void unproject_moving_at(const Prepared& splats, const PinholeF& camera,
+                                                     const SubFrame& sub_frame, int base, Int seen, Sums sum,
+                                                     int colours, const SplatGradients& out, double pose_begin[6],
+                                                     double pose_end[6]) {
+    const int into = base - out.first;
+    const Vec opacity = sum(kV);
+    add(out.log_opacity + into, opacity);
+    add(out.share + into, sum(kShare));
+    for (int k = 0; k < colours; ++k) add(out.colour[k] + into, sum(kColour0 + k));
+
+    const SubFrameProjection o = project_sub_frame<Bent>(splats, camera, sub_frame, base);
+    constexpr float scale = 1.0f / kHalfLog2e;
+    const Vec suu = sum(kVuu), suw = sum(kVuw), sww = sum(kVww);
+    const Vec g_u = scale * o.p * sum(kVu), g_v = scale * (o.q * sum(kVu) + o.r * sum(kVw));
+    // Twice dL/dSigma2D of the blurred covariance, the blurred opacity's part included.
+    const Vec fade = opacity / o.blurred_determinant;
+    const Vec b_xx = scale * scale * o.p * o.p * suu - fade * o.blurred_yy;
+    const Vec b_xy = scale * scale * o.p * (o.q * suu + o.r * suw) + fade * o.blurred_xy;
+    const Vec b_yy = scale * scale * (o.q * (o.q * suu + 2 * o.r * suw) + o.r * o.r * sww) - fade * o.blurred_xx;
+    // By the motion: through the position at a pixel's time, and through the blur.
+    const Vec g_du = scale * o.p * sum(kVut) + sub_frame.blur * (b_xx * o.du + b_xy * o.dv);
+    const Vec g_dv = scale * (o.q * sum(kVut) + o.r * sum(kVwt)) + sub_frame.blur * (b_xy * o.du + b_yy * o.dv);
+    const Vec unfade = opacity / o.determinant;
+    const Vec c_xx = b_xx + unfade * o.yy, c_xy = b_xy - unfade * o.xy, c_yy = b_yy + unfade * o.xx;
+    Vec d_m0[3], d_m1[3];
+    for (int k = 0; k < 3; ++k) {
+        d_m0[k] = 0.5f * (c_xx * o.m0[k] + c_xy * o.m1[k]);
+        d_m1[k] = 0.5f * (c_xy * o.m0[k] + c_yy * o.m1[k]);
+    }
+    unproject_lanes<Bent>(splats, camera, sub_frame.begin, o.begin, seen, base, into, 0.5f * g_u - g_du,
+                          0.5f * g_v - g_dv, d_m0, d_m1, out, pose_begin);
+    unproject_lanes<Bent>(splats, camera, sub_frame.end, o.end, seen, base, into, 0.5f * g_u + g_du,
+                          0.5f * g_v + g_dv, d_m0, d_m1, out, pose_end);
+}
+
 template <bool Bent>
-static void unproject_moving_by(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame, int first,
-                                const float* sums, const uint8_t* visible, int colours, const SplatGradients& out,
-                                double pose_begin[6], double pose_end[6]) {
+SPIKED_DEVICE static inline void unproject_moving_by(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame,
+                                       int first, const float* sums, const uint8_t* visible, int colours,
+                                       const SplatGradients& out, double pose_begin[6], double pose_end[6]) {
     for (int at = 0; at < kGroup; at += kLanes) {
-        const int base = first + at, into = base - out.first;
         Int seen;
         for (int i = 0; i < kLanes; ++i) seen[i] = visible[at + i] ? -1 : 0;
         auto sum = [&](int which) { return load(sums + which * kGroup + at); };
-        const Vec opacity = sum(kV);
-        add(out.log_opacity + into, opacity);
-        add(out.share + into, sum(kShare));
-        for (int k = 0; k < colours; ++k) add(out.colour[k] + into, sum(kColour0 + k));
-
-        const SubFrameProjection o = project_sub_frame<Bent>(splats, camera, sub_frame, base);
-        constexpr float scale = 1.0f / kHalfLog2e;
-        const Vec suu = sum(kVuu), suw = sum(kVuw), sww = sum(kVww);
-        const Vec g_u = scale * o.p * sum(kVu), g_v = scale * (o.q * sum(kVu) + o.r * sum(kVw));
-        // Twice dL/dSigma2D of the blurred covariance, the blurred opacity's part included.
-        const Vec fade = opacity / o.blurred_determinant;
-        const Vec b_xx = scale * scale * o.p * o.p * suu - fade * o.blurred_yy;
-        const Vec b_xy = scale * scale * o.p * (o.q * suu + o.r * suw) + fade * o.blurred_xy;
-        const Vec b_yy = scale * scale * (o.q * (o.q * suu + 2 * o.r * suw) + o.r * o.r * sww) - fade * o.blurred_xx;
-        // By the motion: through the position at a pixel's time, and through the blur.
-        const Vec g_du = scale * o.p * sum(kVut) + sub_frame.blur * (b_xx * o.du + b_xy * o.dv);
-        const Vec g_dv = scale * (o.q * sum(kVut) + o.r * sum(kVwt)) + sub_frame.blur * (b_xy * o.du + b_yy * o.dv);
-        const Vec unfade = opacity / o.determinant;
-        const Vec c_xx = b_xx + unfade * o.yy, c_xy = b_xy - unfade * o.xy, c_yy = b_yy + unfade * o.xx;
-        Vec d_m0[3], d_m1[3];
-        for (int k = 0; k < 3; ++k) {
-            d_m0[k] = 0.5f * (c_xx * o.m0[k] + c_xy * o.m1[k]);
-            d_m1[k] = 0.5f * (c_xy * o.m0[k] + c_yy * o.m1[k]);
-        }
-        unproject_lanes<Bent>(splats, camera, sub_frame.begin, o.begin, seen, base, into, 0.5f * g_u - g_du,
-                              0.5f * g_v - g_dv, d_m0, d_m1, out, pose_begin);
-        unproject_lanes<Bent>(splats, camera, sub_frame.end, o.end, seen, base, into, 0.5f * g_u + g_du,
-                              0.5f * g_v + g_dv, d_m0, d_m1, out, pose_end);
+        unproject_moving_at<Bent>(splats, camera, sub_frame, first + at, seen, sum, colours, out, pose_begin,
+                                  pose_end);
     }
 }
 
-static void unproject_moving(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame, int first,
+SPIKED_DEVICE static inline void unproject_moving(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame, int first,
                              const float* sums, const uint8_t* visible, int colours, const SplatGradients& out,
                              double pose_begin[6], double pose_end[6]) {
     auto* run = camera.lens ? unproject_moving_by<true> : unproject_moving_by<false>;

@@ -1,4 +1,4 @@
-// Splats to screen and gradients back. Notation: W world to camera, p = W (mu -
+// Splats to screen and gradients back; a GPU's threads run the same lines, a lane each (native/gpu). Notation: W world to camera, p = W (mu -
 // c), J the Jacobian of the projection, M = J W (splat spread), Sigma2D = M M^T + 0.3 I.
 
 namespace spiked {
@@ -11,7 +11,7 @@ constexpr float kLog2e = 1.442695041f;
 
 // Columns of an array of rows, kLanes rows from `first`; beyond the count the last row is repeated.
 template <int Columns>
-static inline void read_rows(const float* rows, int first, int count, Vec out[Columns]) {
+SPIKED_DEVICE static inline void read_rows(const float* rows, int first, int count, Vec out[Columns]) {
     alignas(64) float in[Columns][kLanes];
     for (int i = 0; i < kLanes; ++i) {
         const float* row = rows + (int64_t)Columns * (first + i < count ? first + i : count - 1);
@@ -21,7 +21,7 @@ static inline void read_rows(const float* rows, int first, int count, Vec out[Co
 }
 
 template <int Columns>
-static inline void write_rows(float* rows, int first, int last, const Vec in[Columns]) {
+SPIKED_DEVICE static inline void write_rows(float* rows, int first, int last, const Vec in[Columns]) {
     alignas(64) float out[Columns][kLanes];
     for (int k = 0; k < Columns; ++k) store(out[k], in[k]);
     for (int i = 0; i < kLanes && first + i < last; ++i)
@@ -29,17 +29,17 @@ static inline void write_rows(float* rows, int first, int last, const Vec in[Col
 }
 
 // Makes a quaternion wxyz a unit one; returns the factor.
-static inline Vec normalise(Vec q[4]) {
+SPIKED_DEVICE static inline Vec normalise(Vec q[4]) {
     Vec scale = 1.0f / sqrt(max(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3], broadcast(1e-24f)));
     for (int k = 0; k < 4; ++k) q[k] *= scale;
     return scale;
 }
 
-static inline Vec scale_of(Vec log_scale) {
+SPIKED_DEVICE static inline Vec scale_of(Vec log_scale) {
     return exp2_fine(clamp(log_scale, broadcast(-30.0f), broadcast(30.0f)) * kLog2e);
 }
 
-static void prepare(const SplatArrays& splats, int first, int last, float* const mean[3], float* const spread[9],
+SPIKED_DEVICE static inline void prepare(const SplatArrays& splats, int first, int last, float* const mean[3], float* const spread[9],
                     float* log2_opacity) {
     for (int base = first; base < last; base += kLanes) {
         Vec position[3], quat[4], log_scale[3], logit;
@@ -84,7 +84,7 @@ struct ProjectionLanes {
 
 // The angle to the axis of a slope r >= 0, to 2e-8 (M. Abramowitz and I. Stegun, "Handbook of mathematical functions",
 // 4.4.49).
-static inline Vec arctangent(Vec r) {
+SPIKED_DEVICE static inline Vec arctangent(Vec r) {
     const Int steep = r > 1.0f;
     const Vec x = select(steep, 1.0f / max(r, broadcast(1e-6f)), r), t = x * x;
     constexpr float kTerms[] = {-0.0161657367f, 0.0429096138f, -0.0752896400f, 0.1065626393f,
@@ -96,7 +96,7 @@ static inline Vec arctangent(Vec r) {
 }
 
 // Bends the slopes of a projection.
-static inline void bend_lanes(const PinholeF& camera, ProjectionLanes& o) {
+SPIKED_DEVICE static inline void bend_lanes(const PinholeF& camera, ProjectionLanes& o) {
     const Vec x = o.raw_x, y = o.raw_y, square = x * x + y * y;
     const float* k = camera.coefficients;
     Vec scale, growth, curvature;  // the factor of the slopes, and its derivatives by the square
@@ -138,7 +138,7 @@ static inline void bend_lanes(const PinholeF& camera, ProjectionLanes& o) {
 }
 
 template <bool Bent>
-static inline ProjectionLanes project_lanes(const Prepared& s, const PinholeF& camera, const View& view, int base) {
+SPIKED_DEVICE static inline ProjectionLanes project_lanes(const Prepared& s, const PinholeF& camera, const View& view, int base) {
     ProjectionLanes o;
     for (int k = 0; k < 3; ++k) o.offset[k] = (load(s.mean[k] + base) - view.centre_high[k]) - view.centre_low[k];
     const float* w = view.rotation;
@@ -176,17 +176,28 @@ static inline ProjectionLanes project_lanes(const Prepared& s, const PinholeF& c
     return o;
 }
 
+constexpr float kMargin = 0.01f;  // px; absorbs rounding, costs next to nothing
+
+// How far to the left and to the right of its mean a splat's ellipse reaches in bands of rows, times its p; from `low` to
+// `high`, rows from its mean, not beyond the ellipse.
+SPIKED_DEVICE static inline void extent_in_rows(const ProjectedSplat& s, Vec low, Vec high, Vec& left, Vec& right) {
+    const float reach = s.log2_opacity + kLog2Cut;
+    Vec right_dy = clamp(broadcast(s.extreme), low, high), left_dy = clamp(broadcast(-s.extreme), low, high);
+    right = sqrt(max(reach - s.r * s.r * right_dy * right_dy, Vec{})) - s.q * right_dy;
+    left = -sqrt(max(reach - s.r * s.r * left_dy * left_dy, Vec{})) - s.q * left_dy;
+}
+
 // Writes kLanes records of visible splats, and their keys.
-static inline void write_records(const Vec fields[kRecordFields], Int visible, int base, int count,
+SPIKED_DEVICE static inline void write_records(const Vec fields[kRecordFields], Int visible, int base, int count,
                                  ProjectedSplat* records, uint32_t* keys) {
     alignas(64) float out[kRecordFields][kLanes];
     alignas(64) int32_t seen[kLanes];
     for (int k = 0; k < kRecordFields; ++k) store(out[k], fields[k]);
-    __builtin_memcpy(seen, &visible, sizeof seen);
+    memcpy(seen, &visible, sizeof seen);
     for (int i = 0; i < kLanes && base + i < count; ++i) {
         keys[base + i] = kCulled;
         if (!seen[i]) continue;
-        __builtin_memcpy(&keys[base + i], &out[6][i], 4);
+        memcpy(&keys[base + i], &out[6][i], 4);
         // The fields are the record's first floats, in order.
         float* record = &records[base + i].x;
         for (int k = 0; k < kRecordFields; ++k) record[k] = out[k][i];
@@ -194,7 +205,7 @@ static inline void write_records(const Vec fields[kRecordFields], Int visible, i
 }
 
 template <bool Bent>
-static void project_by(const Prepared& splats, const PinholeF& camera, const View& view, int count, int first, int last,
+SPIKED_DEVICE static inline void project_by(const Prepared& splats, const PinholeF& camera, const View& view, int count, int first, int last,
                        ProjectedSplat* records, uint32_t* keys) {
     for (int base = first; base < last; base += kLanes) {
         ProjectionLanes o = project_lanes<Bent>(splats, camera, view, base);
@@ -217,15 +228,15 @@ static void project_by(const Prepared& splats, const PinholeF& camera, const Vie
     }
 }
 
-static void project(const Prepared& splats, const PinholeF& camera, const View& view, int count, int first, int last,
+SPIKED_DEVICE static inline void project(const Prepared& splats, const PinholeF& camera, const View& view, int count, int first, int last,
                     ProjectedSplat* records, uint32_t* keys) {
     (camera.lens ? project_by<true> : project_by<false>)(splats, camera, view, count, first, last, records, keys);
 }
 
-static inline void add(float* p, Vec v) { store(p, load(p) + v); }
+SPIKED_DEVICE static inline void add(float* p, Vec v) { store(p, load(p) + v); }
 
 // From gradients by what the lens shows to gradients by what a camera without distortion would show.
-static inline void straighten_gradients(const PinholeF& camera, const ProjectionLanes& o, Vec& g_u, Vec& g_v,
+SPIKED_DEVICE static inline void straighten_gradients(const PinholeF& camera, const ProjectionLanes& o, Vec& g_u, Vec& g_v,
                                         Vec d_m0[3], Vec d_m1[3], Vec& d_x, Vec& d_y) {
     const BendLanes& b = o.bend;
     const float across = camera.fx / camera.fy, down = camera.fy / camera.fx;
@@ -250,7 +261,7 @@ static inline void straighten_gradients(const PinholeF& camera, const Projection
 // Adds the gradients of one projection by the splat and the pose: g_u, g_v by the mean on screen, by_m0, by_m1 by M's
 // rows.
 template <bool Bent>
-static inline void unproject_lanes(const Prepared& splats, const PinholeF& camera, const View& view,
+SPIKED_DEVICE static inline void unproject_lanes(const Prepared& splats, const PinholeF& camera, const View& view,
                                    const ProjectionLanes& o, Int seen, int base, int into, Vec g_u, Vec g_v,
                                    const Vec by_m0[3], const Vec by_m1[3], const SplatGradients& out, double pose[6]) {
     Vec jx = camera.fx * o.over_z, jy = camera.fy * o.over_z;
@@ -305,43 +316,52 @@ static inline void unproject_lanes(const Prepared& splats, const PinholeF& camer
     }
 }
 
+// The gradients of the splats from `base` on by the sums over their pixels: sum(which) is one of `Sum`.
+template <bool Bent, class Sums>
+SPIKED_DEVICE static inline void unproject_at(const Prepared& splats, const PinholeF& camera, const View& view,
+                                              int base, Int seen, Sums sum, int colours, const SplatGradients& out,
+                                              double pose[6]) {
+    const int into = base - out.first;
+    add(out.log_opacity + into, sum(kV));
+    add(out.share + into, sum(kShare));
+    for (int k = 0; k < colours; ++k) add(out.colour[k] + into, sum(kColour0 + k));
+
+    ProjectionLanes o = project_lanes<Bent>(splats, camera, view, base);
+    // Offsets times the conic are (p u, q u + r w) / kHalfLog2e, so nothing has to be inverted.
+    constexpr float scale = 1.0f / kHalfLog2e;
+    Vec su = sum(kVu), sw = sum(kVw), suu = sum(kVuu), suw = sum(kVuw), sww = sum(kVww);
+    Vec g_u = scale * o.p * su, g_v = scale * (o.q * su + o.r * sw);
+    Vec c_xx = scale * scale * o.p * o.p * suu;  // twice dL/dSigma2D
+    Vec c_xy = scale * scale * o.p * (o.q * suu + o.r * suw);
+    Vec c_yy = scale * scale * (o.q * (o.q * suu + 2 * o.r * suw) + o.r * o.r * sww);
+
+    Vec d_m0[3], d_m1[3];
+    for (int k = 0; k < 3; ++k) {
+        d_m0[k] = c_xx * o.m0[k] + c_xy * o.m1[k];
+        d_m1[k] = c_xy * o.m0[k] + c_yy * o.m1[k];
+    }
+    unproject_lanes<Bent>(splats, camera, view, o, seen, base, into, g_u, g_v, d_m0, d_m1, out, pose);
+}
+
 template <bool Bent>
-static void unproject_by(const Prepared& splats, const PinholeF& camera, const View& view, int first, const float* sums,
-                         const uint8_t* visible, int colours, const SplatGradients& out, double pose[6]) {
+SPIKED_DEVICE static inline void unproject_by(const Prepared& splats, const PinholeF& camera, const View& view, int first,
+                                const float* sums, const uint8_t* visible, int colours, const SplatGradients& out,
+                                double pose[6]) {
     for (int at = 0; at < kGroup; at += kLanes) {
-        const int base = first + at, into = base - out.first;
         Int seen;
         for (int i = 0; i < kLanes; ++i) seen[i] = visible[at + i] ? -1 : 0;
         auto sum = [&](int which) { return load(sums + which * kGroup + at); };
-        add(out.log_opacity + into, sum(kV));
-        add(out.share + into, sum(kShare));
-        for (int k = 0; k < colours; ++k) add(out.colour[k] + into, sum(kColour0 + k));
-
-        ProjectionLanes o = project_lanes<Bent>(splats, camera, view, base);
-        // Offsets times the conic are (p u, q u + r w) / kHalfLog2e, so nothing has to be inverted.
-        constexpr float scale = 1.0f / kHalfLog2e;
-        Vec su = sum(kVu), sw = sum(kVw), suu = sum(kVuu), suw = sum(kVuw), sww = sum(kVww);
-        Vec g_u = scale * o.p * su, g_v = scale * (o.q * su + o.r * sw);
-        Vec c_xx = scale * scale * o.p * o.p * suu;  // twice dL/dSigma2D
-        Vec c_xy = scale * scale * o.p * (o.q * suu + o.r * suw);
-        Vec c_yy = scale * scale * (o.q * (o.q * suu + 2 * o.r * suw) + o.r * o.r * sww);
-
-        Vec d_m0[3], d_m1[3];
-        for (int k = 0; k < 3; ++k) {
-            d_m0[k] = c_xx * o.m0[k] + c_xy * o.m1[k];
-            d_m1[k] = c_xy * o.m0[k] + c_yy * o.m1[k];
-        }
-        unproject_lanes<Bent>(splats, camera, view, o, seen, base, into, g_u, g_v, d_m0, d_m1, out, pose);
+        unproject_at<Bent>(splats, camera, view, first + at, seen, sum, colours, out, pose);
     }
 }
 
-static void unproject(const Prepared& splats, const PinholeF& camera, const View& view, int first, const float* sums,
+SPIKED_DEVICE static inline void unproject(const Prepared& splats, const PinholeF& camera, const View& view, int first, const float* sums,
                       const uint8_t* visible, int colours, const SplatGradients& out, double pose[6]) {
     auto* run = camera.lens ? unproject_by<true> : unproject_by<false>;
     run(splats, camera, view, first, sums, visible, colours, out, pose);
 }
 
-static void finish(const SplatArrays& splats, const Prepared& prepared, const SplatGradients& sums, int first, int last,
+SPIKED_DEVICE static inline void finish(const SplatArrays& splats, const Prepared& prepared, const SplatGradients& sums, int first, int last,
                    float share_scale, const GradientArrays& out) {
     for (int base = first; base < last; base += kLanes) {
         const int from = base - sums.first;

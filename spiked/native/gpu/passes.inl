@@ -1,0 +1,247 @@
+// The passes of the renderer: kernels in their order. `Device` has memory and runs kernels:
+//
+//   template <class T> class Buffer { T* grow(size_t count); T* data(); };   contents are lost when it grows
+//   template <class T> const T* upload(Buffer<T>&, const T*, size_t count);
+//   template <class T> void download(T* to, const T* from, size_t count);    done after finish()
+//   void finish();
+//   template <class Kernel> void run(const Kernel&, uint64_t blocks);
+//   void sort(const uint32_t* keys, uint32_t* sorted_keys, const uint32_t* values, uint32_t* sorted_values, size_t count,
+//             int bits);                                                     equal keys keep their order
+//   void add_up(const uint64_t* counts, uint64_t* sums, size_t count);       sums[i] of those before i
+
+#include <algorithm>
+#include <stdexcept>
+#include <type_traits>
+
+namespace spiked {
+namespace {
+
+constexpr uint64_t kMaxPairs = 1u << 30;  // of a splat and a tile
+
+View view_of_pose(const double* rotation, const double* centre) {
+    View view;
+    for (int i = 0; i < 3; ++i) {
+        for (int j = 0; j < 3; ++j) view.rotation[3 * i + j] = static_cast<float>(rotation[3 * j + i]);
+        view.centre_high[i] = static_cast<float>(centre[i]);
+        view.centre_low[i] = static_cast<float>(centre[i] - view.centre_high[i]);
+    }
+    return view;
+}
+
+// call(std::true_type or std::false_type), by the value.
+template <class Call>
+void choose(bool value, Call call) {
+    if (value) {
+        call(std::true_type{});
+    } else {
+        call(std::false_type{});
+    }
+}
+
+template <class Device>
+class Passes final : public GpuRenderer {
+  public:
+    explicit Passes(const PinholeF& camera) : GpuRenderer(camera) {}
+
+    const char* instructions() const override { return Device::kName; }
+
+    void forward(const SplatArrays& splats, const Views& views, const float background[3], float* values, float* alpha,
+                 float* depth) override {
+        poses_ = 0;  // until it is done
+        take(splats, views);
+        choose(camera_.lens != 0, [&](auto bent) {
+            choose(moving_, [&](auto moving) { project<bent, moving>(); });
+        });
+        list_pairs();
+        choose(splats_.colours == 3, [&](auto coloured) {
+            choose(moving_, [&](auto moving) {
+                composite<coloured ? 3 : 1, moving>(background, values, alpha, depth);
+            });
+        });
+        poses_ = views.count;
+        mosaic_ = views.channels != nullptr;
+    }
+
+    void backward(const float* d_values, const GradientArrays& out) override {
+        const size_t shown = pixels() * (mosaic_ ? 1 : splats_.colours);
+        const float* slopes = device_.upload(d_values_, d_values, shown);
+        float* slots = slots_.grow(static_cast<size_t>(pairs_) * slot_floats(splats_.colours, moving_) + 1);
+        choose(splats_.colours == 3, [&](auto coloured) {
+            choose(moving_, [&](auto moving) {
+                device_.run(Backward<coloured ? 3 : 1, moving>{tiles_, states_, slopes, slots},
+                            static_cast<uint64_t>(sub_poses_) * tiles());
+            });
+        });
+        choose(camera_.lens != 0, [&](auto bent) {
+            choose(moving_, [&](auto moving) { unproject<bent, moving>(out); });
+        });
+        device_.finish();
+    }
+
+  private:
+    template <class T>
+    using Buffer = typename Device::template Buffer<T>;
+
+    int tiles() const { return camera_.tiles_x * camera_.tiles_y; }
+    size_t pixels() const { return static_cast<size_t>(camera_.width) * camera_.height; }
+    size_t records() const { return static_cast<size_t>(splats_.count) * sub_poses_; }
+    static uint64_t blocks(uint64_t threads, int of_block) { return (threads + of_block - 1) / of_block; }
+
+    // Brings everything to the device.
+    void take(const SplatArrays& splats, const Views& views) {
+        const size_t n = splats.count;
+        moving_ = views.start != nullptr;
+        sub_poses_ = moving_ ? views.count - 1 : views.count;
+        splats_ = {splats.count,
+                   splats.colours,
+                   device_.upload(means_, splats.means, 3 * n),
+                   device_.upload(quats_, splats.quats, 4 * n),
+                   device_.upload(log_scales_, splats.log_scales, 3 * n),
+                   device_.upload(opacity_logits_, splats.opacity_logits, n),
+                   device_.upload(colours_, splats.colour, splats.colours * n)};
+        std::vector<View> poses(views.count);
+        for (int i = 0; i < views.count; ++i)
+            poses[i] = view_of_pose(views.rotations + 9 * i, views.centres + 3 * i);
+        tiles_ = {};
+        tiles_.camera = camera_;
+        tiles_.sub_poses = sub_poses_;
+        if (views.weights) tiles_.weights = device_.upload(weights_, views.weights, sub_poses_ * pixels());
+        if (views.channels) tiles_.channels = device_.upload(channels_, views.channels, pixels());
+        if (moving_) {
+            tiles_.begin = device_.upload(weights_, views.start, 2 * pixels());
+            tiles_.end = tiles_.begin + pixels();
+        }
+        scene_.camera = camera_;
+        scene_.splats = splats_;
+        scene_.poses = {device_.upload(views_, poses.data(), poses.size()), sub_frames_.grow(sub_poses_), sub_poses_};
+        Prepare prepare{splats_, {}, {}, nullptr};
+        float* at = prepared_.grow(13 * n);
+        for (int k = 0; k < 3; ++k, at += n) scene_.prepared.mean[k] = prepare.mean[k] = at;
+        for (int k = 0; k < 9; ++k, at += n) scene_.prepared.spread[k] = prepare.spread[k] = at;
+        scene_.prepared.log2_opacity = prepare.log2_opacity = at;
+        device_.run(prepare, blocks(n, Prepare::kThreads));
+        if (moving_)
+            device_.run(SetSubFrames{scene_.poses, tiles_.begin, tiles_.end, static_cast<int64_t>(pixels())}, sub_poses_);
+    }
+
+    template <bool Bent, bool Moving>
+    void project() {
+        const Project<Bent, Moving> kernel{scene_, records_.grow(records()),
+                                           Moving ? motions_.grow(records()) : nullptr, keys_.grow(records()),
+                                           order_.grow(records())};
+        device_.run(kernel, blocks(records(), kernel.kThreads));
+        tiles_.records = kernel.records;
+        tiles_.motions = kernel.motions;
+    }
+
+    // Lists the splats of every tile in order of depth, equal depths by number: they are sorted by depth, their pairs
+    // are listed in that order, and then sorted by tile.
+    void list_pairs() {
+        const size_t count = records();
+        if (count >= kCulled) throw std::runtime_error("too many splats and poses for one render");
+        uint32_t *sorted = sorted_keys_.grow(count), *order = sorted_order_.grow(count);
+        device_.sort(keys_.data(), sorted, order_.data(), order, count, 32);
+        uint64_t *reached = counts_.grow(count + 1), *first = first_pairs_.grow(count + 1);
+        device_.run(CountTiles{camera_, tiles_.records, sorted, order, static_cast<uint32_t>(count), reached},
+                    blocks(count + 1, CountTiles::kThreads));
+        device_.add_up(reached, first, count + 1);
+        uint64_t pairs = 0;
+        device_.download(&pairs, first + count, 1);
+        device_.finish();
+        if (pairs > kMaxPairs)
+            throw std::runtime_error("the splats reach more than 2^30 tiles together: render fewer poses or a smaller image");
+        pairs_ = static_cast<uint32_t>(pairs);
+        const uint32_t all_tiles = static_cast<uint32_t>(sub_poses_) * tiles();
+        device_.run(ListPairs{camera_, tiles_.records, order, first, static_cast<uint32_t>(count),
+                              static_cast<uint32_t>(splats_.count), pair_tiles_.grow(pairs_ + 1), pair_.grow(pairs_ + 1),
+                              pair_record_.grow(pairs_ + 1), first_of_record_.grow(count), pairs_of_record_.grow(count)},
+                    blocks(count, ListPairs::kThreads));
+        int bits = 1;
+        while (all_tiles >> bits) ++bits;
+        uint32_t *by_tile = sorted_tiles_.grow(pairs_ + 1), *listed = sorted_pairs_.grow(pairs_ + 1);
+        device_.sort(pair_tiles_.data(), by_tile, pair_.data(), listed, pairs_, bits);
+        uint32_t* start = tile_start_.grow(all_tiles + 1);
+        device_.run(FindTiles{by_tile, pairs_, all_tiles, start}, blocks(static_cast<uint64_t>(pairs_) + 1, FindTiles::kThreads));
+        tiles_.start = start;
+        tiles_.pairs = listed;
+        tiles_.pair_record = pair_record_.data();
+    }
+
+    template <int C, bool Moving>
+    void composite(const float background[3], float* values, float* alpha, float* depth) {
+        const uint64_t all_tiles = static_cast<uint64_t>(sub_poses_) * tiles();
+        const size_t kept = all_tiles * kTilePixels, shown = pixels() * (C == 1 || tiles_.channels ? 1 : 3);
+        float* at = state_.grow((C + 2) * kept);
+        states_ = {};
+        for (int k = 0; k < C; ++k, at += kept) states_.colour[k] = at;
+        states_.transmittance = at;
+        states_.depth = at + kept;
+        states_.end = ends_.grow(kept);
+        device_.run(Forward<C, Moving>{tiles_, states_, {background[0], background[1], background[2]}}, all_tiles);
+        float* image = image_.grow(shown + 2 * pixels());
+        device_.run(Combine<C, Moving>{tiles_, states_, image, image + shown, image + shown + pixels()}, tiles());
+        device_.download(values, image, shown);
+        device_.download(alpha, image + shown, pixels());
+        device_.download(depth, image + shown + pixels(), pixels());
+        device_.finish();
+    }
+
+    template <bool Bent, bool Moving>
+    void unproject(const GradientArrays& out) {
+        using Kernel = Unproject<Bent, Moving>;
+        const size_t n = splats_.count, c = splats_.colours;
+        float* at = gradients_.grow(n * (13 + c));
+        GradientArrays made{};
+        const auto take = [&](float*& array, size_t columns) { array = at, at += n * columns; };
+        take(made.means, 3), take(made.quats, 4), take(made.log_scales, 3), take(made.opacity_logits, 1);
+        take(made.colour, c), take(made.contribution, 1), take(made.radius_px, 1);
+        const uint64_t count = blocks(n, Kernel::kThreads);
+        double* partial = partial_.grow(count * poses_ * 6 + 1);
+        device_.run(Kernel{scene_, first_of_record_.data(), pairs_of_record_.data(), keys_.data(), tiles_.records,
+                           slots_.data(), slot_floats(splats_.colours, Moving), made, partial, poses_},
+                    count);
+        double* by_poses = by_poses_.grow(static_cast<size_t>(poses_) * 6);
+        device_.run(SumPoses{partial, static_cast<int>(count), poses_, by_poses}, static_cast<uint64_t>(poses_) * 6);
+        device_.download(out.means, made.means, 3 * n);
+        device_.download(out.quats, made.quats, 4 * n);
+        device_.download(out.log_scales, made.log_scales, 3 * n);
+        device_.download(out.opacity_logits, made.opacity_logits, n);
+        device_.download(out.colour, made.colour, c * n);
+        device_.download(out.contribution, made.contribution, n);
+        device_.download(out.radius_px, made.radius_px, n);
+        std::vector<double> sums(static_cast<size_t>(poses_) * 6);
+        device_.download(sums.data(), by_poses, sums.size());
+        device_.finish();
+        for (int i = 0; i < poses_; ++i)
+            for (int k = 0; k < 3; ++k) {
+                out.rotation[3 * i + k] = sums[6 * i + k];
+                out.centre[3 * i + k] = -sums[6 * i + 3 + k];
+            }
+    }
+
+    Device device_;
+    bool moving_ = false;
+    int sub_poses_ = 0;  // or sub-frames
+    uint32_t pairs_ = 0;
+    Scene scene_{};
+    Tiles tiles_{};
+    States states_{};
+
+    Buffer<float> means_, quats_, log_scales_, opacity_logits_, colours_, weights_, prepared_;
+    Buffer<uint8_t> channels_;
+    Buffer<View> views_;
+    Buffer<SubFrame> sub_frames_;
+    Buffer<ProjectedSplat> records_;  // [sub-poses][splats], as the next four
+    Buffer<Motion> motions_;
+    Buffer<uint32_t> keys_, order_, sorted_keys_, sorted_order_;
+    Buffer<uint64_t> counts_, first_pairs_;  // by depth
+    Buffer<uint32_t> pair_tiles_, pair_, pair_record_, sorted_tiles_, sorted_pairs_, tile_start_;
+    Buffer<uint32_t> first_of_record_, pairs_of_record_;
+    Buffer<float> state_;
+    Buffer<uint32_t> ends_;
+    Buffer<float> image_, d_values_, slots_, gradients_;
+    Buffer<double> partial_, by_poses_;
+};
+
+}  // namespace
+}  // namespace spiked

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from spiked.errors import ConfigurationError
 from spiked.recon.statistics import evenly
 from spiked.render import Camera
-from spiked.render.cpu import Rasteriser
+from spiked.render import rasteriser_for
 from spiked.scene import Scene
 from spiked.splitting import split_large
 from spiked.trajectory import Trajectory
@@ -197,7 +197,7 @@ def _seen(
     least_px: float,
     progress: Callable[[float], None] | None,
 ) -> Seen:
-    rasteriser = Rasteriser(camera)
+    rasteriser = rasteriser_for(camera)
     views, nearest = np.zeros(len(scene), np.int64), np.full(len(scene), np.inf)
     for done, row in enumerate(rows, 1):
         rotation, centre = path.rotations[row], path.centres[row]

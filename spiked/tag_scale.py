@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from spiked.errors import ConfigurationError, SceneError
 from spiked.recon.statistics import evenly
 from spiked.render import Camera
-from spiked.render.cpu import Rasteriser
+from spiked.render import rasteriser_for
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics
 from spiked.trajectory import Trajectory
@@ -137,7 +137,7 @@ def pictures_along(
     pinhole = camera.intrinsics.pinhole
     # Of the camera's own size, then enlarged: the renderer widens splats by a share of a pixel, as when the scene was
     # fitted. In a larger picture all are thinner, and a black square on white is 1 % larger.
-    rasteriser = Rasteriser(Camera(pinhole, camera.width, camera.height))
+    rasteriser = rasteriser_for(Camera(pinhole, camera.width, camera.height))
     for row in evenly(len(path), views):
         rotation, centre = path.rotations[row], path.centres[row]
         image = rasteriser.forward(scene, rotation[None], centre[None]).values

@@ -1,5 +1,5 @@
 """Rendering of Gaussian splats: `rasteriser_for` gives the best rasteriser here, of `cpu.Rasteriser` and
-`cuda.CudaRasteriser`; `reference.render` (torch, float64) is there to check them against.
+`gpu.GpuRasteriser`; `reference.render` (torch, float64) is there to check them against.
 """
 
 from spiked.render.camera import Camera

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spiked.errors import ConfigurationError
+from spiked.render import gpu
 from spiked.render.camera import Camera
 from spiked.render.cpu import Rasteriser
 from spiked.render.splats import Floats, Gradients, RenderedImage
@@ -75,8 +76,8 @@ class Choice:
 def chosen() -> Choice:
     """The renderer that SPIKED_RENDER names, cpu or cuda; without it the GPU's if it can render here.
 
-    torch is not even imported where no NVIDIA driver is loaded. Where one is, a GPU that cannot be used is said in the
-    log, once a process. Raises ConfigurationError where cuda is wanted and cannot be had.
+    Where an NVIDIA driver is loaded, a GPU that cannot be used is said in the log, once a process. Raises
+    ConfigurationError where cuda is wanted and cannot be had.
     """
     return choice_for(os.environ.get("SPIKED_RENDER", ""))
 
@@ -88,32 +89,17 @@ def choice_for(wanted: str) -> Choice:
         raise ConfigurationError(f"SPIKED_RENDER={wanted} is no renderer: use cpu or cuda, or unset it")
     if wanted == "cpu":
         return Choice("cpu", "SPIKED_RENDER asks for it")
-    if wanted == "" and not DRIVER.exists():
-        return Choice("cpu", "no NVIDIA driver is loaded")
-    reason = _missing()
+    reason = gpu.missing()
     if reason is None:
-        return Choice("cuda", "the GPU renders" if wanted == "" else "SPIKED_RENDER asks for it")
+        return Choice("cuda", gpu.device_name() if wanted == "" else "SPIKED_RENDER asks for it")
     if wanted == "cuda":
         raise ConfigurationError(f"cannot render on a GPU: {reason}")
+    if not DRIVER.exists():
+        return Choice("cpu", "no NVIDIA driver is loaded")
     _log.warning("the GPU is not used: %s", reason)
     return Choice("cpu", reason, unused=True)
 
 
 def rasteriser_for(camera: Camera, threads: int | None = None) -> AnyRasteriser:
-    """A rasteriser of the kind that is `chosen`; threads are the CPU's. Raises ConfigurationError as that does.
-
-    Images with distortion are rendered by the CPU.
-    """
-    if chosen().renderer == "cpu" or camera.intrinsics.distortion is not None:
-        return Rasteriser(camera, threads)
-    from spiked.render import cuda
-
-    return cuda.CudaRasteriser(camera)
-
-
-def _missing() -> str | None:
-    try:
-        from spiked.render import cuda
-    except (ImportError, OSError) as error:  # OSError: a library that torch was built for
-        return f"torch cannot be imported ({error}): pip install 'spiked[cuda]'"
-    return cuda.missing()
+    """A rasteriser of the kind that is `chosen`; threads are the CPU's. Raises ConfigurationError as that does."""
+    return Rasteriser(camera, threads) if chosen().renderer == "cpu" else gpu.GpuRasteriser(camera)

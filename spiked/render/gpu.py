@@ -5,20 +5,47 @@ block of 4x4 pixels, is finished when it lets less than 1e-4 of the light throug
 add nothing to the contributions.
 """
 
+from functools import cache
 from typing import Any, Literal
+
+import numpy as np
 
 from spiked.errors import ConfigurationError
 from spiked.native import _gpu
 from spiked.render.camera import Camera
 from spiked.render.cpu import Rasteriser
+from spiked.scene import Scene
+from spiked.sensor import Intrinsics
 
 ARCHITECTURES: tuple[str, ...] = tuple(_gpu.architectures.split())
 """GPUs that the kernels of this build are machine code for, as sm_80; empty if it was built without nvcc."""
 
 
+@cache
 def missing() -> str | None:
-    """Why no GPU can be used here; None if one can."""
-    return str(_gpu.why_no_cuda()) or None
+    """Why no GPU can be used here; None if one can: one splat is rendered and differentiated once a process."""
+    reason = str(_gpu.why_no_cuda())
+    if reason:
+        return reason
+    splat = Scene(
+        np.array([[0, 0, 1]], np.float32),
+        np.array([[1, 0, 0, 0]], np.float32),
+        np.full((1, 3), -1, np.float32),
+        np.full(1, 2, np.float32),
+        np.ones((1, 1), np.float32),
+    )
+    try:
+        rasteriser = GpuRasteriser(Camera(Intrinsics(8, 8, 4, 4), 8, 8))
+        values = rasteriser.forward(splat, np.eye(3)[None], np.zeros((1, 3))).values
+        slope = rasteriser.backward(np.ones_like(values)).colours
+    except (ConfigurationError, RuntimeError) as error:
+        return f"the GPU cannot render: {error}. This build has kernels for {', '.join(ARCHITECTURES)} and later"
+    return None if values[4, 4] > 0.1 and slope[0, 0] > 0 else "the GPU renders nothing: its driver may be damaged"
+
+
+def device_name() -> str:
+    """The name of the GPU. Raises RuntimeError without one."""
+    return str(_gpu.cuda_device())
 
 
 class GpuRasteriser(Rasteriser):

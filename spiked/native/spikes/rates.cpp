@@ -297,6 +297,31 @@ void delays(const Array<const uint8_t, 2>& picture, const Offsets<T>& spikes, co
     }
 }
 
+// When pixels look, in sub-frames from `first` on: within [0, parts], at least `least` long. seen: whether that is
+// `share` of the time or more.
+SPIKED_CLONES void exposures_clones(const float* start, const float* stop, int64_t count, float first, float scale,
+                                    float parts, float least, float share, float* begin, float* end, uint8_t* seen) {
+    for (int64_t i = 0; i < count; ++i) {
+        const float from = (start[i] - first) * scale, to = (stop[i] - first) * scale;
+        const float low = std::min(std::max(from, 0.0f), parts - least);
+        const float high = std::min(std::max(to, low + least), parts);
+        begin[i] = low;
+        end[i] = high;
+        seen[i] = high - low >= share * (to - from);
+    }
+}
+
+void exposures(const Array<const float, 2>& start, const Array<const float, 2>& stop, float first, float scale,
+               float parts, float least, float share, const Array<float, 3>& windows, const Array<uint8_t, 2>& seen) {
+    expect_same_shape(start, stop);
+    expect_same_shape(start, seen);
+    const auto count = static_cast<int64_t>(start.size());
+    if (windows.shape(0) != 2 || static_cast<int64_t>(windows.size()) != 2 * count)
+        throw std::invalid_argument("expected windows [2, H, W]");
+    exposures_clones(start.data(), stop.data(), count, first, scale, parts, least, share, windows.data(),
+                     windows.data() + count, seen.data());
+}
+
 // Bindings for bytes and for words. Arrays are not converted, or all would be taken for bytes.
 template <class T>
 void bind_intervals(nb::module_& m) {
@@ -319,6 +344,9 @@ void bind_intervals(nb::module_& m) {
 void bind_rates(nb::module_& m) {
     bind_intervals<uint8_t>(m);
     bind_intervals<uint16_t>(m);
+    m.def("exposures", &exposures, nb::arg("start"), nb::arg("stop"), nb::arg("first"), nb::arg("scale"),
+          nb::arg("parts"), nb::arg("least"), nb::arg("share"), nb::arg("windows").noconvert(),
+          nb::arg("seen").noconvert(), "When pixels look, in sub-frames, and whether that is most of their time.");
     m.def("quantile", &quantile, "The quantile `share` of an image's values; none may be negative.");
     m.def("picture", &picture, nb::arg("rate"), nb::arg("white"), nb::arg("out").noconvert(),
           "255 sqrt(rate / white), at most 255, blurred by a Gaussian of 0.8 px.");

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+import spiked.native._spikes as _spikes
 from spiked.blocks import Window, aligned_window
 from spiked.calibration import Calibration
 from spiked.recon.frontend.motion_compensation import BINOMIAL, MotionCompensator, drift, speed
@@ -126,22 +127,33 @@ class View:
         """`rate` without caching; written to `out` if there is no calibration."""
         return self.rate if self.calibration is not None else self.intervals.rate(out)
 
+    @cached_property
+    def _span(self) -> tuple[float, float]:
+        """Frames from the middle of the window to the begin and to the end of most pixels' exposures."""
+        start, stop = self._measured.times()
+        return (
+            float(np.percentile(start[::4, ::4], EXPOSURE_PERCENTILE)),
+            float(np.percentile(stop[::4, ::4], 100 - EXPOSURE_PERCENTILE)),
+        )
+
+    def exposure_times(self, parts: int) -> NDArray[np.float64]:
+        """The times [parts + 1] in frames of the poses of `exposure`, evenly spaced over that of most pixels."""
+        return self.time + np.linspace(*self._span, parts + 1)
+
     def exposure(self, parts: int) -> tuple[NDArray[np.float64], Image, NDArray[np.bool_]]:
         """When each pixel gathered its charge, for `Rasteriser.forward_moving` with `parts` sub-frames.
 
-        Returns the times [parts + 1] in frames of the poses, evenly spaced over the exposure of most pixels, the
-        pixels' exposures [2, H, W] in units of sub-frames, and a mask [H, W], False for much longer exposures.
+        Returns `exposure_times`, the pixels' exposures [2, H, W] in units of sub-frames, and a mask [H, W], False for
+        much longer exposures.
         """
         start, stop = self._measured.times()
-        first = float(np.percentile(start[::4, ::4], EXPOSURE_PERCENTILE))
-        last = float(np.percentile(stop[::4, ::4], 100 - EXPOSURE_PERCENTILE))
-        scale = np.float32(parts / max(last - first, 1e-3))
-        windows = np.stack([(start - np.float32(first)) * scale, (stop - np.float32(first)) * scale])
-        whole = windows[1] - windows[0]
-        np.clip(windows[0], 0, parts - MIN_EXPOSURE, out=windows[0])
-        np.clip(windows[1], windows[0] + MIN_EXPOSURE, parts, out=windows[1])
-        seen = windows[1] - windows[0] >= MIN_EXPOSURE_SHARE * whole
-        return self.time + np.linspace(first, last, parts + 1), windows.astype(np.float32), seen
+        first, last = self._span
+        windows, seen = np.empty((2, *start.shape), np.float32), np.empty(start.shape, np.bool_)
+        scale = parts / max(last - first, 1e-3)
+        _spikes.exposures(
+            start, stop, first, scale, parts, MIN_EXPOSURE, MIN_EXPOSURE_SHARE, windows, seen.view(np.uint8)
+        )
+        return self.exposure_times(parts), windows, seen
 
 
 def make_view(

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from spiked.native._dense import agreement, gain_evidence
 from spiked.sensor import Image
 
 GAIN_SIGMA = 0.02
@@ -47,20 +48,15 @@ class Nuisances:
 
         Without `gains` only the view's brightness is estimated.
         """
-        expected = self.gain * rendered
-        error = MODEL_ERROR * (expected + observed)
-        precision = 1 / (deviation * deviation + error * error + 1e-12)
+        seen = np.ascontiguousarray(rendered), np.ascontiguousarray(observed), np.ascontiguousarray(deviation)
         # A ratio of means: least squares underestimates the brightness while the map is rough, and the map follows.
         # Weights by precision would give most weight to the darkest pixels.
-        agree = (np.abs(observed - expected) < AGREEING_SIGMAS * (deviation + error)) & np.isfinite(deviation)
-        total = float(expected[agree].sum())
-        if total > 0:
-            self.note(key, float(observed[agree].sum()) / total)
+        expected, light = agreement(self.gain, *seen, MODEL_ERROR, AGREEING_SIGMAS)
+        if expected > 0:
+            self.note(key, light / expected)
         if not gains:
             return
-        model = rendered * np.float32(self.level(key))
-        self._xx += precision * model * model
-        self._xy += precision * model * (observed - model)
+        gain_evidence(self.gain, *seen, self.level(key), MODEL_ERROR, self._xx, self._xy)
         self._observed += 1
 
     def note(self, key: int, brightness: float) -> None:

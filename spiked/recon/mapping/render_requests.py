@@ -67,7 +67,7 @@ class RenderPlanner:
             rotations, centres = path.poses([view.time])
             return RenderRequest(rotations, centres, times=np.array([view.time]))
         if parts is None:
-            times, _, _ = view.exposure(1)
+            times = view.exposure_times(1)
             rotations, centres = path.poses(np.clip(times, path.begin, path.end))
             moved_px = self.motion_px(rotations[0], centres[0], rotations[-1], centres[-1])
             parts = int(np.clip(np.ceil(moved_px / (SUB_FRAME_PX * pixel)), 1, MAX_SUB_FRAMES))

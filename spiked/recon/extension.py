@@ -65,7 +65,7 @@ def extend(
     kept = joint.kept()
     trainer, path = _trainer(joint, reconstructor)
     trainer.mapper.adopt(brightened(joint.splats(kept), 1 / joint.brightness))
-    trainer.mapper.extent = HEADROOM * len(trainer.mapper.scene) / (trainer.mapper.cap / trainer.mapper.extent)
+    trainer.mapper.extent = HEADROOM * len(trainer.mapper) / (trainer.mapper.cap / trainer.mapper.extent)
     replays = [one.replay.brightened(1 / joint.brightness) for one in joint.first_views]
     rng, queue = np.random.default_rng(options.seed), list[int]()
     steps = min(STEPS_A_VIEW * len(joint.second_views), options.steps)

@@ -87,7 +87,7 @@ class Refinement:
         tracker, trainer = self._tracker, self._trainer
         for estimate in tracker.estimated:
             tracker.warnings.append(f"{estimate}: {estimate.ADVICE}")
-        if len(trainer.mapper.scene) and not self.optics_moved:
+        if len(trainer.mapper) and not self.optics_moved:
             progress()  # the live map, before it may be rebuilt
             if cancelled():
                 return False  # a rebuilt map without refinement would be worse

@@ -80,7 +80,7 @@ class Refiner:
         plan, steps, progress = self._plan, self._plan.steps, self._progress
         for share in progress.shares(steps, deadline, cancelled, save):
             self._trainer.step(self.path, self._schedule.rate(share), self._schedule.coarseness(share), share)
-            self._clock.lap(Part.STEPS, plan.step_s(share * steps, len(self._trainer.mapper.scene)))
+            self._clock.lap(Part.STEPS, plan.step_s(share * steps, len(self._trainer.mapper)))
             self._align_if_due(share, plan)
             self._prune_if_due(share, plan)
             progress.done += 1
@@ -90,7 +90,7 @@ class Refiner:
     @property
     def left(self) -> dict[Part, float] | None:
         """Work that is left; None before the refinement has begun."""
-        return None if self._plan is None else self._plan.work(self._progress.done, len(self._trainer.mapper.scene))
+        return None if self._plan is None else self._plan.work(self._progress.done, len(self._trainer.mapper))
 
     def _begin(self, most_steps: int) -> RefinementPlan:
         """Seed the map."""
@@ -102,7 +102,7 @@ class Refiner:
         align = self._pose_step is not None and isinstance(self.path, Spline)
         plan = plan_of(trainer, most_steps, ids, trainer.views.travelled_px, align, self._prunes)
         trainer.seed(self.path, self._points, trainer.options.seeding.order(ids, trainer.extent))
-        if self._prunes and len(trainer.mapper.scene):
+        if self._prunes and len(trainer.mapper):
             trainer.mapper.limit_sizes()
         self._clock.lap(Part.SEEDING, plan.seeding_s())
         return plan
@@ -111,7 +111,7 @@ class Refiner:
         due = self._trainer.options.pruning.due(share)
         if self._prunes and due > self._pruned:
             self._pruned = due
-            work_s = plan.pruning_s(len(self._trainer.mapper.scene))
+            work_s = plan.pruning_s(len(self._trainer.mapper))
             self._trainer.prune(self.path, self._points)
             self._clock.lap(Part.PRUNING, work_s)
 
@@ -122,4 +122,4 @@ class Refiner:
         self.aligned = due
         ids = self._trainer.views.mappable(self.path)
         self.path = self._pose_step.improve(self.path, ids, GRADIENT_STEPS, share)
-        self._clock.lap(Part.ALIGNING, plan.aligning_s(len(self._trainer.mapper.scene)))
+        self._clock.lap(Part.ALIGNING, plan.aligning_s(len(self._trainer.mapper)))

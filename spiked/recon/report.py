@@ -95,7 +95,7 @@ class Sample:
 
 def samples(views: ViewStore, mapper: Mapper, path: Path | None, frame_rate_hz: float, count: int) -> list[Sample]:
     """At most `count` views, evenly spread over the recording, beside their renders from `path`."""
-    path = path if len(mapper.scene) else None
+    path = path if len(mapper) else None
     ids = views.kept if path is None else views.mappable(path)
     out = []
     for view_id in views.spread(ids, count):
@@ -245,7 +245,7 @@ def optics_section(mapper: Mapper, focal: Focal | None, estimated: EstimatedLens
 
 def map_section(mapper: Mapper) -> dict[str, object]:
     """Size and fit of the map."""
-    return {"splats": len(mapper.scene), "steps": mapper.steps, "loss": mapper.loss}
+    return {"splats": len(mapper), "steps": mapper.steps, "loss": mapper.loss}
 
 
 def path_section(path: Path | None, odometry: Odometry, aligned: bool) -> dict[str, object]:

@@ -34,7 +34,7 @@ class AnyRasteriser(Protocol):
 
     def forward(
         self,
-        splats: Scene,
+        splats: Scene | gpu.DeviceScene,
         rotations: ArrayLike,
         centres: ArrayLike,
         *,
@@ -46,7 +46,7 @@ class AnyRasteriser(Protocol):
 
     def forward_moving(
         self,
-        splats: Scene,
+        splats: Scene | gpu.DeviceScene,
         rotations: ArrayLike,
         centres: ArrayLike,
         windows: Floats,

@@ -54,6 +54,17 @@ class Rasteriser:
         self._shapes: tuple[int, int, int] = (0, 0, 0)
         self._values_shape: tuple[int, ...] = ()
 
+    def _splats(self, splats: Any) -> tuple[tuple[Any, ...], int, int]:
+        """What the renderer takes of a scene, and the numbers of its splats and colours."""
+        arrays = _checked_splats(splats)
+        return arrays, *arrays[4].shape
+
+    def _check_slope(self, d_values: Floats) -> None:
+        if self._inputs is None:
+            raise ConfigurationError("backward() differentiates the last forward(), and there was none")
+        if d_values.shape != self._values_shape:
+            raise ConfigurationError(f"d_values is {d_values.shape}, expected {self._values_shape} as rendered")
+
     def _renderer(self, near: float, threads: int, **optics: Any) -> Any:
         """What does the work."""
         return Renderer(near=near, threads=threads, **optics)
@@ -137,8 +148,7 @@ class Rasteriser:
     ) -> RenderedImage:
         rotations = np.ascontiguousarray(rotations, np.float64)
         centres = np.ascontiguousarray(centres, np.float64)
-        arrays = _checked_splats(splats)
-        count, colours = arrays[4].shape
+        arrays, count, colours = self._splats(splats)
         if rotations.ndim != 3 or rotations.shape[1:] != (3, 3) or centres.shape != (len(rotations), 3):
             raise ConfigurationError(
                 f"sub-poses are rotations [S, 3, 3] and centres [S, 3], not {rotations.shape} and {centres.shape}"
@@ -166,10 +176,7 @@ class Rasteriser:
         Raises ConfigurationError before any forward() and for another shape.
         """
         d_values = np.ascontiguousarray(d_values, np.float32)
-        if self._inputs is None:
-            raise ConfigurationError("backward() differentiates the last forward(), and there was none")
-        if d_values.shape != self._values_shape:
-            raise ConfigurationError(f"d_values is {d_values.shape}, expected {self._values_shape} as rendered")
+        self._check_slope(d_values)
         n, colours, s = self._shapes
         out = Gradients(
             means=np.empty((n, 3), np.float32),

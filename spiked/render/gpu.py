@@ -5,6 +5,7 @@ block of 4x4 pixels, is finished when it lets less than 1e-4 of the light throug
 add nothing to the contributions.
 """
 
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
 
@@ -14,6 +15,7 @@ from spiked.errors import ConfigurationError
 from spiked.native import _gpu
 from spiked.render.camera import Camera
 from spiked.render.cpu import Rasteriser
+from spiked.render.splats import Floats
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics
 
@@ -48,6 +50,16 @@ def device_name() -> str:
     return str(_gpu.cuda_device())
 
 
+@dataclass(frozen=True)
+class DeviceScene:
+    """Splats on the device, with their moments of Adam: what `GpuRasteriser.forward` takes in the place of a Scene."""
+
+    native: Any
+
+    def __len__(self) -> int:
+        return int(self.native.count)
+
+
 class GpuRasteriser(Rasteriser):
     """`Rasteriser` on a GPU: the same methods, shapes and errors. The same input gives the same bits.
 
@@ -59,6 +71,33 @@ class GpuRasteriser(Rasteriser):
         is no GPU."""
         self._emulated = device == "emulated"
         super().__init__(camera, 1, near)
+
+    def device_scene(self) -> DeviceScene:
+        """A scene on this device, empty."""
+        return DeviceScene(self._native.scene())
+
+    def descend(
+        self,
+        d_values: Floats,
+        scene: DeviceScene,
+        rates: tuple[float, ...],
+        beta1: float,
+        beta2: float,
+        epsilon: float,
+        most_log_scale: float,
+    ) -> None:
+        """`backward` and a step of Adam on the device, as in `Descent.step`. The last image was of `scene`, or of the
+        splats that it was set to."""
+        self._check_slope(d_values)
+        self._native.descend(
+            np.ascontiguousarray(d_values, np.float32), scene.native, np.array(rates, np.float32), beta1, beta2,
+            epsilon, most_log_scale,
+        )  # fmt: skip
+
+    def _splats(self, splats: Scene | DeviceScene) -> tuple[tuple[Any, ...], int, int]:
+        if isinstance(splats, DeviceScene):
+            return (splats.native,), len(splats), int(splats.native.colours)
+        return super()._splats(splats)
 
     def _renderer(self, near: float, threads: int, **optics: Any) -> Any:
         try:

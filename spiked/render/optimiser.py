@@ -34,7 +34,8 @@ class Adam:
         self._threads = usable_cores() if threads is None else threads
         self._steps = AdamSteps(self._threads)
         self._betas = (beta1, beta2)
-        self._epsilon = epsilon
+        self.epsilon = epsilon
+        """What is added to the root of the second moments."""
         self._moments = [(np.zeros_like(array), np.zeros_like(array)) for array in arrays]
         self._taken = np.zeros(len(arrays[0]), np.uint32)
 
@@ -49,6 +50,21 @@ class Adam:
     def taken(self) -> NDArray[np.uint32]:
         """The number of steps that each splat has made, [N]."""
         return self._taken
+
+    def packed(self) -> tuple[Floats, Floats, NDArray[np.uint32]]:
+        """First and second moments, each [N, columns of all arrays], and `taken`: as a device keeps them."""
+        first, second = (np.concatenate([_rows(pair[i]) for pair in self._moments], axis=1) for i in (0, 1))
+        return first, second, self._taken
+
+    def unpack(self, first: Floats, second: Floats, taken: NDArray[np.uint32]) -> None:
+        """Take over what `packed` gives."""
+        at = 0
+        for pair in self._moments:
+            columns = _rows(pair[0]).shape[1]
+            for mine, theirs in zip(pair, (first, second), strict=True):
+                _rows(mine)[:] = theirs[:, at : at + columns]
+            at += columns
+        self._taken = taken
 
     def grow(self, count: int) -> None:
         """Make room for `count` new splats at the end."""
@@ -102,7 +118,7 @@ class Adam:
                 correction,
                 rate,
                 *self._betas,
-                self._epsilon,
+                self.epsilon,
             )
 
 

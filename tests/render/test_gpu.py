@@ -1,5 +1,6 @@
 """The kernels of a GPU against the rasteriser of the CPU: in their emulation, and on a GPU where there is one."""
 
+import pickle
 import threading
 from dataclasses import fields
 
@@ -12,6 +13,7 @@ from spiked.distortion import Distortion, LensModel
 from spiked.errors import ConfigurationError
 from spiked.native import _gpu
 from spiked.render import Camera, Rasteriser, gpu
+from spiked.render.descent import Descent, DeviceDescent
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Mosaic
 
@@ -173,3 +175,38 @@ def test_rasterisers_in_several_threads(device: str) -> None:
         thread.join()
     assert len(worst) == 20
     assert max(worst) < 2e-4
+
+
+def test_descent_on_the_device(device: str) -> None:
+    """Steps, splats added and removed, and a checkpoint: the scene is that of the CPU."""
+    case = Case("three colours")
+    rates = (1e-3, 2e-3, 3e-3, 4e-2, 5e-3)
+    most, rng = np.float32(np.log(0.2)), np.random.default_rng(8)
+    keep = rng.random(150) < 0.8
+    fits: list[Descent] = [Descent(_copy(case.splats), 0.9, 0.99, 1), DeviceDescent(_copy(case.splats), 0.9, 0.99, 1)]
+    rasterisers = Rasteriser(case.camera, 1), gpu.GpuRasteriser(case.camera, device=device)
+    more = scenes.splats(30, 3, 99)
+    for turn in range(8):
+        slopes = rng.normal(size=case.d_values.shape).astype(np.float32)
+        for i, rasteriser in enumerate(rasterisers):
+            if turn == 3:
+                fits[i].join(more)
+            if turn == 5:
+                fits[i].select(keep)
+            if turn == 6:
+                fits[i] = pickle.loads(pickle.dumps(fits[i]))
+            rasteriser.forward_moving(fits[i].model, case.rotations, case.centres, case.windows)
+            fits[i].step(rasteriser, slopes, rates, most)
+        assert len(fits[0].model) == len(fits[1].model)
+    ours, theirs = (fit.scene for fit in fits)
+    for mine, other, begin, rate in zip(
+        ours.arrays(), theirs.arrays(), case.splats.join(more).select(keep).arrays(), rates, strict=True
+    ):
+        assert np.abs(mine - begin).max() > rate  # they moved
+        assert np.abs(mine - other).max() < 0.05 * rate
+    assert theirs.log_scales.max() <= most
+    assert np.array_equal(fits[0].adam.taken, fits[1].adam.taken)
+
+
+def _copy(scene: Scene) -> Scene:
+    return scene.select(np.arange(len(scene)))

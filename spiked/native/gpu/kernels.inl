@@ -589,6 +589,50 @@ struct Unproject {
     }
 };
 
+// A step of Adam, a splat a thread (D. P. Kingma and J. Ba, 2015); see spiked/render/optimiser.py.
+struct Descend {
+    static constexpr int kThreads = kSplatThreads;
+    int count, colours;
+    float *means, *quats, *log_scales, *opacity_logits, *colour;
+    GradientArrays gradients;
+    float *first, *second;  // [count][11 + colours]
+    uint32_t* taken;
+    DescentRates rates;
+    SPIKED_DEVICE void operator()(const Block<kThreads>& block) const {
+        block.each([&](int thread) {
+            const int64_t n = static_cast<int64_t>(block.index) * kThreads + thread;
+            if (n >= count) return;
+            if (gradients.radius_px[n] > 0) {
+                const uint32_t steps = taken[n] + (taken[n] != ~0u);
+                taken[n] = steps;
+                const double bias1 = 1 - pow(static_cast<double>(rates.beta1), static_cast<double>(steps));
+                const double bias2 = 1 - pow(static_cast<double>(rates.beta2), static_cast<double>(steps));
+                const float correction = static_cast<float>(::sqrt(bias2) / bias1);
+                float *m = first + n * (11 + colours), *v = second + n * (11 + colours);
+                move(means, gradients.means, n, 3, rates.rates[0] * correction, m, v);
+                move(quats, gradients.quats, n, 4, rates.rates[1] * correction, m, v);
+                move(log_scales, gradients.log_scales, n, 3, rates.rates[2] * correction, m, v);
+                move(opacity_logits, gradients.opacity_logits, n, 1, rates.rates[3] * correction, m, v);
+                move(colour, gradients.colour, n, colours, rates.rates[4] * correction, m, v);
+            }
+            for (int k = 0; k < colours; ++k) colour[n * colours + k] = fmaxf(colour[n * colours + k], 0);
+            for (int k = 0; k < 3; ++k) log_scales[3 * n + k] = fminf(log_scales[3 * n + k], rates.most_log_scale);
+        });
+    }
+
+  private:
+    SPIKED_DEVICE void move(float* parameter, const float* gradient, int64_t n, int columns, float rate, float*& m,
+                            float*& v) const {
+        parameter += n * columns, gradient += n * columns;
+        for (int k = 0; k < columns; ++k, ++m, ++v) {
+            const float g = gradient[k];
+            *m += (1 - rates.beta1) * (g - *m);
+            *v += (1 - rates.beta2) * (g * g - *v);
+            parameter[k] -= rate * *m / (sqrtf(*v) + rates.epsilon);
+        }
+    }
+};
+
 // The sums by the poses over all blocks; a block has one of the six of a pose.
 struct SumPoses {
     static constexpr int kThreads = 256;

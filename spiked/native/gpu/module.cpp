@@ -8,9 +8,75 @@
 
 using namespace spiked;
 
+namespace {
+
+void forward_scene(GpuRenderer& self, GpuScene& scene, Array<const double, 3> rotations, Array<const double, 2> centres,
+                   std::optional<Array<const float, 3>> weights, std::optional<Array<const float, 3>> windows,
+                   std::optional<Array<const uint8_t, 2>> channels, Array<const float, 1> background,
+                   AnyArray<float> values, Array<float, 2> alpha, Array<float, 2> depth) {
+    const PassArrays arrays{rotations, centres, weights, windows, channels, background, values, alpha, depth};
+    const Views views = arrays.views(self.camera(), scene.colours());
+    nb::gil_scoped_release release;
+    self.forward(scene, views, background.data(), values.data(), alpha.data(), depth.data());
+}
+
+void descend(GpuRenderer& self, AnyArray<const float> d_values, GpuScene& scene, Array<const float, 1> rates,
+             float beta1, float beta2, float epsilon, float most_log_scale) {
+    expect(self.poses() > 0, "backward follows forward");
+    const size_t pixels = static_cast<size_t>(self.camera().height) * self.camera().width;
+    expect(d_values.size() == pixels * (self.mosaic() ? 1 : scene.colours()), "d_values has the wrong size");
+    expect(self.splats().count == scene.count() && self.splats().colours == scene.colours(),
+           "the last image is of another scene");
+    expect(rates.shape(0) == 5, "a rate for each of the five arrays");
+    const float* r = rates.data();
+    const DescentRates given{{r[0], r[1], r[2], r[3], r[4]}, beta1, beta2, epsilon, most_log_scale};
+    nb::gil_scoped_release release;
+    self.descend(d_values.data(), scene, given);
+}
+
+void set_scene(GpuScene& self, Array<const float, 2> means, Array<const float, 2> quats, Array<const float, 2> log_scales,
+               Array<const float, 1> opacity_logits, Array<const float, 2> colours, Array<const float, 2> first,
+               Array<const float, 2> second, Array<const uint32_t, 1> taken) {
+    const SplatArrays splats = splats_of(means, quats, log_scales, opacity_logits, colours);
+    const size_t moments = static_cast<size_t>(splats.count) * (11 + splats.colours);
+    expect(first.size() == moments && second.size() == moments && taken.size() == means.shape(0), "moments disagree");
+    nb::gil_scoped_release release;
+    self.set(splats, first.data(), second.data(), taken.data());
+}
+
+void get_scene(GpuScene& self, Array<float, 2> means, Array<float, 2> quats, Array<float, 2> log_scales,
+               Array<float, 1> opacity_logits, Array<float, 2> colours, Array<float, 2> first, Array<float, 2> second,
+               Array<uint32_t, 1> taken) {
+    const SplatArrays splats = splats_of(means, quats, log_scales, opacity_logits, colours);
+    const size_t moments = static_cast<size_t>(splats.count) * (11 + splats.colours);
+    expect(splats.count == self.count() && splats.colours == self.colours() && first.size() == moments &&
+               second.size() == moments && taken.size() == means.shape(0),
+           "the scene has another size");
+    nb::gil_scoped_release release;
+    self.get(means.data(), quats.data(), log_scales.data(), opacity_logits.data(), colours.data(), first.data(),
+             second.data(), taken.data());
+}
+
+}  // namespace
+
 NB_MODULE(_gpu, m) {
+    nb::class_<GpuScene>(m, "Scene")
+        .def("set", &set_scene)
+        .def("get", &get_scene, nb::arg("means").noconvert(), nb::arg("quats").noconvert(),
+             nb::arg("log_scales").noconvert(), nb::arg("opacity_logits").noconvert(), nb::arg("colours").noconvert(),
+             nb::arg("first").noconvert(), nb::arg("second").noconvert(), nb::arg("taken").noconvert())
+        .def_prop_ro("count", &GpuScene::count)
+        .def_prop_ro("colours", &GpuScene::colours);
     nb::class_<GpuRenderer> renderer(m, "Renderer");
     bind_passes<GpuRenderer>(renderer);
+    renderer
+        .def("forward", &forward_scene, nb::arg("scene"), nb::arg("rotations").noconvert(),
+             nb::arg("centres").noconvert(), nb::arg("weights").none().noconvert(),
+             nb::arg("windows").none().noconvert(), nb::arg("channels").none().noconvert(), nb::arg("background"),
+             nb::arg("values").noconvert(), nb::arg("alpha").noconvert(), nb::arg("depth").noconvert())
+        .def("descend", &descend, nb::arg("d_values"), nb::arg("scene"), nb::arg("rates"), nb::arg("beta1"),
+             nb::arg("beta2"), nb::arg("epsilon"), nb::arg("most_log_scale"))
+        .def("scene", &GpuRenderer::scene);
     m.def(
         "renderer",
         [](double fx, double fy, double cx, double cy, int width, int height, double near, bool emulated,

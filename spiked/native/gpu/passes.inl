@@ -39,6 +39,56 @@ void choose(bool value, Call call) {
 }
 
 template <class Device>
+class Resident final : public GpuScene {
+  public:
+    template <class T>
+    using Buffer = typename Device::template Buffer<T>;
+
+    void set(const SplatArrays& given, const float* first, const float* second, const uint32_t* taken) override {
+        count_ = given.count, colours_ = given.colours;
+        const size_t n = count_;
+        device_.upload(means_, given.means, 3 * n);
+        device_.upload(quats_, given.quats, 4 * n);
+        device_.upload(log_scales_, given.log_scales, 3 * n);
+        device_.upload(opacity_logits_, given.opacity_logits, n);
+        device_.upload(colour_, given.colour, colours_ * n);
+        device_.upload(first_, first, (11 + colours_) * n);
+        device_.upload(second_, second, (11 + colours_) * n);
+        device_.upload(taken_, taken, n);
+        device_.finish();
+    }
+
+    void get(float* means, float* quats, float* log_scales, float* opacity_logits, float* colours, float* first,
+             float* second, uint32_t* taken) override {
+        const size_t n = count_;
+        device_.download(means, means_.data(), 3 * n);
+        device_.download(quats, quats_.data(), 4 * n);
+        device_.download(log_scales, log_scales_.data(), 3 * n);
+        device_.download(opacity_logits, opacity_logits_.data(), n);
+        device_.download(colours, colour_.data(), colours_ * n);
+        device_.download(first, first_.data(), (11 + colours_) * n);
+        device_.download(second, second_.data(), (11 + colours_) * n);
+        device_.download(taken, taken_.data(), n);
+        device_.finish();
+    }
+
+    SplatArrays arrays() {
+        return {count_,           colours_,      means_.data(), quats_.data(), log_scales_.data(), opacity_logits_.data(),
+                colour_.data()};
+    }
+
+    Descend step(const GradientArrays& gradients, const DescentRates& rates) {
+        return {count_,         colours_,       means_.data(),  quats_.data(), log_scales_.data(), opacity_logits_.data(),
+                colour_.data(), gradients,      first_.data(),  second_.data(), taken_.data(), rates};
+    }
+
+  private:
+    Device device_;
+    Buffer<float> means_, quats_, log_scales_, opacity_logits_, colour_, first_, second_;
+    Buffer<uint32_t> taken_;
+};
+
+template <class Device>
 class Passes final : public GpuRenderer {
   public:
     explicit Passes(const PinholeF& camera) : GpuRenderer(camera) {}
@@ -48,7 +98,52 @@ class Passes final : public GpuRenderer {
     void forward(const SplatArrays& splats, const Views& views, const float background[3], float* values, float* alpha,
                  float* depth) override {
         poses_ = 0;  // until it is done
-        take(splats, views);
+        take(splats);
+        render(views, background, values, alpha, depth);
+    }
+
+    void forward(GpuScene& scene, const Views& views, const float background[3], float* values, float* alpha,
+                 float* depth) override {
+        poses_ = 0;
+        splats_ = static_cast<Resident<Device>&>(scene).arrays();
+        render(views, background, values, alpha, depth);
+    }
+
+    void backward(const float* d_values, const GradientArrays& out) override {
+        differentiate(d_values);
+        const size_t n = splats_.count;
+        device_.download(out.means, gradients_.means, 3 * n);
+        device_.download(out.quats, gradients_.quats, 4 * n);
+        device_.download(out.log_scales, gradients_.log_scales, 3 * n);
+        device_.download(out.opacity_logits, gradients_.opacity_logits, n);
+        device_.download(out.colour, gradients_.colour, splats_.colours * n);
+        device_.download(out.contribution, gradients_.contribution, n);
+        device_.download(out.radius_px, gradients_.radius_px, n);
+        std::vector<double> sums(static_cast<size_t>(poses_) * 6);
+        device_.download(sums.data(), by_poses_.data(), sums.size());
+        device_.finish();
+        for (int i = 0; i < poses_; ++i)
+            for (int k = 0; k < 3; ++k) {
+                out.rotation[3 * i + k] = sums[6 * i + k];
+                out.centre[3 * i + k] = -sums[6 * i + 3 + k];
+            }
+    }
+
+    void descend(const float* d_values, GpuScene& scene, const DescentRates& rates) override {
+        differentiate(d_values);
+        device_.run(static_cast<Resident<Device>&>(scene).step(gradients_, rates),
+                    blocks(splats_.count, Descend::kThreads));
+        device_.finish();
+    }
+
+    std::unique_ptr<GpuScene> scene() const override { return std::make_unique<Resident<Device>>(); }
+
+  private:
+    template <class T>
+    using Buffer = typename Device::template Buffer<T>;
+
+    void render(const Views& views, const float background[3], float* values, float* alpha, float* depth) {
+        take(views);
         choose(camera_.lens != 0, [&](auto bent) {
             choose(moving_, [&](auto moving) { project<bent, moving>(); });
         });
@@ -62,7 +157,8 @@ class Passes final : public GpuRenderer {
         mosaic_ = views.channels != nullptr;
     }
 
-    void backward(const float* d_values, const GradientArrays& out) override {
+    // The gradients of the last image, which stay on the device.
+    void differentiate(const float* d_values) {
         const size_t shown = pixels() * (mosaic_ ? 1 : splats_.colours);
         const float* slopes = device_.upload(d_values_, d_values, shown);
         float* slots = slots_.grow(static_cast<size_t>(pairs_) * slot_floats(splats_.colours, moving_) + 1);
@@ -73,25 +169,18 @@ class Passes final : public GpuRenderer {
             });
         });
         choose(camera_.lens != 0, [&](auto bent) {
-            choose(moving_, [&](auto moving) { unproject<bent, moving>(out); });
+            choose(moving_, [&](auto moving) { unproject<bent, moving>(); });
         });
-        device_.finish();
     }
-
-  private:
-    template <class T>
-    using Buffer = typename Device::template Buffer<T>;
 
     int tiles() const { return camera_.tiles_x * camera_.tiles_y; }
     size_t pixels() const { return static_cast<size_t>(camera_.width) * camera_.height; }
     size_t records() const { return static_cast<size_t>(splats_.count) * sub_poses_; }
     static uint64_t blocks(uint64_t threads, int of_block) { return (threads + of_block - 1) / of_block; }
 
-    // Brings everything to the device.
-    void take(const SplatArrays& splats, const Views& views) {
+    // Brings the splats to the device.
+    void take(const SplatArrays& splats) {
         const size_t n = splats.count;
-        moving_ = views.start != nullptr;
-        sub_poses_ = moving_ ? views.count - 1 : views.count;
         splats_ = {splats.count,
                    splats.colours,
                    device_.upload(means_, splats.means, 3 * n),
@@ -99,6 +188,13 @@ class Passes final : public GpuRenderer {
                    device_.upload(log_scales_, splats.log_scales, 3 * n),
                    device_.upload(opacity_logits_, splats.opacity_logits, n),
                    device_.upload(colours_, splats.colour, splats.colours * n)};
+    }
+
+    // Brings poses and planes to the device.
+    void take(const Views& views) {
+        const size_t n = splats_.count;
+        moving_ = views.start != nullptr;
+        sub_poses_ = moving_ ? views.count - 1 : views.count;
         std::vector<View> poses(views.count);
         for (int i = 0; i < views.count; ++i)
             poses[i] = view_of_pose(views.rotations + 9 * i, views.centres + 3 * i);
@@ -187,36 +283,21 @@ class Passes final : public GpuRenderer {
     }
 
     template <bool Bent, bool Moving>
-    void unproject(const GradientArrays& out) {
+    void unproject() {
         using Kernel = Unproject<Bent, Moving>;
         const size_t n = splats_.count, c = splats_.colours;
-        float* at = gradients_.grow(n * (13 + c));
-        GradientArrays made{};
-        const auto take = [&](float*& array, size_t columns) { array = at, at += n * columns; };
-        take(made.means, 3), take(made.quats, 4), take(made.log_scales, 3), take(made.opacity_logits, 1);
-        take(made.colour, c), take(made.contribution, 1), take(made.radius_px, 1);
+        float* at = gradient_.grow(n * (13 + c));
+        const auto part = [&](float*& array, size_t columns) { array = at, at += n * columns; };
+        GradientArrays& out = gradients_;
+        part(out.means, 3), part(out.quats, 4), part(out.log_scales, 3), part(out.opacity_logits, 1);
+        part(out.colour, c), part(out.contribution, 1), part(out.radius_px, 1);
         const uint64_t count = blocks(n, Kernel::kThreads);
         double* partial = partial_.grow(count * poses_ * 6 + 1);
         device_.run(Kernel{scene_, first_of_record_.data(), pairs_of_record_.data(), keys_.data(), tiles_.records,
-                           slots_.data(), slot_floats(splats_.colours, Moving), made, partial, poses_},
+                           slots_.data(), slot_floats(splats_.colours, Moving), out, partial, poses_},
                     count);
         double* by_poses = by_poses_.grow(static_cast<size_t>(poses_) * 6);
         device_.run(SumPoses{partial, static_cast<int>(count), poses_, by_poses}, static_cast<uint64_t>(poses_) * 6);
-        device_.download(out.means, made.means, 3 * n);
-        device_.download(out.quats, made.quats, 4 * n);
-        device_.download(out.log_scales, made.log_scales, 3 * n);
-        device_.download(out.opacity_logits, made.opacity_logits, n);
-        device_.download(out.colour, made.colour, c * n);
-        device_.download(out.contribution, made.contribution, n);
-        device_.download(out.radius_px, made.radius_px, n);
-        std::vector<double> sums(static_cast<size_t>(poses_) * 6);
-        device_.download(sums.data(), by_poses, sums.size());
-        device_.finish();
-        for (int i = 0; i < poses_; ++i)
-            for (int k = 0; k < 3; ++k) {
-                out.rotation[3 * i + k] = sums[6 * i + k];
-                out.centre[3 * i + k] = -sums[6 * i + 3 + k];
-            }
     }
 
     Device device_;
@@ -226,6 +307,7 @@ class Passes final : public GpuRenderer {
     Scene scene_{};
     Tiles tiles_{};
     States states_{};
+    GradientArrays gradients_{};
 
     Buffer<float> means_, quats_, log_scales_, opacity_logits_, colours_, weights_, prepared_;
     Buffer<uint8_t> channels_;
@@ -239,7 +321,7 @@ class Passes final : public GpuRenderer {
     Buffer<uint32_t> first_of_record_, pairs_of_record_;
     Buffer<float> state_;
     Buffer<uint32_t> ends_;
-    Buffer<float> image_, d_values_, slots_, gradients_;
+    Buffer<float> image_, d_values_, slots_, gradient_;
     Buffer<double> partial_, by_poses_;
 };
 

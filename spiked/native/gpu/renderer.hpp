@@ -8,6 +8,30 @@
 
 namespace spiked {
 
+// Splats that stay on the device, with the moments of Adam.
+class GpuScene {
+  public:
+    virtual ~GpuScene() = default;
+
+    int count() const { return count_; }
+    int colours() const { return colours_; }
+    // Moments are [count][11 + colours], a splat's means, quaternion, log scales, opacity logit and colours in turn; taken
+    // [count] are its steps.
+    virtual void set(const SplatArrays&, const float* first, const float* second, const uint32_t* taken) = 0;
+    virtual void get(float* means, float* quats, float* log_scales, float* opacity_logits, float* colours,
+                     float* first, float* second, uint32_t* taken) = 0;
+
+  protected:
+    int count_ = 0, colours_ = 1;
+};
+
+// A step of Adam on all splats that the last image showed.
+struct DescentRates {
+    float rates[5];  // of the five arrays
+    float beta1, beta2, epsilon;
+    float most_log_scale;  // log scales stay below, and colours at or above 0
+};
+
 class GpuRenderer {
   public:
     virtual ~GpuRenderer() = default;
@@ -16,6 +40,11 @@ class GpuRenderer {
     virtual void forward(const SplatArrays&, const Views&, const float background[3], float* values, float* alpha,
                          float* depth) = 0;
     virtual void backward(const float* d_values, const GradientArrays&) = 0;
+    // The same for splats that are on this renderer's kind of device; the gradients go into a step, and stay there.
+    virtual void forward(GpuScene&, const Views&, const float background[3], float* values, float* alpha,
+                         float* depth) = 0;
+    virtual void descend(const float* d_values, GpuScene&, const DescentRates&) = 0;
+    virtual std::unique_ptr<GpuScene> scene() const = 0;
 
     virtual const char* instructions() const = 0;
     const PinholeF& camera() const { return camera_; }

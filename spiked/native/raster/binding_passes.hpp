@@ -50,41 +50,65 @@ PinholeF camera_of(double fx, double fy, double cx, double cy, int width, int he
     return camera;
 }
 
+// Poses, planes and images of a forward pass, as Python gives them.
+struct PassArrays {
+    const Array<const double, 3>& rotations;
+    const Array<const double, 2>& centres;
+    const std::optional<Array<const float, 3>>&weights, &windows;
+    const std::optional<Array<const uint8_t, 2>>& channels;
+    const Array<const float, 1>& background;
+    const AnyArray<float>& values;
+    const Array<float, 2>&alpha, &depth;
+
+    // Checks them against the camera and the number of colours.
+    Views views(const PinholeF& camera, size_t c) const {
+        const size_t s = rotations.shape(0), height = camera.height, width = camera.width;
+        expect(s > 0 && rotations.shape(1) == 3 && rotations.shape(2) == 3 && centres.shape(0) == s &&
+                   centres.shape(1) == 3 && background.shape(0) == 3,
+               "poses disagree");
+        expect(!weights || (weights->shape(0) == s && weights->shape(1) == height && weights->shape(2) == width),
+               "weights are [S, H, W]");
+        expect(!windows || (!weights && s > 1 && windows->shape(0) == 2 && windows->shape(1) == height &&
+                            windows->shape(2) == width),
+               "windows are [2, H, W], go without weights, and need two poses");
+        expect(!channels || (c == 3 && channels->shape(0) == height && channels->shape(1) == width),
+               "channels are [H, W], for splats of three colours");
+        expect(values.size() == height * width * (channels ? 1 : c) && alpha.size() == height * width &&
+                   depth.size() == height * width,
+               "outputs have the wrong size");
+        return {rotations.data(),
+                centres.data(),
+                static_cast<int>(s),
+                weights ? weights->data() : nullptr,
+                windows ? windows->data() : nullptr,
+                windows ? windows->data() + height * width : nullptr,
+                channels ? channels->data() : nullptr};
+    }
+};
+
+// T: float or const float.
+template <class T>
+SplatArrays splats_of(const Array<T, 2>& means, const Array<T, 2>& quats, const Array<T, 2>& log_scales,
+                      const Array<T, 1>& opacity_logits, const Array<T, 2>& colours) {
+    const size_t n = means.shape(0), c = colours.shape(1);
+    expect(means.shape(1) == 3 && quats.shape(0) == n && quats.shape(1) == 4 && log_scales.shape(0) == n &&
+               log_scales.shape(1) == 3 && opacity_logits.shape(0) == n && colours.shape(0) == n,
+           "splat arrays disagree");
+    expect(c == 1 || c == 3, "colours are [N, 1] or [N, 3]");
+    expect(n < (1u << 27), "too many splats");
+    return {static_cast<int>(n), static_cast<int>(c),   means.data(),  quats.data(),
+            log_scales.data(),   opacity_logits.data(), colours.data()};
+}
+
 template <class Renderer>
 void forward(Renderer& self, Array<const float, 2> means, Array<const float, 2> quats, Array<const float, 2> log_scales,
              Array<const float, 1> opacity_logits, Array<const float, 2> colours, Array<const double, 3> rotations,
              Array<const double, 2> centres, std::optional<Array<const float, 3>> weights,
              std::optional<Array<const float, 3>> windows, std::optional<Array<const uint8_t, 2>> channels,
              Array<const float, 1> background, AnyArray<float> values, Array<float, 2> alpha, Array<float, 2> depth) {
-    const size_t n = means.shape(0), s = rotations.shape(0), c = colours.shape(1);
-    const size_t height = self.camera().height, width = self.camera().width;
-    expect(means.shape(1) == 3 && quats.shape(0) == n && quats.shape(1) == 4 && log_scales.shape(0) == n &&
-               log_scales.shape(1) == 3 && opacity_logits.shape(0) == n && colours.shape(0) == n,
-           "splat arrays disagree");
-    expect(c == 1 || c == 3, "colours are [N, 1] or [N, 3]");
-    expect(n < (1u << 27), "too many splats");
-    expect(s > 0 && rotations.shape(1) == 3 && rotations.shape(2) == 3 && centres.shape(0) == s &&
-               centres.shape(1) == 3 && background.shape(0) == 3,
-           "poses disagree");
-    expect(!weights || (weights->shape(0) == s && weights->shape(1) == height && weights->shape(2) == width),
-           "weights are [S, H, W]");
-    expect(!windows || (!weights && s > 1 && windows->shape(0) == 2 && windows->shape(1) == height &&
-                        windows->shape(2) == width),
-           "windows are [2, H, W], go without weights, and need two poses");
-    expect(!channels || (c == 3 && channels->shape(0) == height && channels->shape(1) == width),
-           "channels are [H, W], for splats of three colours");
-    expect(values.size() == height * width * (channels ? 1 : c) && alpha.size() == height * width &&
-               depth.size() == height * width,
-           "outputs have the wrong size");
-    const SplatArrays splats{static_cast<int>(n), static_cast<int>(c),   means.data(),  quats.data(),
-                             log_scales.data(),   opacity_logits.data(), colours.data()};
-    const Views views{rotations.data(),
-                      centres.data(),
-                      static_cast<int>(s),
-                      weights ? weights->data() : nullptr,
-                      windows ? windows->data() : nullptr,
-                      windows ? windows->data() + height * width : nullptr,
-                      channels ? channels->data() : nullptr};
+    const SplatArrays splats = splats_of(means, quats, log_scales, opacity_logits, colours);
+    const PassArrays arrays{rotations, centres, weights, windows, channels, background, values, alpha, depth};
+    const Views views = arrays.views(self.camera(), colours.shape(1));
     nb::gil_scoped_release release;
     self.forward(splats, views, background.data(), values.data(), alpha.data(), depth.data());
 }

@@ -21,8 +21,7 @@ from spiked.recon.mapping.seeding import SweptView, isotropic_splats
 from spiked.recon.statistics import WHITE_PERCENTILE
 from spiked.render import AnyRasteriser, Camera
 from spiked.render.charge import ChargeLoss
-from spiked.render.optimiser import Adam
-from spiked.render.splats import Gradients
+from spiked.render.descent import descent_for
 from spiked.scene import Scene
 from spiked.sensor import Image, Sensor
 
@@ -57,13 +56,11 @@ class Mapper:
         self.colours = 1 if sensor.mosaic is None else 3
         self.levels = levels(sensor, camera, threads)
         self.channels = self.levels[0].channels
-        self.scene = Scene.empty(self.colours)
+        self.descent = descent_for(Scene.empty(self.colours), *BETAS, threads)
         self.white = 1.0
         """The radiance (spikes a frame) that is shown as white: `WHITE_PERCENTILE` of the first seeded view."""
         self.depth = 1.0
         """Typical depth of the scene; the learning rate of the means is relative to it."""
-        self._threads = threads
-        self.adam = Adam(self.scene.arrays(), *BETAS, threads=threads)
         self.nuisances = Nuisances(sensor.height, sensor.width)
         self.rate_loss = RateLoss(options.ssim, options.floor)
         self.view_loss = options.view_loss()
@@ -76,6 +73,15 @@ class Mapper:
         self._charge_error: Image = np.zeros((1, 1), np.float32)
         self._rng = np.random.default_rng(seed)
         self._losses: dict[int, float] = {}
+
+    def __len__(self) -> int:
+        """The number of splats."""
+        return len(self.descent.model)
+
+    @property
+    def scene(self) -> Scene:
+        """The map."""
+        return self.descent.scene
 
     @property
     def rasteriser(self) -> AnyRasteriser:
@@ -96,7 +102,7 @@ class Mapper:
         """Add splats at the pixels of a swept view that the map does not cover, with a depth confidence of at least
         `surer`; returns their number."""
         rate, seeding = swept.view.rate, self.options.seeding
-        if len(self.scene):
+        if len(self):
             alpha = self.rasteriser.forward(self.scene, swept.rotation[None], swept.centre[None]).alpha
             empty = alpha < seeding.opacity
         else:
@@ -104,7 +110,7 @@ class Mapper:
             empty = np.ones(rate.shape, bool)
         empty &= swept.sweep.confidence >= surer
         stride = seeding.stride(rate.size, int(self.cap / self.extent), self.options.stride_px)
-        chosen = seeding.pixels(empty, stride, self.cap - len(self.scene))
+        chosen = seeding.pixels(empty, stride, self.cap - len(self))
         if chosen is None:
             return 0
         v, u = chosen
@@ -136,13 +142,11 @@ class Mapper:
         v, u = pixels
         at, deviation_px = np.stack([u + 0.5, v + 0.5], 1), self.options.seeding.size * apart_px
         intrinsics = self.camera.intrinsics
-        self.scene = self.scene.join(isotropic_splats(intrinsics, at, depth, colours, deviation_px, rotation, centre))
-        self.adam.grow(len(at))
+        self.descent.join(isotropic_splats(intrinsics, at, depth, colours, deviation_px, rotation, centre))
 
     def adopt(self, scene: Scene) -> None:
         """Go on with another scene."""
-        self.scene = scene
-        self.adam = Adam(scene.arrays(), *BETAS, threads=self._threads)
+        self.descent.adopt(scene)
 
     def level(self, coarse: float) -> Level:
         """The pyramid level for a coarseness from 0 (full size) to 1 (smallest)."""
@@ -156,30 +160,28 @@ class Mapper:
             slope = self._compare_rates(key, view, request, level, background)
         else:
             slope = self._compare_charge(key, request, level, background)
-        self._descend(level.rasteriser.backward(slope), decay)
+        self._descend(level.rasteriser, slope, decay)
 
     def replay(self, replay: Replay, decay: float) -> None:
         """One gradient step towards what another map shows."""
         background = float(self._rng.uniform(0, self.options.background)) * self.white
-        image = replay.render(self.scene, background)
+        image = replay.render(self.descent.model, background)
         slope = self.rate_loss(image.values, replay.target(image.values), self.white)[1]
-        self._descend(replay.rasteriser.backward(slope), decay)
+        self._descend(replay.rasteriser, slope, decay)
 
-    def _descend(self, gradients: Gradients, decay: float) -> None:
+    def _descend(self, rasteriser: AnyRasteriser, slope: Image, decay: float) -> None:
         self.steps += 1
         o = self.options
         others = (o.rate_quats, o.rate_scales, o.rate_opacities, o.rate_colours * self.white)
         rates = tuple(decay * rate for rate in (o.rate_means * self.depth, *others))
-        self.adam.step(self.scene.arrays(), gradients.arrays(), rates, gradients.radius_px > 0)
-        # Viewers show splats of negative colour as black.
-        np.maximum(self.scene.colours, 0, out=self.scene.colours)
-        np.minimum(self.scene.log_scales, self._most_log_scale, out=self.scene.log_scales)
+        self.descent.step(rasteriser, slope, rates, self._most_log_scale)
 
     def _compare_rates(self, key: int, view: View, request: RenderRequest, level: Level, background: float) -> Image:
         """Gradient of the loss by the image, from a view's rates over its pixels' windows."""
         target = level.target(view, request.windows, request.seen)
         first = self.options.demosaic_first and level.mosaic is not None
-        image = level.render(self.scene, replace(request, windows=target.windows), background, demosaiced=first)
+        model = self.descent.model
+        image = level.render(model, replace(request, windows=target.windows), background, demosaiced=first)
         expected = image.values
         factor: Image | None = None
         if first:
@@ -198,7 +200,8 @@ class Mapper:
 
     def _compare_charge(self, key: int, request: RenderRequest, level: Level, background: float) -> Image:
         """As `_compare_rates`, from the charge between the spikes of all frames around a view."""
-        image = level.rasteriser.forward(self.scene, request.rotations, request.centres, background=background)
+        model = self.descent.model
+        image = level.rasteriser.forward(model, request.rotations, request.centres, background=background)
         gain, phase = self.nuisances.factor(key), int(self._rng.integers(level.factor))
         charge = self.charge_loss(image, request, gain, self.white, pixel=level.factor, phase=phase)
         if self._knows_nuisances():
@@ -231,12 +234,12 @@ class Mapper:
         rotation, centre = request.rotations[middle], request.centres[middle]
         if request.warp is None:
             level = self.levels[0]
-            image = level.render(self.scene, request)
+            image = level.render(self.descent.model, request)
             deviation = level.target(view, request.windows, request.seen).deviation
             certainty = self.rate_loss.certainty(deviation, self.white)
             error = (view.rate - self.nuisances.factor(key) * image.values) * certainty
         else:
-            image = self.rasteriser.forward(self.scene, rotation[None], centre[None])
+            image = self.rasteriser.forward(self.descent.model, rotation[None], centre[None])
             size = (self.camera.width, self.camera.height)
             error = cv2.resize(self._charge_error, size, interpolation=cv2.INTER_LINEAR)
         seen = fill_mosaic(view.rate, self.channels) if request.warp is None else image.values
@@ -253,7 +256,7 @@ class Mapper:
         strategy = self.options.densification
         dead = strategy.dead(self.scene)
         self._remove(dead)
-        chosen = strategy.choose(error, int(dead.sum()), self.cap, self.cap - len(self.scene), self._rng)
+        chosen = strategy.choose(error, int(dead.sum()), self.cap, self.cap - len(self), self._rng)
         if chosen is None:
             return
         v, u = chosen
@@ -272,8 +275,7 @@ class Mapper:
     def _remove(self, chosen: NDArray[np.bool_]) -> None:
         """Remove splats, [N]."""
         if chosen.any():
-            self.scene = self.scene.select(~chosen)
-            self.adam.keep(~chosen)
+            self.descent.select(~chosen)
 
     def render(self, rotation: Array, centre: Array) -> Image:
         """Render the map from a pose: radiance [H, W, C]."""

@@ -215,7 +215,7 @@ Compared = tuple[RenderedImage, Image, Image, Image]
 def _windowed(key: int, view: View, request: RenderRequest, mapper: Mapper, level: Level) -> Compared:
     """A view's rates and the map rendered over the pixels' windows."""
     target = level.target(view, request.windows, request.seen)
-    image = level.render(mapper.scene, replace(request, windows=target.windows))
+    image = level.render(mapper.descent.model, replace(request, windows=target.windows))
     expected = image.values
     if level.factor == 1:
         expected = np.asarray(expected * mapper.nuisances.factor(key), np.float32)
@@ -226,7 +226,7 @@ def _windowed(key: int, view: View, request: RenderRequest, mapper: Mapper, leve
 
 def _warped(request: RenderRequest, warp: FrameWarp, mapper: Mapper, level: Level) -> Compared:
     """The spikes of the frames around a view, warped to it by depth and path, and the map rendered there."""
-    image = level.rasteriser.forward(mapper.scene, request.rotations, request.centres)
+    image = level.rasteriser.forward(mapper.descent.model, request.rotations, request.centres)
     moved = warp.displacements(mapper.camera, request.rotations[0], request.centres[0], image.depth)
     seen = level.shrunk(warp_frames(warp.frames, mapper.sensor, moved, WARP_CELL_PX))
     return image, grey(image.values), seen, np.ones_like(seen)

@@ -120,7 +120,7 @@ class MapTrainer:
         points [N, 3] are landmarks, whose depths give the range of the sweep; quick: sweep small images.
         """
         self.mapper.extent = self.extent
-        begins, mappable = len(self.mapper.scene) == 0, self.views.mappable(path)
+        begins, mappable = len(self.mapper) == 0, self.views.mappable(path)
         poses = path.poses([self.views[i].time for i in mappable])
         found = [self._sweep(mappable, *poses, mappable.index(view_id), points, quick) for view_id in ids]
         swept = [one for one in found if one is not None]
@@ -223,7 +223,7 @@ class MapTrainer:
         request = self.planner.exposed(view, path, level.factor)
         target = level.target(view, request.windows, request.seen)
         request = replace(request, windows=target.windows)
-        image = level.render(self.mapper.scene, request)
+        image = level.render(self.mapper.descent.model, request)
         factor = None
         if level.factor == 1 and self.options.nuisances:
             factor = self.mapper.nuisances.factor(view_id)
@@ -257,7 +257,7 @@ class MapTrainer:
     def train_live(self, path: Path, points: Array, until: float) -> None:
         """Seed recent views if needed, then take steps until that time of `time.perf_counter`."""
         ids, quick = self.views.mappable(path), isinstance(path, Waypoints)
-        if len(self.mapper.scene) == 0:
+        if len(self.mapper) == 0:
             self.seed(path, points, [ids[len(ids) // 2]], quick)
         elif self.options.seeding.due([self.views[i].time for i in ids], self._seeded_at):
             self.seed(path, points, [ids[-3]], quick)

@@ -1,0 +1,129 @@
+"""Gradient descent on a scene by Adam: the splats, their moments, and the step that changes both.
+
+`descent_for` gives the best one here: on a GPU splats and moments stay on the device from step to step.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spiked.render.choice import AnyRasteriser, chosen
+from spiked.render.gpu import DeviceScene, GpuRasteriser
+from spiked.render.optimiser import Adam
+from spiked.render.splats import Floats
+from spiked.scene import Scene
+
+
+class Descent:
+    """A scene that is fitted on the CPU."""
+
+    def __init__(self, scene: Scene, beta1: float, beta2: float, threads: int | None = None) -> None:
+        self._settings = beta1, beta2, threads
+        self.adopt(scene)
+
+    def adopt(self, scene: Scene) -> None:
+        """Go on with another scene, without moments."""
+        beta1, beta2, threads = self._settings
+        self._scene = scene
+        self.adam = Adam(scene.arrays(), beta1, beta2, threads=threads)
+
+    @property
+    def scene(self) -> Scene:
+        """The scene as it is. The next step changes its arrays."""
+        return self._scene
+
+    @property
+    def model(self) -> Scene | DeviceScene:
+        """The scene as a rasteriser of this kind renders it best."""
+        return self._scene
+
+    def join(self, splats: Scene) -> None:
+        """Add splats, without moments."""
+        self._scene = self.scene.join(splats)
+        self.adam.grow(len(splats))
+
+    def select(self, rows: NDArray[np.bool_]) -> None:
+        """Keep the splats at `rows`, [N]."""
+        self._scene = self.scene.select(rows)
+        self.adam.keep(rows)
+
+    def step(
+        self, rasteriser: AnyRasteriser, slope: Floats, rates: tuple[float, ...], most_log_scale: np.float32
+    ) -> None:
+        """Change the splats that the last image of `rasteriser`, a render of `model`, shows: slope is the gradient by
+        its values, and rates are those of the five arrays.
+
+        Colours below 0 become 0, as viewers show them as black, and log scales stay at or below most_log_scale.
+        """
+        gradients = rasteriser.backward(slope)
+        scene = self._scene
+        self.adam.step(scene.arrays(), gradients.arrays(), rates, gradients.radius_px > 0)
+        np.maximum(scene.colours, 0, out=scene.colours)
+        np.minimum(scene.log_scales, most_log_scale, out=scene.log_scales)
+
+
+class DeviceDescent(Descent):
+    """A scene that is fitted on a GPU; it is copied back when it is asked for, and to it when it was changed here."""
+
+    def __init__(self, scene: Scene, beta1: float, beta2: float, threads: int | None = None) -> None:
+        self._device: DeviceScene | None = None
+        self._behind = False
+        """The scene here is older than the one on the device."""
+        super().__init__(scene, beta1, beta2, threads)
+
+    def __getstate__(self) -> dict[str, object]:
+        self._fetch()
+        return vars(self) | {"_device": None}
+
+    def adopt(self, scene: Scene) -> None:
+        """See `Descent.adopt`."""
+        super().adopt(scene)
+        self._device, self._behind = None, False
+
+    @property
+    def scene(self) -> Scene:
+        """See `Descent.scene`; a copy of what is on the device."""
+        self._fetch()
+        return self._scene
+
+    @property
+    def model(self) -> Scene | DeviceScene:
+        """The scene on the device; the one here where it has not been fitted since it was changed."""
+        return self._scene if self._device is None else self._device
+
+    def join(self, splats: Scene) -> None:
+        """See `Descent.join`."""
+        super().join(splats)
+        self._device = None
+
+    def select(self, rows: NDArray[np.bool_]) -> None:
+        """See `Descent.select`."""
+        self._fetch()
+        super().select(rows)
+        self._device = None
+
+    def step(
+        self, rasteriser: AnyRasteriser, slope: Floats, rates: tuple[float, ...], most_log_scale: np.float32
+    ) -> None:
+        """See `Descent.step`."""
+        assert isinstance(rasteriser, GpuRasteriser)
+        if self._device is None:
+            self._device = rasteriser.device_scene()
+            self._device.native.set(*self._scene.arrays(), *self.adam.packed())
+        beta1, beta2, _ = self._settings
+        rasteriser.descend(slope, self._device, rates, beta1, beta2, self.adam.epsilon, float(most_log_scale))
+        self._behind = True
+
+    def _fetch(self) -> None:
+        if not self._behind or self._device is None:
+            return
+        arrays = tuple(np.empty_like(array) for array in self._scene.arrays())
+        moments = tuple(np.empty_like(array) for array in self.adam.packed())
+        self._device.native.get(*arrays, *moments)
+        self._scene = Scene(*arrays, white=self._scene.white)
+        self.adam.unpack(*moments)
+        self._behind = False
+
+
+def descent_for(scene: Scene, beta1: float, beta2: float, threads: int | None = None) -> Descent:
+    """Descent by the renderer that is `chosen`; threads are the CPU's. Raises ConfigurationError as that does."""
+    return (Descent if chosen().renderer == "cpu" else DeviceDescent)(scene, beta1, beta2, threads)

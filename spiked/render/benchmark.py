@@ -14,7 +14,7 @@ from spiked.pose import exp_so3
 from spiked.render.camera import Camera
 from spiked.render.charge import WARP_CELL_PX, ChargeLoss
 from spiked.render.cpu import Rasteriser, usable_cores
-from spiked.render.loss import dssim
+from spiked.render.loss import StructuralSimilarity
 from spiked.render.optimiser import Adam
 from spiked.render.splats import Floats
 from spiked.scene import Scene
@@ -300,10 +300,10 @@ def _fused(size: Size, repetitions: int) -> list[Measurement]:
         rng.normal(size=rest).astype(np.float32)
         for rest in ((size.splats, 3), (size.splats, 4), (size.splats, 3), (size.splats,), (size.splats, 1))
     ]
-    adam = Adam(arrays)
+    adam, similarity = Adam(arrays), StructuralSimilarity()
     where = f"{size.width}x{size.height}"
     timed: tuple[tuple[str, Callable[[], object]], ...] = (
-        (f"D-SSIM, {where}", lambda: dssim(rendered, target=target)),
+        (f"D-SSIM, {where}", lambda: similarity(rendered, target)),
         (f"Adam, {size.splats // 1000}k splats", lambda: adam.step(arrays, arrays, [1e-6] * 5)),
     )
     return [Measurement(name, repeated(work, repetitions).best_s * 1e3, "ms") for name, work in timed]

@@ -159,8 +159,10 @@ struct SsimImage {
     int width, height;
     float c1, c2;
 };
-// Floats of scratch: eight planes with margins above and below, and eight rows with margins at both ends.
-static inline int64_t ssim_scratch(int width, int height) { return 8 * ((int64_t)(height + 10) * width + width + 10); }
+constexpr int kSsimMargin = 5;  // rows
+// Floats of scratch of a thread: eight rows with margins at both ends, and five without.
+static inline int64_t ssim_scratch(int width) { return 8 * ((int64_t)width + 2 * kSsimMargin) + 5 * (int64_t)width; }
+
 struct RasterKernels {
     const char* name;
 #define SPIKED_KERNEL(result, name, arguments) result(*name) arguments;

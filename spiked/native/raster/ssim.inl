@@ -19,7 +19,7 @@ static double sum_floats(const float* x, int count) {
     return sum;
 }
 
-constexpr int kReach = 5;  // the window has 2 kReach + 1 pixels on a side
+constexpr int kReach = kSsimMargin;  // the window has 2 kReach + 1 pixels on a side
 // exp(-k^2 / (2 1.5^2)), normalised over -5..5
 static constexpr float kWindow[kReach + 1] = {0.26601172f, 0.21300553f, 0.10936069f,
                                               0.03600077f, 0.00759876f, 0.00102838f};
@@ -60,30 +60,23 @@ static inline void similarity_row(const SsimImage& image, float* const blurred[5
     }
 }
 
-static double ssim(const SsimImage& image, const float* rendered, const float* target, float* scratch,
-                   float* d_rendered) {
-    const int width = image.width, height = image.height;
-    const int64_t margin = (int64_t)kReach * width, plane = (int64_t)height * width + 2 * margin;
-    float *planes[5], *d_planes[3], *rows[5], *d_rows[3];
-    // What is outside the image counts as zero in both images: rows above and below it, and both ends of a row.
-    auto take_plane = [&](float*& p) {
-        p = scratch + margin;
-        scratch += plane;
-        __builtin_memset(p - margin, 0, margin * sizeof(float));
-        __builtin_memset(p + (int64_t)height * width, 0, margin * sizeof(float));
-    };
-    auto take_row = [&](float*& p) {
-        p = scratch + kReach;
-        scratch += width + 2 * kReach;
-        __builtin_memset(p - kReach, 0, (width + 2 * kReach) * sizeof(float));
-    };
-    for (float*& p : planes) take_plane(p);
-    for (float*& p : d_planes) take_plane(p);
-    for (float*& p : rows) take_row(p);
-    for (float*& p : d_rows) take_row(p);
+// Rows of scratch [8][width] with margins of zeros at both ends: what is outside of the image counts as zero.
+static inline void take_rows(float* scratch, int width, float* rows[8]) {
+    for (int k = 0; k < 8; ++k, scratch += width + 2 * kReach) {
+        rows[k] = scratch + kReach;
+        __builtin_memset(scratch, 0, (width + 2 * kReach) * sizeof(float));
+    }
+}
 
-    for (int y = 0; y < height; ++y) {
-        const float *a = rendered + (int64_t)y * width, *b = target + (int64_t)y * width;
+// Blurs rows [first, last) of x, y, x^2, y^2 and xy along themselves.
+static void ssim_blur(const SsimImage& image, const float* rendered, const float* target, int first, int last,
+                      float* scratch, float* const planes[8]) {
+    const int width = image.width;
+    float* rows[8];
+    take_rows(scratch, width, rows);
+    for (int y = first; y < last; ++y) {
+        const int64_t at = (int64_t)y * width;
+        const float *a = rendered + at, *b = target + at;
         for (int x = 0; x < width; ++x) {
             rows[0][x] = a[x];
             rows[1][x] = b[x];
@@ -91,26 +84,42 @@ static double ssim(const SsimImage& image, const float* rendered, const float* t
             rows[3][x] = b[x] * b[x];
             rows[4][x] = a[x] * b[x];
         }
-        for (int k = 0; k < 5; ++k) blur_row(rows[k], width, planes[k] + (int64_t)y * width);
+        for (int k = 0; k < 5; ++k) blur_row(rows[k], width, planes[k] + at);
     }
-    double sum = 0;
-    for (int y = 0; y < height; ++y) {
+}
+
+// The similarity of rows [first, last), a sum for each, and its derivatives blurred along the rows.
+static void ssim_compare(const SsimImage& image, int first, int last, float* scratch, float* const planes[8],
+                         double* sums) {
+    const int width = image.width;
+    float* rows[8];
+    take_rows(scratch, width, rows);
+    float* const* d_rows = rows + 4;  // rows[0..3] hold the similarities and blurs in turn
+    float* blurred = scratch + 8 * (width + 2 * kReach);
+    float* means[5];
+    for (int k = 0; k < 5; ++k) means[k] = blurred + (int64_t)k * width;
+    for (int y = first; y < last; ++y) {
         const int64_t at = (int64_t)y * width;
-        for (int k = 0; k < 5; ++k) blur_column(planes[k] + at, width, width, rows[k]);
-        // The row of d_rendered holds the similarities until it gets its gradients.
-        float* similarity = d_rendered + (int64_t)y * width;
-        similarity_row(image, rows, similarity, d_rows);
-        sum += sum_floats(similarity, width);
-        for (int k = 0; k < 3; ++k) blur_row(d_rows[k], width, d_planes[k] + at);
+        for (int k = 0; k < 5; ++k) blur_column(planes[k] + at, width, width, means[k]);
+        similarity_row(image, means, rows[0], d_rows);
+        sums[y] = sum_floats(rows[0], width);
+        for (int k = 0; k < 3; ++k) blur_row(d_rows[k], width, planes[5 + k] + at);
     }
-    const float over = (float)(1.0 / ((double)width * height));
-    for (int y = 0; y < height; ++y) {
-        const float *a = rendered + (int64_t)y * width, *b = target + (int64_t)y * width;
-        float* out = d_rendered + (int64_t)y * width;
-        for (int k = 0; k < 3; ++k) blur_column(d_planes[k] + (int64_t)y * width, width, width, d_rows[k]);
+}
+
+// The gradient of the mean similarity by rows [first, last) of the rendered image.
+static void ssim_gradient(const SsimImage& image, const float* rendered, const float* target, int first, int last,
+                          float* scratch, float* const planes[8], float* d_rendered) {
+    const int width = image.width;
+    const float over = (float)(1.0 / ((double)width * image.height));
+    float* d_rows[3] = {scratch, scratch + width, scratch + 2 * width};
+    for (int y = first; y < last; ++y) {
+        const int64_t at = (int64_t)y * width;
+        const float *a = rendered + at, *b = target + at;
+        float* out = d_rendered + at;
+        for (int k = 0; k < 3; ++k) blur_column(planes[5 + k] + at, width, width, d_rows[k]);
         for (int x = 0; x < width; ++x) out[x] = over * (d_rows[0][x] + 2 * a[x] * d_rows[1][x] + b[x] * d_rows[2][x]);
     }
-    return sum / ((double)width * height);
 }
 
 }  // namespace

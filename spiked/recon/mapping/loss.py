@@ -17,7 +17,7 @@ from spiked.recon.mapping.pyramid import Target
 from spiked.recon.mapping.render_requests import RenderRequest
 from spiked.render import Camera, RenderedImage
 from spiked.render.charge import ChargeLoss
-from spiked.render.loss import dssim
+from spiked.render.loss import StructuralSimilarity
 from spiked.sensor import Image, Mosaic
 
 RATE_RANGE = 1e-3, 1 - 1e-3
@@ -65,6 +65,10 @@ class ViewLoss(Protocol):
         """Compare rates `expected`, [H, W] or [H, W, 3], with a target of their shape."""
 
 
+def _on_one_thread() -> StructuralSimilarity:
+    return StructuralSimilarity(1)
+
+
 @dataclass(frozen=True)
 class RateLoss:
     """Squared error of a view's rates, weighted by their noise, and structural similarity."""
@@ -76,6 +80,7 @@ class RateLoss:
     nothing (decision 3)."""
     ssim_scale: float = 0.01
     """Factor on 1 - SSIM; brings it to the size of the mean squared error."""
+    similarity: StructuralSimilarity = field(default_factory=_on_one_thread, compare=False, repr=False)
 
     def __call__(
         self, expected: Image, target: Target, white: float, mosaic: Mosaic | None = None
@@ -93,7 +98,7 @@ class RateLoss:
         weight = self.certainty(target.deviation, white)
         scale = np.float32(1 / (white**2 * error.size))
         squares = Comparison(0.0, 2 * scale * weight * error, float(np.mean(weight * error * error)) / white**2)
-        return _with_similarity(squares, self.ssim, self.ssim_scale, expected, target, white, mosaic)
+        return _with_similarity(self, squares, expected, target, white, mosaic)
 
     def certainty(self, deviation: Image, white: float) -> Image:
         """Weight in [0, 1] of a squared error of a rate with that standard deviation; 1 for a noiseless pixel."""
@@ -102,19 +107,19 @@ class RateLoss:
 
 
 def _with_similarity(
+    loss: "RateLoss | PhotometricLoss",
     squares: Comparison,
-    share: float,
-    scale: float,
     expected: Image,
     target: Target,
     white: float,
     mosaic: Mosaic | None,
 ) -> Comparison:
     """(1 - share) squared error + share * scale * (1 - SSIM); `squares` has the squared error and its slope."""
+    share, scale = loss.ssim, loss.ssim_scale
     if share == 0:
         return Comparison(squares.error, squares.slope, squares.error)
     rendered, seen = luminance(expected, mosaic), luminance(target.values, mosaic)
-    unlike, slope = dssim(rendered, target=seen, white=white)
+    unlike, slope = loss.similarity(rendered, seen, white)
     # The filter of `luminance` is symmetric, so it is its own transpose.
     slope = (1 - share) * squares.slope + share * scale * luminance(slope, mosaic)
     return Comparison((1 - share) * squares.error + share * scale * unlike, slope, squares.error)
@@ -131,13 +136,14 @@ class PhotometricLoss:
     """Lambda of the equations."""
     ssim_scale: float = 0.01
     """As in `RateLoss`; 1 is what the equations say."""
+    similarity: StructuralSimilarity = field(default_factory=_on_one_thread, compare=False, repr=False)
 
     def compare(self, expected: Image, target: Target, white: float, mosaic: Mosaic | None = None) -> Comparison:
         """See `ViewLoss.compare`."""
         error = np.where(np.isfinite(target.deviation), expected - target.values, np.float32(0))
         slope = np.asarray(2 * error * np.float32(1 / (white**2 * error.size)), np.float32)
         squares = Comparison(0.0, slope, float(np.mean(error * error)) / white**2)
-        return _with_similarity(squares, self.ssim, self.ssim_scale, expected, target, white, mosaic)
+        return _with_similarity(self, squares, expected, target, white, mosaic)
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ class Mapper:
         """Typical depth of the scene; the learning rate of the means is relative to it."""
         self.nuisances = Nuisances(sensor.height, sensor.width)
         self.rate_loss = RateLoss(options.ssim, options.floor)
-        self.view_loss = options.view_loss()
+        self.view_loss = options.view_loss(threads)
         kernel = ChargeLoss(sensor, threads)
         self.charge_loss = WarpedChargeLoss(kernel, camera, calibration, options.floor, options.detail)
         self.extent = 1.0

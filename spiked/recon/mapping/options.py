@@ -15,6 +15,7 @@ from spiked.recon.mapping.loss import (
 from spiked.recon.mapping.pruning import Pruning
 from spiked.recon.mapping.schedule import Schedule
 from spiked.recon.mapping.seeding import Seeding
+from spiked.render.loss import StructuralSimilarity
 
 PHOTON_SPLATS = 0.375
 """Splats of a map made of photon counts, over those of one made of spikes (decision 27)."""
@@ -79,12 +80,14 @@ class MapOptions:
     schedule: Schedule = field(default_factory=Schedule)
     """What happens when in a refinement."""
 
-    def view_loss(self) -> ViewLoss:
-        """The loss of a view's image; `LossName.CHARGE` has another one for fast motion."""
-        light = PhotometricLoss(self.ssim, self.ssim_scale)
+    def view_loss(self, threads: int | None = 1) -> ViewLoss:
+        """The loss of a view's image; `LossName.CHARGE` has another one for fast motion. Threads: None, the cores that
+        this process may use."""
+        similarity = StructuralSimilarity(threads)
+        light = PhotometricLoss(self.ssim, self.ssim_scale, similarity)
         match self.loss:
             case LossName.CHARGE:
-                return RateLoss(self.ssim, self.floor, self.ssim_scale)
+                return RateLoss(self.ssim, self.floor, self.ssim_scale, similarity)
             case LossName.ACCUMULATION | LossName.INTERVAL:
                 return light
             case LossName.BINOMIAL:

@@ -189,7 +189,7 @@ class MapTrainer:
     def fit_with(self, loss: LossName) -> None:
         """Fit the map with another loss from now on; the views have recorded what it needs."""
         self.loss = loss
-        self.mapper.view_loss = replace(self.options, loss=loss).view_loss()
+        self.mapper.view_loss = replace(self.options, loss=loss).view_loss(self.threads)
 
     def use_only(self, ids: Sequence[int] | None) -> None:
         """Take steps on these views only; None: on all."""

@@ -16,7 +16,7 @@ GUEST := qemu-system-x86 busybox-static udev
 
 VENV := .venv
 BIN := $(VENV)/bin
-NATIVE_SOURCES := CMakeLists.txt $(shell find spiked/native -name '*.cpp' -o -name '*.hpp' -o -name '*.inl' -o -name CMakeLists.txt)
+NATIVE_SOURCES := CMakeLists.txt $(shell find spiked/native -name '*.cpp' -o -name '*.hpp' -o -name '*.inl' -o -name '*.cu' -o -name CMakeLists.txt)
 CPP := $(filter-out %CMakeLists.txt,$(NATIVE_SOURCES)) $(wildcard tests/fuzz/*.?pp)
 WEB := $(shell find web -path web/node_modules -prune -o -type f -print)
 PAGE := service/spiked_service/page/index.html

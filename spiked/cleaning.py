@@ -10,8 +10,7 @@ from scipy.spatial import cKDTree
 
 from spiked.errors import ConfigurationError
 from spiked.recon.statistics import evenly
-from spiked.render import Camera
-from spiked.render import rasteriser_for
+from spiked.render import Camera, rasteriser_for
 from spiked.scene import Scene
 from spiked.splitting import split_large
 from spiked.trajectory import Trajectory

@@ -15,8 +15,7 @@ from scipy.optimize import least_squares
 
 from spiked.errors import ConfigurationError, SceneError
 from spiked.recon.statistics import evenly
-from spiked.render import Camera
-from spiked.render import rasteriser_for
+from spiked.render import Camera, rasteriser_for
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics
 from spiked.trajectory import Trajectory

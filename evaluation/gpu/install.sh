@@ -2,7 +2,7 @@
 # A wheel of this tree, installed into an environment of its own, the compiled modules in it checked:
 #   evaluation/gpu/install.sh VENV
 # The environment sees the machine's packages, so that a torch made for its GPU is taken and none is downloaded.
-# EXTRAS are those of the wheel: "[cuda,test]" if not set.
+# EXTRAS are those of the wheel: "[test]" if not set.
 set -eu
 venv=$(realpath -m "${1:?usage: evaluation/gpu/install.sh VENV}")
 cd "$(dirname "$0")/../.."
@@ -12,7 +12,7 @@ trap 'rm -rf "$wheels"' EXIT
 "$venv/bin/pip" wheel --quiet --no-deps --wheel-dir "$wheels" .
 wheel=$(ls "$wheels"/spiked-*.whl)
 "$venv/bin/pip" install --quiet --force-reinstall --no-deps "$wheel"
-"$venv/bin/pip" install --quiet "$wheel${EXTRAS-[cuda,test]}"
+"$venv/bin/pip" install --quiet "$wheel${EXTRAS-[test]}"
 # Away from the tree, whose folder `spiked` has no compiled modules and would be found first.
 cd "$wheels"
 "$venv/bin/python" -P - "$venv" <<'CHECK'

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Everything there is to measure on a machine with an NVIDIA GPU and the CUDA toolkit (gsplat compiles its kernels once):
+# Everything there is to measure on a machine with an NVIDIA GPU and nvcc (beside gsplat, if EXTRAS or the machine has it):
 #   evaluation/gpu/measure.sh STREAMS [SCORE.py] > gpu.txt
 # STREAMS holds living/ and camp_color/ as `spiked simulate` writes such folders. VENV is where the wheel of this tree
 # is installed: build/gpu if not set.
@@ -7,7 +7,7 @@ set -eu
 streams=$(realpath "${1:?usage: evaluation/gpu/measure.sh STREAMS [SCORE.py]}")
 score=${2:+--score $(realpath "$2")}
 tree=$(realpath "$(dirname "$0")/../..")
-command -v nvcc >/dev/null || { echo "the CUDA toolkit's nvcc is not in PATH: gsplat needs it to compile" >&2; exit 1; }
+command -v nvcc >/dev/null || { echo "nvcc is not in PATH: the kernels are compiled with it" >&2; exit 1; }
 venv=$(realpath -m "${VENV:-$tree/build/gpu}")
 "$tree/evaluation/gpu/install.sh" "$venv"
 away=$(mktemp -d)
@@ -16,7 +16,7 @@ cd "$away"  # in the tree, and without -P, Python would find the folder `spiked`
 python="$venv/bin/python -P"
 nvidia-smi --query-gpu=name,driver_version,memory.total --format=csv
 "$venv/bin/spiked" version
-$python -m pytest -q -p no:cacheprovider "$tree/tests/render/test_cuda.py"
+$python -m pytest -q -p no:cacheprovider "$tree/tests/render/test_gpu.py" "$tree/tests/render/test_gsplat.py" "$tree/tests/render/test_torch.py"
 $python "$tree/evaluation/gpu/measure.py"
 for renderer in cuda cpu; do
     echo "whole runs, $renderer"

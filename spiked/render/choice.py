@@ -15,8 +15,7 @@ from spiked.errors import ConfigurationError
 from spiked.render import gpu
 from spiked.render.camera import Camera
 from spiked.render.cpu import Rasteriser
-from spiked.render.splats import Floats, Gradients, RenderedImage
-from spiked.scene import Scene
+from spiked.render.splats import AnySplats, Floats, Gradients, RenderedImage
 
 DRIVER = Path("/proc/driver/nvidia/version")
 """Exists while an NVIDIA driver is loaded."""
@@ -34,7 +33,7 @@ class AnyRasteriser(Protocol):
 
     def forward(
         self,
-        splats: Scene | gpu.DeviceScene,
+        splats: AnySplats,
         rotations: ArrayLike,
         centres: ArrayLike,
         *,
@@ -46,7 +45,7 @@ class AnyRasteriser(Protocol):
 
     def forward_moving(
         self,
-        splats: Scene | gpu.DeviceScene,
+        splats: AnySplats,
         rotations: ArrayLike,
         centres: ArrayLike,
         windows: Floats,

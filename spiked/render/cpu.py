@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from spiked.errors import ConfigurationError
 from spiked.native._raster import Renderer
 from spiked.render.camera import Camera
-from spiked.render.splats import Floats, Gradients, RenderedImage
+from spiked.render.splats import AnySplats, DeviceScene, Floats, Gradients, RenderedImage
 from spiked.scene import Scene
 
 MAX_THREADS = 256
@@ -54,8 +54,10 @@ class Rasteriser:
         self._shapes: tuple[int, int, int] = (0, 0, 0)
         self._values_shape: tuple[int, ...] = ()
 
-    def _splats(self, splats: Any) -> tuple[tuple[Any, ...], int, int]:
+    def _splats(self, splats: AnySplats) -> tuple[tuple[Any, ...], int, int]:
         """What the renderer takes of a scene, and the numbers of its splats and colours."""
+        if isinstance(splats, DeviceScene):
+            raise ConfigurationError("the splats are on a GPU, and this rasteriser is the CPU's")
         arrays = _checked_splats(splats)
         return arrays, *arrays[4].shape
 
@@ -81,7 +83,7 @@ class Rasteriser:
 
     def forward(
         self,
-        splats: Scene,
+        splats: AnySplats,
         rotations: ArrayLike,
         centres: ArrayLike,
         *,
@@ -105,7 +107,7 @@ class Rasteriser:
 
     def forward_moving(
         self,
-        splats: Scene,
+        splats: AnySplats,
         rotations: ArrayLike,
         centres: ArrayLike,
         windows: Floats,
@@ -138,7 +140,7 @@ class Rasteriser:
 
     def _forward(
         self,
-        splats: Scene,
+        splats: AnySplats,
         rotations: ArrayLike,
         centres: ArrayLike,
         weights: Floats | None,

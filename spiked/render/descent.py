@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.render.choice import AnyRasteriser, chosen
-from spiked.render.gpu import DeviceScene, GpuRasteriser
+from spiked.render.gpu import GpuRasteriser
 from spiked.render.optimiser import Adam
-from spiked.render.splats import Floats
+from spiked.render.splats import AnySplats, DeviceScene, Floats
 from spiked.scene import Scene
 
 
@@ -32,7 +32,7 @@ class Descent:
         return self._scene
 
     @property
-    def model(self) -> Scene | DeviceScene:
+    def model(self) -> AnySplats:
         """The scene as a rasteriser of this kind renders it best."""
         return self._scene
 
@@ -86,7 +86,7 @@ class DeviceDescent(Descent):
         return self._scene
 
     @property
-    def model(self) -> Scene | DeviceScene:
+    def model(self) -> AnySplats:
         """The scene on the device; the one here where it has not been fitted since it was changed."""
         return self._scene if self._device is None else self._device
 
@@ -116,11 +116,11 @@ class DeviceDescent(Descent):
     def _fetch(self) -> None:
         if not self._behind or self._device is None:
             return
-        arrays = tuple(np.empty_like(array) for array in self._scene.arrays())
-        moments = tuple(np.empty_like(array) for array in self.adam.packed())
-        self._device.native.get(*arrays, *moments)
-        self._scene = Scene(*arrays, white=self._scene.white)
-        self.adam.unpack(*moments)
+        means, quats, log_scales, logits, colours = (np.empty_like(array) for array in self._scene.arrays())
+        first, second, taken = self.adam.packed()
+        self._device.native.get(means, quats, log_scales, logits, colours, first, second, taken)
+        self._scene = Scene(means, quats, log_scales, logits, colours, self._scene.white)
+        self.adam.unpack(first, second, taken)
         self._behind = False
 
 

@@ -1,21 +1,20 @@
 """The rasteriser on a GPU: our own CUDA kernels behind the interface of `cpu.Rasteriser`, without torch.
 
-The kernels' arithmetic is that of the CPU, compiled a second time (`spiked/native/gpu`). Two things differ: a pixel, not a
-block of 4x4 pixels, is finished when it lets less than 1e-4 of the light through; and pixels whose window misses a sub-frame
-add nothing to the contributions.
+The kernels' arithmetic is that of the CPU, compiled a second time (`spiked/native/gpu`). Two things differ: a pixel,
+not a block of 4x4 pixels, is finished when it lets less than 1e-4 of the light through; and pixels whose window misses
+a sub-frame add nothing to the contributions.
 """
 
-from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
 
 import numpy as np
 
+import spiked.native._gpu as _gpu
 from spiked.errors import ConfigurationError
-from spiked.native import _gpu
 from spiked.render.camera import Camera
 from spiked.render.cpu import Rasteriser
-from spiked.render.splats import Floats
+from spiked.render.splats import AnySplats, DeviceScene, Floats
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics
 
@@ -50,16 +49,6 @@ def device_name() -> str:
     return str(_gpu.cuda_device())
 
 
-@dataclass(frozen=True)
-class DeviceScene:
-    """Splats on the device, with their moments of Adam: what `GpuRasteriser.forward` takes in the place of a Scene."""
-
-    native: Any
-
-    def __len__(self) -> int:
-        return int(self.native.count)
-
-
 class GpuRasteriser(Rasteriser):
     """`Rasteriser` on a GPU: the same methods, shapes and errors. The same input gives the same bits.
 
@@ -67,8 +56,8 @@ class GpuRasteriser(Rasteriser):
     """
 
     def __init__(self, camera: Camera, near: float = 0.01, device: Literal["cuda", "emulated"] = "cuda") -> None:
-        """The emulated device runs the same kernels on the CPU, slowly: for tests. Raises ConfigurationError where there
-        is no GPU."""
+        """The emulated device runs the same kernels on the CPU, slowly: for tests. Raises ConfigurationError where
+        there is no GPU."""
         self._emulated = device == "emulated"
         super().__init__(camera, 1, near)
 
@@ -94,7 +83,7 @@ class GpuRasteriser(Rasteriser):
             epsilon, most_log_scale,
         )  # fmt: skip
 
-    def _splats(self, splats: Scene | DeviceScene) -> tuple[tuple[Any, ...], int, int]:
+    def _splats(self, splats: AnySplats) -> tuple[tuple[Any, ...], int, int]:
         if isinstance(splats, DeviceScene):
             return (splats.native,), len(splats), int(splats.native.colours)
         return super()._splats(splats)

@@ -54,7 +54,7 @@ class Adam:
     def packed(self) -> tuple[Floats, Floats, NDArray[np.uint32]]:
         """First and second moments, each [N, columns of all arrays], and `taken`: as a device keeps them."""
         first, second = (np.concatenate([_rows(pair[i]) for pair in self._moments], axis=1) for i in (0, 1))
-        return first, second, self._taken
+        return first, second, self._taken.copy()
 
     def unpack(self, first: Floats, second: Floats, taken: NDArray[np.uint32]) -> None:
         """Take over what `packed` gives."""

@@ -1,11 +1,28 @@
 """What comes out of a renderer: images and gradients. What goes in is a `spiked.scene.Scene`."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spiked.scene import Scene
+
 Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class DeviceScene:
+    """Splats on a GPU, with their moments of Adam: what its rasteriser takes in the place of a Scene."""
+
+    native: Any
+
+    def __len__(self) -> int:
+        return int(self.native.count)
+
+
+AnySplats = Scene | DeviceScene
+"""What rasterisers render."""
 
 
 @dataclass(frozen=True)

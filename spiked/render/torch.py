@@ -1,4 +1,4 @@
-"""The CPU's rasteriser and losses as differentiable operators of torch (extra `spiked[torch]`), for a loss or an
+"""The rasterisers and losses as differentiable operators of torch (extra `spiked[torch]`), for a loss or an
 optimiser of one's own; `examples/own_loss.py` trains a scene.
 
     splats = {name: tensor.requires_grad_() for name, tensor in scene.to_torch().items()}
@@ -6,8 +6,9 @@ optimiser of one's own; `examples/own_loss.py` trains a scene.
     loss(image).backward()  # gradients in splats, rotations and centres
 
 The operators are `torch.ops.spiked.render`, `render_backward`, `charge_loss` and `dssim`. They have shapes for
-torch.compile and torch.export, and work on the CPU in float32: tensors of other types are converted, and gradients come
-back in the type of what they are of. Tensors on another device are refused. Second derivatives do not exist.
+torch.compile and torch.export, and work in float32: tensors of other types are converted, and gradients come back in
+the type of what they are of. `render` takes tensors on the CPU, or all on a GPU, where our CUDA kernels render (they go
+through main memory); the losses work on the CPU. Second derivatives do not exist.
 """
 
 from collections import OrderedDict
@@ -27,6 +28,7 @@ from spiked.pose import hat
 from spiked.render.camera import Camera
 from spiked.render.charge import ChargeLoss
 from spiked.render.cpu import Rasteriser
+from spiked.render.gpu import GpuRasteriser
 from spiked.render.loss import dssim as _dssim
 from spiked.scene import Scene
 from spiked.sensor import BitOrder, Intrinsics, Layout, Mosaic, Sensor
@@ -73,8 +75,8 @@ def render(
 
     There are gradients by the splats and the poses. That by a rotation lies in the tangent of the rotations, as
     matrices near them that are none have no image: give rotations as functions of what is optimised, for instance
-    torch.linalg.matrix_exp. Raises ConfigurationError for shapes that do not fit, and for tensors that are not on the
-    CPU.
+    torch.linalg.matrix_exp. Raises ConfigurationError for shapes that do not fit, for tensors on several devices, and
+    where no GPU can render.
     """
     missing = [name for name in SPLATS if name not in splats]
     if missing:
@@ -86,7 +88,7 @@ def render(
         raise ConfigurationError(f"the background has {len(ground)} radiances: give one, or one for each of 3 colours")
     size = camera.width, camera.height
     tensors = tuple(splats[name] for name in SPLATS)
-    _on_cpu(*tensors, rotations, centres, weights, windows, channels)
+    _on_one_device(*tensors, rotations, centres, weights, windows, channels)
     return Rendered(
         *_render(*tensors, rotations, centres, weights, windows, channels, ground, _optics(camera), *size, near)
     )
@@ -148,10 +150,11 @@ def _render(
     near: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     given = _Given(means, quats, log_scales, opacity_logits, colours, rotations, centres, weights, windows, channels)
-    kept = _kept(_View(tuple(optics), width, height, near))
+    kept = _kept(_View(tuple(optics), width, height, near, means.device.type))
     with kept.lock:
         made = kept.forward(given, background)
-    return torch.from_numpy(made[0]), torch.from_numpy(made[1]), torch.from_numpy(made[2])
+    values, alpha, depth = (torch.from_numpy(array).to(means.device) for array in made)
+    return values, alpha, depth
 
 
 @_render.register_fake
@@ -183,15 +186,15 @@ def _render_backward(
     near: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     given = _Given(means, quats, log_scales, opacity_logits, colours, rotations, centres, weights, windows, channels)
-    kept = _kept(_View(tuple(optics), width, height, near))
+    kept = _kept(_View(tuple(optics), width, height, near, means.device.type))
     with kept.lock:
         if not kept.holds(given, background):
             kept.forward(given, background)
         slopes = kept.rasteriser.backward(_array(slope))
     # In the tangent: the derivative along [phi]x R is rotation . phi.
-    turned = 0.5 * hat(slopes.rotation) @ np.asarray(rotations.detach().numpy(), np.float64)
+    turned = 0.5 * hat(slopes.rotation) @ np.asarray(rotations.detach().cpu().numpy(), np.float64)
     by = zip((*slopes.arrays(), turned, slopes.centre), given[:7], strict=True)
-    a, b, c, d, e, f, g = (torch.from_numpy(array).to(tensor.dtype) for array, tensor in by)
+    a, b, c, d, e, f, g = (torch.from_numpy(array).to(tensor) for array, tensor in by)
     return a, b, c, d, e, f, g
 
 
@@ -304,13 +307,16 @@ class _View(NamedTuple):
     width: int
     height: int
     near: float
+    device: str
+    """cpu or cuda."""
 
     def rasteriser(self) -> Rasteriser:
         """One for it."""
         lens = self.optics[4:]
         bent = Distortion(LENSES[int(lens[0])], tuple(lens[1:])) if lens else None
         fx, fy, cx, cy = self.optics[:4]
-        return Rasteriser(Camera(Intrinsics(fx, fy, cx, cy, bent), self.width, self.height), near=self.near)
+        camera = Camera(Intrinsics(fx, fy, cx, cy, bent), self.width, self.height)
+        return Rasteriser(camera, near=self.near) if self.device == "cpu" else GpuRasteriser(camera, self.near)
 
 
 @dataclass
@@ -327,8 +333,8 @@ class _Kept:
         """Render."""
         means, quats, log_scales, opacity_logits, colours = (_array(tensor) for tensor in given[:5])
         scene = Scene(means, quats, log_scales, opacity_logits, colours)
-        poses = given.rotations.detach().numpy(), given.centres.detach().numpy()
-        channels = None if given.channels is None else given.channels.numpy()
+        poses = given.rotations.detach().cpu().numpy(), given.centres.detach().cpu().numpy()
+        channels = None if given.channels is None else given.channels.cpu().numpy()
         self.last = None
         ground = tuple(background)
         if given.windows is not None:
@@ -375,13 +381,20 @@ def _version(tensor: Tensor) -> int:
 
 
 def _array(tensor: Tensor) -> _Array:
-    return np.ascontiguousarray(tensor.detach().numpy(), np.float32)
+    return np.ascontiguousarray(tensor.detach().cpu().numpy(), np.float32)
 
 
 def _on_cpu(*tensors: Tensor | None) -> None:
     for tensor in tensors:
         if tensor is not None and tensor.device.type != "cpu":
             raise ConfigurationError(
-                f"a tensor is on {tensor.device}: these operators work on the CPU, so give tensor.cpu(); "
+                f"a tensor is on {tensor.device}: the losses work on the CPU, so give tensor.cpu(); "
                 "autograd carries gradients back"
             )
+
+
+def _on_one_device(*tensors: Tensor | None) -> None:
+    """Raises ConfigurationError for tensors on different devices, or on one that does not render."""
+    devices = {tensor.device.type for tensor in tensors if tensor is not None}
+    if len(devices) > 1 or not devices <= {"cpu", "cuda"}:
+        raise ConfigurationError(f"tensors are on {', '.join(sorted(devices))}: give all on the CPU, or all on a GPU")

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from spiked.distortion import Distortion, LensModel
 from spiked.errors import ConfigurationError, SceneError
-from spiked.render import Camera, Rasteriser
+from spiked.render import Camera, Rasteriser, gpu
 from spiked.render import torch as operators
 from spiked.render.charge import WARP_CELL_PX, ChargeLoss
 from spiked.render.loss import dssim
@@ -82,6 +82,37 @@ def test_image_and_gradients_are_those_of_the_rasteriser(kind: str) -> None:
     for tensor, by in zip([*splats.values(), centres], [*gradients.arrays(), gradients.centre], strict=True):
         assert tensor.grad is not None
         np.testing.assert_array_equal(tensor.grad.numpy(), by)
+
+
+@pytest.mark.skipif(gpu.missing() is not None, reason=f"no GPU here: {gpu.missing()}")
+@pytest.mark.parametrize("kind", ["grey", "weights", "mosaic", "lens"])
+def test_tensors_on_a_gpu_are_rendered_there(kind: str) -> None:
+    case = Case(kind)
+    splats, rotations, centres = case.leaves()
+    here = {name: t.detach().cuda().requires_grad_() for name, t in splats.items()}
+    turned, places = (t.detach().cuda().requires_grad_() for t in (rotations, centres))
+    fixed = {"weights": case.weights, "windows": case.windows, "channels": case.channels}
+    tensors: dict[str, Any] = {
+        name: torch.from_numpy(array).cuda() for name, array in fixed.items() if array is not None
+    }
+    made = operators.render(case.camera, here, turned, places, background=case.background, **tensors)
+    expected = case.render(splats, rotations, centres)
+    for mine, other in zip(made, expected, strict=True):
+        assert mine.is_cuda
+        assert torch.allclose(mine.cpu(), other, atol=2e-4)
+    made.values.square().sum().backward()
+    expected.values.square().sum().backward()
+    for mine, other in zip([*here.values(), turned, places], [*splats.values(), rotations, centres], strict=True):
+        assert mine.grad is not None and other.grad is not None and mine.grad.is_cuda
+        assert float((mine.grad.cpu() - other.grad).norm()) < 2e-4 * float(other.grad.norm())
+    torch.library.opcheck(operators._render, _arguments(case, here, turned, places, tensors))
+
+
+def _arguments(case: Case, splats: dict[str, Tensor], rotations: Tensor, centres: Tensor, more: dict[str, Any]) -> Any:
+    ground = [case.background] if isinstance(case.background, float) else [*case.background]
+    planes = [more.get(name) for name in ("weights", "windows", "channels")]
+    size = case.camera.width, case.camera.height
+    return *splats.values(), rotations, centres, *planes, ground, operators._optics(case.camera), *size, 0.01
 
 
 def test_a_rotation_carries_the_gradient_of_what_turns_it() -> None:
@@ -203,8 +234,10 @@ def test_mistakes_are_told() -> None:
     splats, rotations, centres = Case("colour").leaves()
     with pytest.raises(ConfigurationError, match=r"lack quats"):
         operators.render(CAMERA, {n: t for n, t in splats.items() if n != "quats"}, rotations, centres)
-    with pytest.raises(ConfigurationError, match=r"on meta: .*give tensor\.cpu\(\)"):
+    with pytest.raises(ConfigurationError, match="on cpu, meta: give all on the CPU"):
         operators.render(CAMERA, splats | {"means": splats["means"].to("meta")}, rotations, centres)
+    with pytest.raises(ConfigurationError, match=r"on meta: .*give tensor\.cpu\(\)"):
+        operators.dssim(torch.zeros(4, 4), torch.zeros(4, 4, device="meta"))
     with pytest.raises(ConfigurationError, match="2 radiances"):
         operators.render(CAMERA, splats, rotations, centres, background=(0.1, 0.2))
     with pytest.raises(ConfigurationError, match="give one of them"):

@@ -59,13 +59,13 @@ SPIKED_CLONES void add_evidence(const float* gain, const float* rendered, const 
     }
 }
 
-void gain_evidence(const Image& gain, const Image& rendered, const Image& observed, const Image& deviation,
-                   float level, float model_error, const Array<float, 2>& xx, const Array<float, 2>& xy) {
+void gain_evidence(const Image& gain, const Image& rendered, const Image& observed, const Image& deviation, float level,
+                   float model_error, const Array<float, 2>& xx, const Array<float, 2>& xy) {
     const size_t height = gain.shape(0), width = gain.shape(1);
     expect_alike(height, width, {&rendered, &observed, &deviation});
     if (xx.size() != height * width || xy.size() != height * width) throw std::invalid_argument("images must be alike");
-    add_evidence(gain.data(), rendered.data(), observed.data(), deviation.data(),
-                 static_cast<int64_t>(height * width), level, model_error, xx.data(), xy.data());
+    add_evidence(gain.data(), rendered.data(), observed.data(), deviation.data(), static_cast<int64_t>(height * width),
+                 level, model_error, xx.data(), xy.data());
 }
 
 }  // namespace

@@ -1,8 +1,8 @@
 // A block of threads, as kernels are written for it: on a GPU a thread each, in the emulation one after the other.
 //
-// A kernel is a struct of plain data with kThreads and operator()(Block<kThreads>). In it, what every thread does stands in
-// each(), what a thread keeps from one each() to the next in a PerThread, and what the block shares in SPIKED_SHARED
-// variables. Threads see each other's writes after sync().
+// A kernel is a struct of plain data with kThreads and operator()(Block<kThreads>). In it, what every thread does
+// stands in each(), what a thread keeps from one each() to the next in a PerThread, and what the block shares in
+// SPIKED_SHARED variables. Threads see each other's writes after sync().
 #pragma once
 #include "lane.hpp"
 
@@ -67,8 +67,8 @@ struct Block {
 #endif
     }
 
-    // out[warp * stride + k] = the sum over the warp's threads of values[thread].of[k], in a fixed order. Where `some` is
-    // false of all threads of a warp, all values are zero, and are not added up. Needs a sync() before it is read.
+    // out[warp * stride + k] = the sum over the warp's threads of values[thread].of[k], in a fixed order. Where `some`
+    // is false of all threads of a warp, all values are zero, and are not added up. Needs a sync() before it is read.
     template <class T, int N>
     SPIKED_DEVICE void warp_sums(PerThread<Sums<T, N>, Threads>& values, PerThread<bool, Threads>& some, T* out,
                                  int stride) const {
@@ -99,7 +99,8 @@ struct Block {
 
 #if defined(__CUDACC__)
   private:
-    // A lane gives half of its 2 Half sums to the one on the other side and goes on with the other half, from `kept` on.
+    // A lane gives half of its 2 Half sums to the one on the other side and goes on with the other half, from `kept`
+    // on.
     template <int Half, class T, int N>
     SPIKED_DEVICE static void fold(T (&v)[N], int lane, int& kept) {
         if constexpr (Half > 0) {

@@ -1,5 +1,5 @@
-// The renderer on a GPU by CUDA. Its runtime is linked statically and finds the driver when it is used first, so that the
-// module loads on machines without one.
+// The renderer on a GPU by CUDA. Its runtime is linked statically and finds the driver when it is used first, so that
+// the module loads on machines without one.
 #include <cuda_runtime.h>
 
 #include <cub/device/device_radix_sort.cuh>

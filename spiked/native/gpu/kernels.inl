@@ -171,8 +171,7 @@ struct CountTiles {
             const uint32_t rank = block.index * kThreads + thread;
             if (rank > count) return;
             uint64_t reached = 0;
-            if (rank < count && keys[rank] != kCulled)
-                each_tile(records[order[rank]], camera, [&](int) { ++reached; });
+            if (rank < count && keys[rank] != kCulled) each_tile(records[order[rank]], camera, [&](int) { ++reached; });
             tiles[rank] = reached;
         });
     }
@@ -293,7 +292,8 @@ struct Forward {
         };
         SPIKED_SHARED Entry entries[kBatch];
         PerThread<Pixel, kThreads> pixels;
-        const int tile = static_cast<int>(block.index) % tiles.tiles(), sub_pose = static_cast<int>(block.index) / tiles.tiles();
+        const int tile = static_cast<int>(block.index) % tiles.tiles(),
+                  sub_pose = static_cast<int>(block.index) / tiles.tiles();
         const int left = tile % tiles.camera.tiles_x * kTile, top = tile / tiles.camera.tiles_x * kTile;
         const uint32_t first = tiles.start[block.index], last = tiles.start[block.index + 1];
         block.each([&](int thread) {
@@ -302,7 +302,8 @@ struct Forward {
             pixel = {at.x + 0.5f, at.y + 0.5f, 0, 0, 0, {}, 0, false};
             if (left + at.x >= tiles.camera.width || top + at.y >= tiles.camera.height) return;
             float weight;
-            tiles.exposure<Moving>(sub_pose, static_cast<int64_t>(top + at.y) * tiles.camera.width + left + at.x, weight, pixel.time);
+            tiles.exposure<Moving>(sub_pose, static_cast<int64_t>(top + at.y) * tiles.camera.width + left + at.x,
+                                   weight, pixel.time);
             pixel.t = 1;
             pixel.open = weight > 0;
         });
@@ -311,7 +312,8 @@ struct Forward {
             const int count = static_cast<int>(last - from < kBatch ? last - from : kBatch);
             block.each([&](int thread) {
                 if (thread < count)
-                    entries[thread] = tiles.entry<Moving>(tiles.pairs[from + thread], static_cast<float>(left), static_cast<float>(top), C);
+                    entries[thread] = tiles.entry<Moving>(tiles.pairs[from + thread], static_cast<float>(left),
+                                                          static_cast<float>(top), C);
             });
             block.sync();
             block.each([&](int thread) {
@@ -409,7 +411,8 @@ struct Backward {
         PerThread<Pixel, kThreads> pixels;
         PerThread<Sums<float, kSlot>, kThreads> sums;
         PerThread<bool, kThreads> some;
-        const int tile = static_cast<int>(block.index) % tiles.tiles(), sub_pose = static_cast<int>(block.index) / tiles.tiles();
+        const int tile = static_cast<int>(block.index) % tiles.tiles(),
+                  sub_pose = static_cast<int>(block.index) / tiles.tiles();
         const int left = tile % tiles.camera.tiles_x * kTile, top = tile / tiles.camera.tiles_x * kTile;
         const uint32_t first = tiles.start[block.index], last = tiles.start[block.index + 1];
         block.each([&](int thread) {
@@ -437,7 +440,8 @@ struct Backward {
                 if (thread >= count) return;
                 numbers[thread] = tiles.pairs[from + thread];
                 if (reached)
-                    entries[thread] = tiles.entry<Moving>(numbers[thread], static_cast<float>(left), static_cast<float>(top), C);
+                    entries[thread] =
+                        tiles.entry<Moving>(numbers[thread], static_cast<float>(left), static_cast<float>(top), C);
             });
             block.sync();
             for (int i = 0; reached && i < count; ++i) {
@@ -544,7 +548,8 @@ struct Unproject {
             const int n = static_cast<int>(block.index) * kThreads + thread;
             if (n >= scene.splats.count) return;
             out.radius_px[n] = gradients[thread].radius;
-            finish(scene.splats, scene.prepared, sums_in(n, gradients[thread].of), n, n + 1, 1.0f / scene.poses.sub_poses, out);
+            finish(scene.splats, scene.prepared, sums_in(n, gradients[thread].of), n, n + 1,
+                   1.0f / scene.poses.sub_poses, out);
         });
     }
 
@@ -645,7 +650,8 @@ struct SumPoses {
         PerThread<bool, kThreads> some;
         block.each([&](int thread) {
             double sum = 0;
-            for (int i = thread; i < blocks; i += kThreads) sum += partial[static_cast<int64_t>(i) * poses * 6 + block.index];
+            for (int i = thread; i < blocks; i += kThreads)
+                sum += partial[static_cast<int64_t>(i) * poses * 6 + block.index];
             sums[thread] = {{sum}};
             some[thread] = true;
         });

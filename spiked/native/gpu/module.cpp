@@ -34,9 +34,9 @@ void descend(GpuRenderer& self, AnyArray<const float> d_values, GpuScene& scene,
     self.descend(d_values.data(), scene, given);
 }
 
-void set_scene(GpuScene& self, Array<const float, 2> means, Array<const float, 2> quats, Array<const float, 2> log_scales,
-               Array<const float, 1> opacity_logits, Array<const float, 2> colours, Array<const float, 2> first,
-               Array<const float, 2> second, Array<const uint32_t, 1> taken) {
+void set_scene(GpuScene& self, Array<const float, 2> means, Array<const float, 2> quats,
+               Array<const float, 2> log_scales, Array<const float, 1> opacity_logits, Array<const float, 2> colours,
+               Array<const float, 2> first, Array<const float, 2> second, Array<const uint32_t, 1> taken) {
     const SplatArrays splats = splats_of(means, quats, log_scales, opacity_logits, colours);
     const size_t moments = static_cast<size_t>(splats.count) * (11 + splats.colours);
     expect(first.size() == moments && second.size() == moments && taken.size() == means.shape(0), "moments disagree");

@@ -5,7 +5,8 @@
 //   template <class T> void download(T* to, const T* from, size_t count);    done after finish()
 //   void finish();
 //   template <class Kernel> void run(const Kernel&, uint64_t blocks);
-//   void sort(const uint32_t* keys, uint32_t* sorted_keys, const uint32_t* values, uint32_t* sorted_values, size_t count,
+//   void sort(const uint32_t* keys, uint32_t* sorted_keys, const uint32_t* values, uint32_t* sorted_values, size_t
+//   count,
 //             int bits);                                                     equal keys keep their order
 //   void add_up(const uint64_t* counts, uint64_t* sums, size_t count);       sums[i] of those before i
 
@@ -73,13 +74,13 @@ class Resident final : public GpuScene {
     }
 
     SplatArrays arrays() {
-        return {count_,           colours_,      means_.data(), quats_.data(), log_scales_.data(), opacity_logits_.data(),
+        return {count_,        colours_, means_.data(), quats_.data(), log_scales_.data(), opacity_logits_.data(),
                 colour_.data()};
     }
 
     Descend step(const GradientArrays& gradients, const DescentRates& rates) {
-        return {count_,         colours_,       means_.data(),  quats_.data(), log_scales_.data(), opacity_logits_.data(),
-                colour_.data(), gradients,      first_.data(),  second_.data(), taken_.data(), rates};
+        return {count_,         colours_,  means_.data(), quats_.data(),  log_scales_.data(), opacity_logits_.data(),
+                colour_.data(), gradients, first_.data(), second_.data(), taken_.data(),      rates};
     }
 
   private:
@@ -144,14 +145,11 @@ class Passes final : public GpuRenderer {
 
     void render(const Views& views, const float background[3], float* values, float* alpha, float* depth) {
         take(views);
-        choose(camera_.lens != 0, [&](auto bent) {
-            choose(moving_, [&](auto moving) { project<bent, moving>(); });
-        });
+        choose(camera_.lens != 0, [&](auto bent) { choose(moving_, [&](auto moving) { project<bent, moving>(); }); });
         list_pairs();
         choose(splats_.colours == 3, [&](auto coloured) {
-            choose(moving_, [&](auto moving) {
-                composite<coloured ? 3 : 1, moving>(background, values, alpha, depth);
-            });
+            choose(moving_,
+                   [&](auto moving) { composite<coloured ? 3 : 1, moving>(background, values, alpha, depth); });
         });
         poses_ = views.count;
         mosaic_ = views.channels != nullptr;
@@ -168,9 +166,7 @@ class Passes final : public GpuRenderer {
                             static_cast<uint64_t>(sub_poses_) * tiles());
             });
         });
-        choose(camera_.lens != 0, [&](auto bent) {
-            choose(moving_, [&](auto moving) { unproject<bent, moving>(); });
-        });
+        choose(camera_.lens != 0, [&](auto bent) { choose(moving_, [&](auto moving) { unproject<bent, moving>(); }); });
     }
 
     int tiles() const { return camera_.tiles_x * camera_.tiles_y; }
@@ -196,8 +192,7 @@ class Passes final : public GpuRenderer {
         moving_ = views.start != nullptr;
         sub_poses_ = moving_ ? views.count - 1 : views.count;
         std::vector<View> poses(views.count);
-        for (int i = 0; i < views.count; ++i)
-            poses[i] = view_of_pose(views.rotations + 9 * i, views.centres + 3 * i);
+        for (int i = 0; i < views.count; ++i) poses[i] = view_of_pose(views.rotations + 9 * i, views.centres + 3 * i);
         tiles_ = {};
         tiles_.camera = camera_;
         tiles_.sub_poses = sub_poses_;
@@ -217,7 +212,8 @@ class Passes final : public GpuRenderer {
         scene_.prepared.log2_opacity = prepare.log2_opacity = at;
         device_.run(prepare, blocks(n, Prepare::kThreads));
         if (moving_)
-            device_.run(SetSubFrames{scene_.poses, tiles_.begin, tiles_.end, static_cast<int64_t>(pixels())}, sub_poses_);
+            device_.run(SetSubFrames{scene_.poses, tiles_.begin, tiles_.end, static_cast<int64_t>(pixels())},
+                        sub_poses_);
     }
 
     template <bool Bent, bool Moving>
@@ -245,19 +241,22 @@ class Passes final : public GpuRenderer {
         device_.download(&pairs, first + count, 1);
         device_.finish();
         if (pairs > kMaxPairs)
-            throw std::runtime_error("the splats reach more than 2^30 tiles together: render fewer poses or a smaller image");
+            throw std::runtime_error(
+                "the splats reach more than 2^30 tiles together: render fewer poses or a smaller image");
         pairs_ = static_cast<uint32_t>(pairs);
         const uint32_t all_tiles = static_cast<uint32_t>(sub_poses_) * tiles();
-        device_.run(ListPairs{camera_, tiles_.records, order, first, static_cast<uint32_t>(count),
-                              static_cast<uint32_t>(splats_.count), pair_tiles_.grow(pairs_ + 1), pair_.grow(pairs_ + 1),
-                              pair_record_.grow(pairs_ + 1), first_of_record_.grow(count), pairs_of_record_.grow(count)},
-                    blocks(count, ListPairs::kThreads));
+        device_.run(
+            ListPairs{camera_, tiles_.records, order, first, static_cast<uint32_t>(count),
+                      static_cast<uint32_t>(splats_.count), pair_tiles_.grow(pairs_ + 1), pair_.grow(pairs_ + 1),
+                      pair_record_.grow(pairs_ + 1), first_of_record_.grow(count), pairs_of_record_.grow(count)},
+            blocks(count, ListPairs::kThreads));
         int bits = 1;
         while (all_tiles >> bits) ++bits;
         uint32_t *by_tile = sorted_tiles_.grow(pairs_ + 1), *listed = sorted_pairs_.grow(pairs_ + 1);
         device_.sort(pair_tiles_.data(), by_tile, pair_.data(), listed, pairs_, bits);
         uint32_t* start = tile_start_.grow(all_tiles + 1);
-        device_.run(FindTiles{by_tile, pairs_, all_tiles, start}, blocks(static_cast<uint64_t>(pairs_) + 1, FindTiles::kThreads));
+        device_.run(FindTiles{by_tile, pairs_, all_tiles, start},
+                    blocks(static_cast<uint64_t>(pairs_) + 1, FindTiles::kThreads));
         tiles_.start = start;
         tiles_.pairs = listed;
         tiles_.pair_record = pair_record_.data();

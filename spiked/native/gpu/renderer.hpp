@@ -15,11 +15,11 @@ class GpuScene {
 
     int count() const { return count_; }
     int colours() const { return colours_; }
-    // Moments are [count][11 + colours], a splat's means, quaternion, log scales, opacity logit and colours in turn; taken
-    // [count] are its steps.
+    // Moments are [count][11 + colours], a splat's means, quaternion, log scales, opacity logit and colours in turn;
+    // taken [count] are its steps.
     virtual void set(const SplatArrays&, const float* first, const float* second, const uint32_t* taken) = 0;
-    virtual void get(float* means, float* quats, float* log_scales, float* opacity_logits, float* colours,
-                     float* first, float* second, uint32_t* taken) = 0;
+    virtual void get(float* means, float* quats, float* log_scales, float* opacity_logits, float* colours, float* first,
+                     float* second, uint32_t* taken) = 0;
 
   protected:
     int count_ = 0, colours_ = 1;

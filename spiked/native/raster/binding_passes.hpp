@@ -1,4 +1,5 @@
-// What the Python faces of the renderers share, on the CPU and on a GPU: the shapes of their arguments are checked here.
+// What the Python faces of the renderers share, on the CPU and on a GPU: the shapes of their arguments are checked
+// here.
 #pragma once
 #include <algorithm>
 #include <cmath>

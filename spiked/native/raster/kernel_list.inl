@@ -46,8 +46,8 @@ SPIKED_KERNEL(void, finish,
 SPIKED_KERNEL(void, adam,
               (const AdamRates&, int rows, int columns, const float* correction, const float* gradient,
                float* parameter, float* first, float* second))
-// Structural similarity of rows [first, last) in three passes: the rows of planes[0..4], from those what planes[5..7] hold
-// and sums [height], from those the gradient. Planes have kSsimMargin rows of zeros above and below; scratch has
+// Structural similarity of rows [first, last) in three passes: the rows of planes[0..4], from those what planes[5..7]
+// hold and sums [height], from those the gradient. Planes have kSsimMargin rows of zeros above and below; scratch has
 // ssim_scratch(width) floats.
 SPIKED_KERNEL(void, ssim_blur,
               (const SsimImage&, const float* rendered, const float* target, int first, int last, float* scratch,

@@ -22,7 +22,8 @@ SPIKED_DEVICE static inline Covered covered_by(const Planes& planes, int64_t at)
     return {length / (stop - start), 0.5f * (from - planes.sub_frame + (to - planes.sub_frame)) - 0.5f, length};
 }
 
-SPIKED_DEVICE static inline void cover(const Planes& planes, int64_t count, double* weight, double* square, float* time_reach) {
+SPIKED_DEVICE static inline void cover(const Planes& planes, int64_t count, double* weight, double* square,
+                                       float* time_reach) {
     constexpr int64_t kRun = 1024;
     double weights = 0, squares = 0;
     float farthest = 0;
@@ -69,8 +70,8 @@ struct SubFrameProjection {
 };
 
 template <bool Bent>
-SPIKED_DEVICE static inline SubFrameProjection project_sub_frame(const Prepared& s, const PinholeF& camera, const SubFrame& sub_frame,
-                                                   int base) {
+SPIKED_DEVICE static inline SubFrameProjection project_sub_frame(const Prepared& s, const PinholeF& camera,
+                                                                 const SubFrame& sub_frame, int base) {
     SubFrameProjection o;
     o.begin = project_lanes<Bent>(s, camera, sub_frame.begin, base);
     o.end = project_lanes<Bent>(s, camera, sub_frame.end, base);
@@ -113,8 +114,9 @@ SPIKED_DEVICE static inline SubFrameProjection project_sub_frame(const Prepared&
 }
 
 template <bool Bent>
-SPIKED_DEVICE static inline void project_moving_by(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame, int count,
-                              int first, int last, ProjectedSplat* records, Motion* motions, uint32_t* keys) {
+SPIKED_DEVICE static inline void project_moving_by(const Prepared& splats, const PinholeF& camera,
+                                                   const SubFrame& sub_frame, int count, int first, int last,
+                                                   ProjectedSplat* records, Motion* motions, uint32_t* keys) {
     alignas(64) float out[6][kLanes];
     for (int base = first; base < last; base += kLanes) {
         const SubFrameProjection o = project_sub_frame<Bent>(splats, camera, sub_frame, base);
@@ -156,8 +158,9 @@ SPIKED_DEVICE static inline void project_moving_by(const Prepared& splats, const
     }
 }
 
-SPIKED_DEVICE static inline void project_moving(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame, int count,
-                           int first, int last, ProjectedSplat* records, Motion* motions, uint32_t* keys) {
+SPIKED_DEVICE static inline void project_moving(const Prepared& splats, const PinholeF& camera,
+                                                const SubFrame& sub_frame, int count, int first, int last,
+                                                ProjectedSplat* records, Motion* motions, uint32_t* keys) {
     auto* run = camera.lens ? project_moving_by<true> : project_moving_by<false>;
     run(splats, camera, sub_frame, count, first, last, records, motions, keys);
 }
@@ -195,26 +198,27 @@ SPIKED_DEVICE static inline void unproject_moving_at(const Prepared& splats, con
     }
     unproject_lanes<Bent>(splats, camera, sub_frame.begin, o.begin, seen, base, into, 0.5f * g_u - g_du,
                           0.5f * g_v - g_dv, d_m0, d_m1, out, pose_begin);
-    unproject_lanes<Bent>(splats, camera, sub_frame.end, o.end, seen, base, into, 0.5f * g_u + g_du,
-                          0.5f * g_v + g_dv, d_m0, d_m1, out, pose_end);
+    unproject_lanes<Bent>(splats, camera, sub_frame.end, o.end, seen, base, into, 0.5f * g_u + g_du, 0.5f * g_v + g_dv,
+                          d_m0, d_m1, out, pose_end);
 }
 
 template <bool Bent>
-SPIKED_DEVICE static inline void unproject_moving_by(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame,
-                                       int first, const float* sums, const uint8_t* visible, int colours,
-                                       const SplatGradients& out, double pose_begin[6], double pose_end[6]) {
+SPIKED_DEVICE static inline void unproject_moving_by(const Prepared& splats, const PinholeF& camera,
+                                                     const SubFrame& sub_frame, int first, const float* sums,
+                                                     const uint8_t* visible, int colours, const SplatGradients& out,
+                                                     double pose_begin[6], double pose_end[6]) {
     for (int at = 0; at < kGroup; at += kLanes) {
         Int seen;
         for (int i = 0; i < kLanes; ++i) seen[i] = visible[at + i] ? -1 : 0;
         auto sum = [&](int which) { return load(sums + which * kGroup + at); };
-        unproject_moving_at<Bent>(splats, camera, sub_frame, first + at, seen, sum, colours, out, pose_begin,
-                                  pose_end);
+        unproject_moving_at<Bent>(splats, camera, sub_frame, first + at, seen, sum, colours, out, pose_begin, pose_end);
     }
 }
 
-SPIKED_DEVICE static inline void unproject_moving(const Prepared& splats, const PinholeF& camera, const SubFrame& sub_frame, int first,
-                             const float* sums, const uint8_t* visible, int colours, const SplatGradients& out,
-                             double pose_begin[6], double pose_end[6]) {
+SPIKED_DEVICE static inline void unproject_moving(const Prepared& splats, const PinholeF& camera,
+                                                  const SubFrame& sub_frame, int first, const float* sums,
+                                                  const uint8_t* visible, int colours, const SplatGradients& out,
+                                                  double pose_begin[6], double pose_end[6]) {
     auto* run = camera.lens ? unproject_moving_by<true> : unproject_moving_by<false>;
     run(splats, camera, sub_frame, first, sums, visible, colours, out, pose_begin, pose_end);
 }

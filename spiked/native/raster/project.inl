@@ -1,5 +1,5 @@
-// Splats to screen and gradients back; a GPU's threads run the same lines, a lane each (native/gpu). Notation: W world to camera, p = W (mu -
-// c), J the Jacobian of the projection, M = J W (splat spread), Sigma2D = M M^T + 0.3 I.
+// Splats to screen and gradients back; a GPU's threads run the same lines, a lane each (native/gpu). Notation: W world
+// to camera, p = W (mu - c), J the Jacobian of the projection, M = J W (splat spread), Sigma2D = M M^T + 0.3 I.
 
 namespace spiked {
 namespace {
@@ -39,8 +39,8 @@ SPIKED_DEVICE static inline Vec scale_of(Vec log_scale) {
     return exp2_fine(clamp(log_scale, broadcast(-30.0f), broadcast(30.0f)) * kLog2e);
 }
 
-SPIKED_DEVICE static inline void prepare(const SplatArrays& splats, int first, int last, float* const mean[3], float* const spread[9],
-                    float* log2_opacity) {
+SPIKED_DEVICE static inline void prepare(const SplatArrays& splats, int first, int last, float* const mean[3],
+                                         float* const spread[9], float* log2_opacity) {
     for (int base = first; base < last; base += kLanes) {
         Vec position[3], quat[4], log_scale[3], logit;
         read_rows<3>(splats.means, base, splats.count, position);
@@ -138,7 +138,8 @@ SPIKED_DEVICE static inline void bend_lanes(const PinholeF& camera, ProjectionLa
 }
 
 template <bool Bent>
-SPIKED_DEVICE static inline ProjectionLanes project_lanes(const Prepared& s, const PinholeF& camera, const View& view, int base) {
+SPIKED_DEVICE static inline ProjectionLanes project_lanes(const Prepared& s, const PinholeF& camera, const View& view,
+                                                          int base) {
     ProjectionLanes o;
     for (int k = 0; k < 3; ++k) o.offset[k] = (load(s.mean[k] + base) - view.centre_high[k]) - view.centre_low[k];
     const float* w = view.rotation;
@@ -178,8 +179,8 @@ SPIKED_DEVICE static inline ProjectionLanes project_lanes(const Prepared& s, con
 
 constexpr float kMargin = 0.01f;  // px; absorbs rounding, costs next to nothing
 
-// How far to the left and to the right of its mean a splat's ellipse reaches in bands of rows, times its p; from `low` to
-// `high`, rows from its mean, not beyond the ellipse.
+// How far to the left and to the right of its mean a splat's ellipse reaches in bands of rows, times its p; from `low`
+// to `high`, rows from its mean, not beyond the ellipse.
 SPIKED_DEVICE static inline void extent_in_rows(const ProjectedSplat& s, Vec low, Vec high, Vec& left, Vec& right) {
     const float reach = s.log2_opacity + kLog2Cut;
     Vec right_dy = clamp(broadcast(s.extreme), low, high), left_dy = clamp(broadcast(-s.extreme), low, high);
@@ -189,7 +190,7 @@ SPIKED_DEVICE static inline void extent_in_rows(const ProjectedSplat& s, Vec low
 
 // Writes kLanes records of visible splats, and their keys.
 SPIKED_DEVICE static inline void write_records(const Vec fields[kRecordFields], Int visible, int base, int count,
-                                 ProjectedSplat* records, uint32_t* keys) {
+                                               ProjectedSplat* records, uint32_t* keys) {
     alignas(64) float out[kRecordFields][kLanes];
     alignas(64) int32_t seen[kLanes];
     for (int k = 0; k < kRecordFields; ++k) store(out[k], fields[k]);
@@ -205,8 +206,8 @@ SPIKED_DEVICE static inline void write_records(const Vec fields[kRecordFields], 
 }
 
 template <bool Bent>
-SPIKED_DEVICE static inline void project_by(const Prepared& splats, const PinholeF& camera, const View& view, int count, int first, int last,
-                       ProjectedSplat* records, uint32_t* keys) {
+SPIKED_DEVICE static inline void project_by(const Prepared& splats, const PinholeF& camera, const View& view, int count,
+                                            int first, int last, ProjectedSplat* records, uint32_t* keys) {
     for (int base = first; base < last; base += kLanes) {
         ProjectionLanes o = project_lanes<Bent>(splats, camera, view, base);
         const Vec &x = Bent ? o.seen_x : o.raw_x, &y = Bent ? o.seen_y : o.raw_y;
@@ -228,16 +229,16 @@ SPIKED_DEVICE static inline void project_by(const Prepared& splats, const Pinhol
     }
 }
 
-SPIKED_DEVICE static inline void project(const Prepared& splats, const PinholeF& camera, const View& view, int count, int first, int last,
-                    ProjectedSplat* records, uint32_t* keys) {
+SPIKED_DEVICE static inline void project(const Prepared& splats, const PinholeF& camera, const View& view, int count,
+                                         int first, int last, ProjectedSplat* records, uint32_t* keys) {
     (camera.lens ? project_by<true> : project_by<false>)(splats, camera, view, count, first, last, records, keys);
 }
 
 SPIKED_DEVICE static inline void add(float* p, Vec v) { store(p, load(p) + v); }
 
 // From gradients by what the lens shows to gradients by what a camera without distortion would show.
-SPIKED_DEVICE static inline void straighten_gradients(const PinholeF& camera, const ProjectionLanes& o, Vec& g_u, Vec& g_v,
-                                        Vec d_m0[3], Vec d_m1[3], Vec& d_x, Vec& d_y) {
+SPIKED_DEVICE static inline void straighten_gradients(const PinholeF& camera, const ProjectionLanes& o, Vec& g_u,
+                                                      Vec& g_v, Vec d_m0[3], Vec d_m1[3], Vec& d_x, Vec& d_y) {
     const BendLanes& b = o.bend;
     const float across = camera.fx / camera.fy, down = camera.fy / camera.fx;
     const Vec u = g_u, v = g_v;
@@ -262,8 +263,9 @@ SPIKED_DEVICE static inline void straighten_gradients(const PinholeF& camera, co
 // rows.
 template <bool Bent>
 SPIKED_DEVICE static inline void unproject_lanes(const Prepared& splats, const PinholeF& camera, const View& view,
-                                   const ProjectionLanes& o, Int seen, int base, int into, Vec g_u, Vec g_v,
-                                   const Vec by_m0[3], const Vec by_m1[3], const SplatGradients& out, double pose[6]) {
+                                                 const ProjectionLanes& o, Int seen, int base, int into, Vec g_u,
+                                                 Vec g_v, const Vec by_m0[3], const Vec by_m1[3],
+                                                 const SplatGradients& out, double pose[6]) {
     Vec jx = camera.fx * o.over_z, jy = camera.fy * o.over_z;
     Vec d_spread[9], d_jx{}, d_jy{}, d_jxz{}, d_jyz{};
     Vec d_m0[3] = {by_m0[0], by_m0[1], by_m0[2]}, d_m1[3] = {by_m1[0], by_m1[1], by_m1[2]};
@@ -344,9 +346,9 @@ SPIKED_DEVICE static inline void unproject_at(const Prepared& splats, const Pinh
 }
 
 template <bool Bent>
-SPIKED_DEVICE static inline void unproject_by(const Prepared& splats, const PinholeF& camera, const View& view, int first,
-                                const float* sums, const uint8_t* visible, int colours, const SplatGradients& out,
-                                double pose[6]) {
+SPIKED_DEVICE static inline void unproject_by(const Prepared& splats, const PinholeF& camera, const View& view,
+                                              int first, const float* sums, const uint8_t* visible, int colours,
+                                              const SplatGradients& out, double pose[6]) {
     for (int at = 0; at < kGroup; at += kLanes) {
         Int seen;
         for (int i = 0; i < kLanes; ++i) seen[i] = visible[at + i] ? -1 : 0;
@@ -355,14 +357,15 @@ SPIKED_DEVICE static inline void unproject_by(const Prepared& splats, const Pinh
     }
 }
 
-SPIKED_DEVICE static inline void unproject(const Prepared& splats, const PinholeF& camera, const View& view, int first, const float* sums,
-                      const uint8_t* visible, int colours, const SplatGradients& out, double pose[6]) {
+SPIKED_DEVICE static inline void unproject(const Prepared& splats, const PinholeF& camera, const View& view, int first,
+                                           const float* sums, const uint8_t* visible, int colours,
+                                           const SplatGradients& out, double pose[6]) {
     auto* run = camera.lens ? unproject_by<true> : unproject_by<false>;
     run(splats, camera, view, first, sums, visible, colours, out, pose);
 }
 
-SPIKED_DEVICE static inline void finish(const SplatArrays& splats, const Prepared& prepared, const SplatGradients& sums, int first, int last,
-                   float share_scale, const GradientArrays& out) {
+SPIKED_DEVICE static inline void finish(const SplatArrays& splats, const Prepared& prepared, const SplatGradients& sums,
+                                        int first, int last, float share_scale, const GradientArrays& out) {
     for (int base = first; base < last; base += kLanes) {
         const int from = base - sums.first;
         Vec radius, logit, quat[4], log_scale[3];

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from spiked.blocks import Window
 from spiked.pose import Array
+from spiked.recon.frontend.exposure import Exposed
 from spiked.sensor import Image
 
 DEVIATION_PX = 7
@@ -22,7 +23,7 @@ small where the count happens to be small, and weights made of it darken the map
 
 
 @dataclass(frozen=True)
-class PhotonCounts:
+class PhotonCounts(Exposed):
     """What `SpikeIntervals` is for spike cameras; images are upright [H, W]."""
 
     count: NDArray[np.unsignedinteger[Any]]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 import spiked.native._spikes as _spikes
 from spiked.blocks import Window
 from spiked.pose import Array
+from spiked.recon.frontend.exposure import Exposed
 from spiked.sensor import Image
 
 Offsets = NDArray[np.unsignedinteger[Any]]
@@ -22,7 +23,7 @@ JITTER = 1.2e-3
 
 
 @dataclass(frozen=True)
-class SpikeIntervals:
+class SpikeIntervals(Exposed):
     """As `Window`, with bytes where they suffice; its arrays [H, W] are copies. `never` is their largest number."""
 
     spikes: Offsets

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.blocks import aligned_window, unpack
+from spiked.recon.frontend.exposure import Exposed
 from spiked.sensor import Image, Sensor
 
 COUNTED_FRAMES = 32
@@ -32,7 +33,7 @@ class TargetKind(StrEnum):
 
 
 @dataclass(frozen=True)
-class SpikeCounts:
+class SpikeCounts(Exposed):
     """Spikes of each pixel in the same window; images are upright [H, W]."""
 
     count: NDArray[np.uint8]
@@ -62,7 +63,7 @@ class SpikeCounts:
 
 
 @dataclass(frozen=True)
-class AdjacentSpikes:
+class AdjacentSpikes(Exposed):
     """The last spike of each pixel before an instant and the first one after it; images are upright [H, W]."""
 
     before: NDArray[np.uint8]

@@ -19,11 +19,8 @@ from spiked.sensor import Image, Mosaic, Response, Sensor
 
 SITE_SHARES = np.array([0.25, 0.5, 0.25], np.float32)
 """Share of the red, green and blue sites in a mosaic."""
-EXPOSURE_PERCENTILE = 10.0
-"""Percentile of exposure starts and ends that bound the rendered span: the darkest pixels gather charge for too long to
-render their whole exposure in straight sub-frames (decision 6)."""
 MIN_EXPOSURE_SHARE = 0.7
-"""Share of a pixel's exposure that has to lie in that span (decision 6)."""
+"""Share of a pixel's exposure that has to lie in the span of most (decision 6)."""
 MIN_EXPOSURE = 0.02
 """Shortest exposure of a pixel, in units of a sub-frame."""
 SEARCH_FRAMES = 24
@@ -127,18 +124,9 @@ class View:
         """`rate` without caching; written to `out` if there is no calibration."""
         return self.rate if self.calibration is not None else self.intervals.rate(out)
 
-    @cached_property
-    def _span(self) -> tuple[float, float]:
-        """Frames from the middle of the window to the begin and to the end of most pixels' exposures."""
-        start, stop = self._measured.times()
-        return (
-            float(np.percentile(start[::4, ::4], EXPOSURE_PERCENTILE)),
-            float(np.percentile(stop[::4, ::4], 100 - EXPOSURE_PERCENTILE)),
-        )
-
     def exposure_times(self, parts: int) -> NDArray[np.float64]:
         """The times [parts + 1] in frames of the poses of `exposure`, evenly spaced over that of most pixels."""
-        return self.time + np.linspace(*self._span, parts + 1)
+        return self.time + np.linspace(*self._measured.span, parts + 1)
 
     def exposure(self, parts: int) -> tuple[NDArray[np.float64], Image, NDArray[np.bool_]]:
         """When each pixel gathered its charge, for `Rasteriser.forward_moving` with `parts` sub-frames.
@@ -147,7 +135,7 @@ class View:
         much longer exposures.
         """
         start, stop = self._measured.times()
-        first, last = self._span
+        first, last = self._measured.span
         windows, seen = np.empty((2, *start.shape), np.float32), np.empty(start.shape, np.bool_)
         scale = parts / max(last - first, 1e-3)
         _spikes.exposures(

@@ -9,8 +9,7 @@ from spiked.recon.frontend.demosaic import fill_mosaic
 from spiked.recon.frontend.windowing import View, luminance
 from spiked.recon.mapping.render_requests import RenderRequest
 from spiked.render import Camera, RenderedImage, rasteriser_for
-from spiked.render.gpu import DeviceScene
-from spiked.scene import Scene
+from spiked.render.splats import AnySplats
 from spiked.sensor import Image, Mosaic, Sensor
 
 SMALLEST_PIXELS = 50_000
@@ -57,7 +56,7 @@ class Level:
         return None if self.channels is None else self._mosaic
 
     def render(
-        self, scene: Scene | DeviceScene, request: RenderRequest, background: float = 0.0, *, demosaiced: bool = False
+        self, scene: AnySplats, request: RenderRequest, background: float = 0.0, *, demosaiced: bool = False
     ) -> RenderedImage:
         """Render a scene at this size; the request's windows are of this size. `background` is a radiance.
 

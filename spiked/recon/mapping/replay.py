@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from spiked.pose import Array
 from spiked.recon.mapping.pyramid import Target
 from spiked.render import AnyRasteriser, RenderedImage
-from spiked.render.gpu import DeviceScene
+from spiked.render.splats import AnySplats
 from spiked.scene import Scene
 from spiked.sensor import Image
 
@@ -50,7 +50,7 @@ class Replay:
         """[H, W], 1 where the map has surfaces, else 0."""
         return (self.opacity > LEAST_OPACITY).astype(np.float32)
 
-    def render(self, scene: Scene | DeviceScene, background: float = 0.0) -> RenderedImage:
+    def render(self, scene: AnySplats, background: float = 0.0) -> RenderedImage:
         """Another scene from the same pose."""
         return self.rasteriser.forward(scene, self.rotation[None], self.centre[None], background=background)
 

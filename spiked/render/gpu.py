@@ -5,6 +5,8 @@ not a block of 4x4 pixels, is finished when it lets less than 1e-4 of the light 
 a sub-frame add nothing to the contributions.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any, Literal
 
@@ -14,7 +16,7 @@ import spiked.native._gpu as _gpu
 from spiked.errors import ConfigurationError
 from spiked.render.camera import Camera
 from spiked.render.cpu import Rasteriser
-from spiked.render.splats import AnySplats, DeviceScene, Floats
+from spiked.render.splats import AnySplats, DeviceScene, Floats, Gradients, RenderedImage
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics
 
@@ -49,6 +51,17 @@ def device_name() -> str:
     return str(_gpu.cuda_device())
 
 
+@contextmanager
+def _device_errors() -> Iterator[None]:
+    """Raises ConfigurationError where the device fails, for instance for lack of memory."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise ConfigurationError(
+            f"{error}. Free its memory (nvidia-smi shows who uses it), or render on the CPU: SPIKED_RENDER=cpu"
+        ) from error
+
+
 class GpuRasteriser(Rasteriser):
     """`Rasteriser` on a GPU: the same methods, shapes and errors. The same input gives the same bits.
 
@@ -60,6 +73,15 @@ class GpuRasteriser(Rasteriser):
         there is no GPU."""
         self._emulated = device == "emulated"
         super().__init__(camera, 1, near)
+
+    def _forward(self, *inputs: Any) -> RenderedImage:
+        with _device_errors():
+            return super()._forward(*inputs)
+
+    def backward(self, d_values: Floats) -> Gradients:
+        """See `Rasteriser.backward`."""
+        with _device_errors():
+            return super().backward(d_values)
 
     def device_scene(self) -> DeviceScene:
         """A scene on this device, empty."""
@@ -78,10 +100,11 @@ class GpuRasteriser(Rasteriser):
         """`backward` and a step of Adam on the device, as in `Descent.step`. The last image was of `scene`, or of the
         splats that it was set to."""
         self._check_slope(d_values)
-        self._native.descend(
-            np.ascontiguousarray(d_values, np.float32), scene.native, np.array(rates, np.float32), beta1, beta2,
-            epsilon, most_log_scale,
-        )  # fmt: skip
+        with _device_errors():
+            self._native.descend(
+                np.ascontiguousarray(d_values, np.float32), scene.native, np.array(rates, np.float32), beta1, beta2,
+                epsilon, most_log_scale,
+            )  # fmt: skip
 
     def _splats(self, splats: AnySplats) -> tuple[tuple[Any, ...], int, int]:
         if isinstance(splats, DeviceScene):

@@ -157,6 +157,17 @@ def test_errors_are_those_of_the_cpu(device: str) -> None:
         gpu.GpuRasteriser(scenes.camera(), near=0, device=device)
 
 
+def test_too_much_for_one_render_is_told(device: str) -> None:
+    """More than 2^30 pairs of splats and tiles: here 70,000 splats as large as the picture of 4096x4096."""
+    splats = scenes.splats(70_000, 1, 1, size=30.0)
+    splats.means[:, 2] = 100
+    rasteriser = gpu.GpuRasteriser(Camera(Intrinsics(4000, 4000, 2048, 2048), 4096, 4096), device=device)
+    with pytest.raises(ConfigurationError, match=r"2\^30 tiles.*SPIKED_RENDER=cpu"):
+        rasteriser.forward(splats, np.eye(3)[None], np.zeros((1, 3)))
+    small = scenes.splats(50, 1, 1)  # and it goes on
+    assert np.isfinite(rasteriser.forward(small, np.eye(3)[None], np.zeros((1, 3))).values).all()
+
+
 def test_rasterisers_in_several_threads(device: str) -> None:
     case = Case("one")
     expected = Rasteriser(case.camera, 1).forward_moving(case.splats, case.rotations, case.centres, case.windows)

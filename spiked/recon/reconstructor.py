@@ -242,7 +242,7 @@ class Reconstructor:
         version = self._tracker.posed_views + self._refinement.ended + self.trainer.version
         left_s = 0.0 if self._stage == "done" else self._refinement.left_s
         share = self._refinement.progress
-        status = Status(o.state, reason, self._stage, self.frames, len(m.scene), m.loss, version, share, *pose)
+        status = Status(o.state, reason, self._stage, self.frames, len(m), m.loss, version, share, *pose)
         return replace(status, left_s=left_s)
 
     def tracked(self, since: int = 0) -> list[Tracked]:

@@ -37,18 +37,6 @@ struct Scene {
     Poses poses;
 };
 
-struct Fill {
-    static constexpr int kThreads = 256;
-    float* out;
-    uint64_t count;
-    SPIKED_DEVICE void operator()(const Block<kThreads>& block) const {
-        block.each([&](int thread) {
-            const uint64_t at = static_cast<uint64_t>(block.index) * kThreads + thread;
-            if (at < count) out[at] = 0;
-        });
-    }
-};
-
 // From splats to Prepared.
 struct Prepare {
     static constexpr int kThreads = kSplatThreads;

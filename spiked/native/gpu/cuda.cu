@@ -134,9 +134,10 @@ class Cuda {
     void* stage(size_t bytes) {
         bytes = (bytes + 255) / 256 * 256;
         if (staged_ + bytes > staging_room_) {
+            // All that a call stages has to fit at last, or memory would be locked anew in every call.
+            const size_t room = 2 * (staging_room_ + bytes) + (1 << 20);
             if (staging_) outgrown_.push_back(staging_);
             staging_ = nullptr, staging_room_ = 0, staged_ = 0;
-            const size_t room = 2 * (staged_ + bytes) + (1 << 20);
             check(cudaMallocHost(&staging_, room));
             staging_room_ = room;
         }

@@ -6,6 +6,7 @@
 #include <stdint.h>
 #include <string.h>
 
+#define SPIKED_INLINED __attribute__((always_inline))
 #define SPIKED_DEVICE  // before functions that a GPU runs as well, see native/gpu/lane.hpp
 
 #if defined(__SSE2__)

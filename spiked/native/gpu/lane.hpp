@@ -5,6 +5,7 @@
 #include <stdint.h>
 #include <string.h>
 
+#define SPIKED_INLINED
 #if defined(__CUDACC__)
 #define SPIKED_DEVICE __device__
 #else

@@ -167,10 +167,10 @@ SPIKED_DEVICE static inline void project_moving(const Prepared& splats, const Pi
 
 // As unproject_at, by the poses at both ends of the sub-frame.
 template <bool Bent, class Sums>
-SPIKED_DEVICE static inline void unproject_moving_at(const Prepared& splats, const PinholeF& camera,
-                                                     const SubFrame& sub_frame, int base, Int seen, Sums sum,
-                                                     int colours, const SplatGradients& out, double pose_begin[6],
-                                                     double pose_end[6]) {
+SPIKED_DEVICE SPIKED_INLINED static inline void unproject_moving_at(const Prepared& splats, const PinholeF& camera,
+                                                                    const SubFrame& sub_frame, int base, Int seen,
+                                                                    Sums sum, int colours, const SplatGradients& out,
+                                                                    double pose_begin[6], double pose_end[6]) {
     const int into = base - out.first;
     const Vec opacity = sum(kV);
     add(out.log_opacity + into, opacity);

@@ -320,9 +320,9 @@ SPIKED_DEVICE static inline void unproject_lanes(const Prepared& splats, const P
 
 // The gradients of the splats from `base` on by the sums over their pixels: sum(which) is one of `Sum`.
 template <bool Bent, class Sums>
-SPIKED_DEVICE static inline void unproject_at(const Prepared& splats, const PinholeF& camera, const View& view,
-                                              int base, Int seen, Sums sum, int colours, const SplatGradients& out,
-                                              double pose[6]) {
+SPIKED_DEVICE SPIKED_INLINED static inline void unproject_at(const Prepared& splats, const PinholeF& camera,
+                                                             const View& view, int base, Int seen, Sums sum,
+                                                             int colours, const SplatGradients& out, double pose[6]) {
     const int into = base - out.first;
     add(out.log_opacity + into, sum(kV));
     add(out.share + into, sum(kShare));

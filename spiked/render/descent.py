@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.render.choice import AnyRasteriser, chosen
-from spiked.render.gpu import GpuRasteriser
+from spiked.render.gpu import GpuRasteriser, device_errors
 from spiked.render.optimiser import Adam
 from spiked.render.splats import AnySplats, DeviceScene, Floats
 from spiked.scene import Scene
@@ -22,6 +22,9 @@ class Descent:
 
     def adopt(self, scene: Scene) -> None:
         """Go on with another scene, without moments."""
+        self._restart(scene)
+
+    def _restart(self, scene: Scene) -> None:
         beta1, beta2, threads = self._settings
         self._scene = scene
         self.adam = Adam(scene.arrays(), beta1, beta2, threads=threads)
@@ -35,6 +38,11 @@ class Descent:
     def model(self) -> AnySplats:
         """The scene as a rasteriser of this kind renders it best."""
         return self._scene
+
+    @property
+    def opacity_logits(self) -> Floats:
+        """Of the scene, [N]."""
+        return self._scene.opacity_logits
 
     def join(self, splats: Scene) -> None:
         """Add splats, without moments."""
@@ -62,7 +70,7 @@ class Descent:
 
 
 class DeviceDescent(Descent):
-    """A scene that is fitted on a GPU; it is copied back when it is asked for, and to it when it was changed here."""
+    """A scene that is fitted on a GPU, from the first step on; it is copied back when it is asked for."""
 
     def __init__(self, scene: Scene, beta1: float, beta2: float, threads: int | None = None) -> None:
         self._device: DeviceScene | None = None
@@ -90,16 +98,33 @@ class DeviceDescent(Descent):
         """The scene on the device; the one here where it has not been fitted since it was changed."""
         return self._scene if self._device is None else self._device
 
+    @property
+    def opacity_logits(self) -> Floats:
+        """See `Descent.opacity_logits`."""
+        if self._device is None:
+            return super().opacity_logits
+        logits = np.empty(len(self._device), np.float32)
+        with device_errors():
+            self._device.native.opacity_logits(logits)
+        return logits
+
     def join(self, splats: Scene) -> None:
         """See `Descent.join`."""
-        super().join(splats)
-        self._device = None
+        if self._device is None:
+            super().join(splats)
+            return
+        with device_errors():
+            self._device.native.join(*splats.arrays())
+        self._behind = True
 
     def select(self, rows: NDArray[np.bool_]) -> None:
         """See `Descent.select`."""
-        self._fetch()
-        super().select(rows)
-        self._device = None
+        if self._device is None:
+            super().select(rows)
+            return
+        with device_errors():
+            self._device.native.select(np.flatnonzero(rows).astype(np.uint32))
+        self._behind = True
 
     def step(
         self, rasteriser: AnyRasteriser, slope: Floats, rates: tuple[float, ...], most_log_scale: np.float32
@@ -107,8 +132,10 @@ class DeviceDescent(Descent):
         """See `Descent.step`."""
         assert isinstance(rasteriser, GpuRasteriser)
         if self._device is None:
-            self._device = rasteriser.device_scene()
-            self._device.native.set(*self._scene.arrays(), *self.adam.packed())
+            with device_errors():
+                device = rasteriser.device_scene()
+                device.native.set(*self._scene.arrays(), *self.adam.packed())
+            self._device = device
         beta1, beta2, _ = self._settings
         rasteriser.descend(slope, self._device, rates, beta1, beta2, self.adam.epsilon, float(most_log_scale))
         self._behind = True
@@ -116,10 +143,14 @@ class DeviceDescent(Descent):
     def _fetch(self) -> None:
         if not self._behind or self._device is None:
             return
-        means, quats, log_scales, logits, colours = (np.empty_like(array) for array in self._scene.arrays())
-        first, second, taken = self.adam.packed()
-        self._device.native.get(means, quats, log_scales, logits, colours, first, second, taken)
-        self._scene = Scene(means, quats, log_scales, logits, colours, self._scene.white)
+        n, colours = len(self._device), int(self._device.native.colours)
+        shapes = (n, 3), (n, 4), (n, 3), (n,), (n, colours)
+        means, quats, log_scales, logits, colour = (np.empty(shape, np.float32) for shape in shapes)
+        first, second = (np.empty((n, 11 + colours), np.float32) for _ in range(2))
+        taken = np.empty(n, np.uint32)
+        with device_errors():
+            self._device.native.get(means, quats, log_scales, logits, colour, first, second, taken)
+        self._restart(Scene(means, quats, log_scales, logits, colour, self._scene.white))
         self.adam.unpack(first, second, taken)
         self._behind = False
 

@@ -52,7 +52,7 @@ def device_name() -> str:
 
 
 @contextmanager
-def _device_errors() -> Iterator[None]:
+def device_errors() -> Iterator[None]:
     """Raises ConfigurationError where the device fails, for instance for lack of memory."""
     try:
         yield
@@ -75,12 +75,12 @@ class GpuRasteriser(Rasteriser):
         super().__init__(camera, 1, near)
 
     def _forward(self, *inputs: Any) -> RenderedImage:
-        with _device_errors():
+        with device_errors():
             return super()._forward(*inputs)
 
     def backward(self, d_values: Floats) -> Gradients:
         """See `Rasteriser.backward`."""
-        with _device_errors():
+        with device_errors():
             return super().backward(d_values)
 
     def device_scene(self) -> DeviceScene:
@@ -100,7 +100,7 @@ class GpuRasteriser(Rasteriser):
         """`backward` and a step of Adam on the device, as in `Descent.step`. The last image was of `scene`, or of the
         splats that it was set to."""
         self._check_slope(d_values)
-        with _device_errors():
+        with device_errors():
             self._native.descend(
                 np.ascontiguousarray(d_values, np.float32), scene.native, np.array(rates, np.float32), beta1, beta2,
                 epsilon, most_log_scale,

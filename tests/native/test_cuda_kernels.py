@@ -17,7 +17,7 @@ KERNEL = re.compile(
 )
 PER_PIXEL = "Forward", "Backward", "Combine"
 KERNELS = {*PER_PIXEL, "Prepare", "SetSubFrames", "Project", "CountTiles", "ListPairs", "FindTiles", "Unproject",
-           "SumPoses", "Descend"}  # fmt: skip
+           "SumPoses", "Descend", "TakeRows"}  # fmt: skip
 
 
 @pytest.mark.skipif(NVCC is None, reason="there is no nvcc here")

@@ -52,7 +52,7 @@ def test_densification_is_due_every_so_many_steps_until_its_share() -> None:
 
 
 def test_faint_splats_are_dead() -> None:
-    np.testing.assert_array_equal(DensifyStrategy().dead(scene([0.5, -4.5, -3.5])), [False, True, False])
+    np.testing.assert_array_equal(DensifyStrategy().dead(np.array([0.5, -4.5, -3.5], np.float32)), [False, True, False])
 
 
 def test_splats_are_added_where_the_error_is() -> None:

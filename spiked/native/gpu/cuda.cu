@@ -61,6 +61,10 @@ class Cuda {
             return data_;
         }
         T* data() { return data_; }
+        void swap(Buffer& other) {
+            std::swap(data_, other.data_);
+            std::swap(room_, other.room_);
+        }
 
       private:
         T* data_ = nullptr;
@@ -70,11 +74,16 @@ class Cuda {
     template <class T>
     const T* upload(Buffer<T>& buffer, const T* from, size_t count) {
         T* to = buffer.grow(count);
-        if (count == 0) return to;
+        put(to, from, count);
+        return to;
+    }
+
+    template <class T>
+    void put(T* to, const T* from, size_t count) {
+        if (count == 0) return;
         void* through = stage(count * sizeof(T));
         std::memcpy(through, from, count * sizeof(T));
         check(cudaMemcpyAsync(to, through, count * sizeof(T), cudaMemcpyHostToDevice, stream_));
-        return to;
     }
 
     template <class T>

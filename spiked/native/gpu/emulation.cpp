@@ -28,6 +28,7 @@ class Emulation {
             return values_.data();
         }
         T* data() { return values_.data(); }
+        void swap(Buffer& other) { values_.swap(other.values_); }
 
       private:
         std::vector<T> values_;
@@ -38,6 +39,11 @@ class Emulation {
         T* to = buffer.grow(count);
         std::copy_n(from, count, to);
         return to;
+    }
+
+    template <class T>
+    void put(T* to, const T* from, size_t count) {
+        std::copy_n(from, count, to);
     }
 
     template <class T>

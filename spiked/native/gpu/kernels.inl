@@ -37,6 +37,27 @@ struct Scene {
     Poses poses;
 };
 
+constexpr uint32_t kNoRow = 0xffffffffu;
+
+// Rows of an array in another order; zeros for kNoRow.
+template <class T>
+struct TakeRows {
+    static constexpr int kThreads = 256;
+    const T* in;
+    T* out;
+    const uint32_t* rows;
+    uint64_t count;  // of elements
+    int columns;
+    SPIKED_DEVICE void operator()(const Block<kThreads>& block) const {
+        block.each([&](int thread) {
+            const uint64_t at = static_cast<uint64_t>(block.index) * kThreads + thread;
+            if (at >= count) return;
+            const uint32_t row = rows[at / columns];
+            out[at] = row == kNoRow ? T{} : in[static_cast<uint64_t>(row) * columns + at % columns];
+        });
+    }
+};
+
 // From splats to Prepared.
 struct Prepare {
     static constexpr int kThreads = kSplatThreads;

@@ -57,6 +57,29 @@ void get_scene(GpuScene& self, Array<float, 2> means, Array<float, 2> quats, Arr
              second.data(), taken.data());
 }
 
+void select_rows(GpuScene& self, Array<const uint32_t, 1> rows) {
+    for (size_t i = 0; i < rows.shape(0); ++i)
+        expect(rows.data()[i] < static_cast<uint32_t>(self.count()), "there is no such row");
+    nb::gil_scoped_release release;
+    self.select(rows.data(), rows.shape(0));
+}
+
+void join_splats(GpuScene& self, Array<const float, 2> means, Array<const float, 2> quats,
+                 Array<const float, 2> log_scales, Array<const float, 1> opacity_logits,
+                 Array<const float, 2> colours) {
+    const SplatArrays splats = splats_of(means, quats, log_scales, opacity_logits, colours);
+    expect(splats.colours == self.colours(), "the scene has other colours");
+    expect(self.count() + means.shape(0) < (1u << 27), "too many splats");
+    nb::gil_scoped_release release;
+    self.join(splats);
+}
+
+void opacity_logits(GpuScene& self, Array<float, 1> out) {
+    expect(out.shape(0) == static_cast<size_t>(self.count()), "the scene has another size");
+    nb::gil_scoped_release release;
+    self.opacity_logits(out.data());
+}
+
 }  // namespace
 
 NB_MODULE(_gpu, m) {
@@ -65,6 +88,9 @@ NB_MODULE(_gpu, m) {
         .def("get", &get_scene, nb::arg("means").noconvert(), nb::arg("quats").noconvert(),
              nb::arg("log_scales").noconvert(), nb::arg("opacity_logits").noconvert(), nb::arg("colours").noconvert(),
              nb::arg("first").noconvert(), nb::arg("second").noconvert(), nb::arg("taken").noconvert())
+        .def("select", &select_rows, nb::arg("rows"))
+        .def("join", &join_splats)
+        .def("opacity_logits", &opacity_logits, nb::arg("out").noconvert())
         .def_prop_ro("count", &GpuScene::count)
         .def_prop_ro("colours", &GpuScene::colours);
     nb::class_<GpuRenderer> renderer(m, "Renderer");

@@ -1,14 +1,19 @@
 // The passes of the renderer: kernels in their order. `Device` has memory and runs kernels:
 //
-//   template <class T> class Buffer { T* grow(size_t count); T* data(); };   contents are lost when it grows
-//   template <class T> const T* upload(Buffer<T>&, const T*, size_t count);
-//   template <class T> void download(T* to, const T* from, size_t count);    done after finish()
+//   template <class T> class Buffer { T* grow(size_t count); T* data(); void swap(Buffer&); };
+//       Its contents are lost when it grows.
+//   template <class T> const T* upload(Buffer<T>&, const T* from, size_t count);
+//   template <class T> void put(T* to, const T* from, size_t count);
+//       As upload, to memory that is there.
+//   template <class T> void download(T* to, const T* from, size_t count);
+//       Done after finish().
 //   void finish();
 //   template <class Kernel> void run(const Kernel&, uint64_t blocks);
-//   void sort(const uint32_t* keys, uint32_t* sorted_keys, const uint32_t* values, uint32_t* sorted_values, size_t
-//   count,
-//             int bits);                                                     equal keys keep their order
-//   void add_up(const uint64_t* counts, uint64_t* sums, size_t count);       sums[i] of those before i
+//   void sort(const uint32_t* keys, uint32_t* sorted_keys, const uint32_t* values, uint32_t* sorted_values,
+//             size_t count, int bits);
+//       Equal keys keep their order.
+//   void add_up(const uint64_t* counts, uint64_t* sums, size_t count);
+//       sums[i] of those before i.
 
 #include <algorithm>
 #include <stdexcept>
@@ -73,6 +78,29 @@ class Resident final : public GpuScene {
         device_.finish();
     }
 
+    void select(const uint32_t* rows, size_t count) override {
+        rearrange(rows, count);
+        device_.finish();
+    }
+
+    void join(const SplatArrays& more) override {
+        const size_t n = count_, m = more.count;
+        std::vector<uint32_t> rows(n + m, kNoRow);
+        for (size_t i = 0; i < n; ++i) rows[i] = static_cast<uint32_t>(i);
+        rearrange(rows.data(), rows.size());
+        device_.put(means_.data() + 3 * n, more.means, 3 * m);
+        device_.put(quats_.data() + 4 * n, more.quats, 4 * m);
+        device_.put(log_scales_.data() + 3 * n, more.log_scales, 3 * m);
+        device_.put(opacity_logits_.data() + n, more.opacity_logits, m);
+        device_.put(colour_.data() + colours_ * n, more.colour, colours_ * m);
+        device_.finish();
+    }
+
+    void opacity_logits(float* out) override {
+        device_.download(out, opacity_logits_.data(), count_);
+        device_.finish();
+    }
+
     SplatArrays arrays() {
         return {count_,        colours_, means_.data(), quats_.data(), log_scales_.data(), opacity_logits_.data(),
                 colour_.data()};
@@ -84,9 +112,29 @@ class Resident final : public GpuScene {
     }
 
   private:
+    void rearrange(const uint32_t* given, size_t count) {
+        const uint32_t* rows = device_.upload(rows_, given, count);
+        const auto rearranged = [&](auto& array, auto& spare, int columns) {
+            using Kernel = TakeRows<std::remove_reference_t<decltype(*array.data())>>;
+            const uint64_t elements = static_cast<uint64_t>(count) * columns;
+            device_.run(Kernel{array.data(), spare.grow(elements), rows, elements, columns},
+                        (elements + Kernel::kThreads - 1) / Kernel::kThreads);
+            array.swap(spare);
+        };
+        rearranged(means_, spare_, 3);
+        rearranged(quats_, spare_, 4);
+        rearranged(log_scales_, spare_, 3);
+        rearranged(opacity_logits_, spare_, 1);
+        rearranged(colour_, spare_, colours_);
+        rearranged(first_, spare_, 11 + colours_);
+        rearranged(second_, spare_, 11 + colours_);
+        rearranged(taken_, spare_taken_, 1);
+        count_ = static_cast<int>(count);
+    }
+
     Device device_;
-    Buffer<float> means_, quats_, log_scales_, opacity_logits_, colour_, first_, second_;
-    Buffer<uint32_t> taken_;
+    Buffer<float> means_, quats_, log_scales_, opacity_logits_, colour_, first_, second_, spare_;
+    Buffer<uint32_t> taken_, spare_taken_, rows_;
 };
 
 template <class Device>

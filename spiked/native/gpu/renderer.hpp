@@ -20,6 +20,11 @@ class GpuScene {
     virtual void set(const SplatArrays&, const float* first, const float* second, const uint32_t* taken) = 0;
     virtual void get(float* means, float* quats, float* log_scales, float* opacity_logits, float* colours, float* first,
                      float* second, uint32_t* taken) = 0;
+    // Keeps the splats `rows`, in that order, with their moments.
+    virtual void select(const uint32_t* rows, size_t count) = 0;
+    // Adds splats without moments, of as many colours.
+    virtual void join(const SplatArrays&) = 0;
+    virtual void opacity_logits(float*) = 0;
 
   protected:
     int count_ = 0, colours_ = 1;

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spiked.scene import Scene
 from spiked.sensor import Image
 
 
@@ -36,9 +35,9 @@ class DensifyStrategy:
         """Whether to densify after that many steps, at that share of the refinement (0 for a live map)."""
         return share < self.until and steps % self.every == 0
 
-    def dead(self, scene: Scene) -> NDArray[np.bool_]:
+    def dead(self, opacity_logits: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Splats to be replaced, [N]."""
-        return scene.opacity_logits < self.dead_logit
+        return np.asarray(opacity_logits < self.dead_logit)
 
     def badness(self, error: Image) -> Image:
         """Weight of each pixel [H, W] for a new splat, from a signed error [H, W] or [H, W, C]; 0 up to the median."""

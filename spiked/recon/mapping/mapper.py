@@ -254,7 +254,7 @@ class Mapper:
     def _replace(self, error: Image, seen: Image, depth: Image, rotation: Array, centre: Array) -> None:
         """Remove dead splats and add others where `error` is large, of the colours and depths of images [H, W]."""
         strategy = self.options.densification
-        dead = strategy.dead(self.scene)
+        dead = strategy.dead(self.descent.opacity_logits)
         self._remove(dead)
         chosen = strategy.choose(error, int(dead.sum()), self.cap, self.cap - len(self), self._rng)
         if chosen is None:

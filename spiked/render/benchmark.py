@@ -5,6 +5,7 @@ Times are minima over repetitions, for machines that do other work as well; the 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,10 @@ from spiked.measurement import Measurement, Timing, peak_per_second, repeated
 from spiked.pose import exp_so3
 from spiked.render.camera import Camera
 from spiked.render.charge import WARP_CELL_PX, ChargeLoss
+from spiked.render.choice import chosen
 from spiked.render.cpu import Rasteriser, usable_cores
+from spiked.render.descent import Descent, DeviceDescent
+from spiked.render.gpu import GpuRasteriser
 from spiked.render.loss import StructuralSimilarity
 from spiked.render.optimiser import Adam
 from spiked.render.splats import Floats
@@ -22,6 +26,8 @@ from spiked.sensor import Intrinsics, Sensor
 
 FORWARD_OPERATIONS, BACKWARD_OPERATIONS = 18, 34
 """Vector arithmetic instructions that a splat costs a pixel, for one colour."""
+BETAS = 0.9, 0.99
+"""Adam's decay rates."""
 MOTION_PX = 2.0
 """Image motion of the moving camera."""
 CHARGE_FRAMES = 24
@@ -46,6 +52,8 @@ def measure(sizes: tuple[Size, ...] = SIZES, repetitions: int = 10) -> list[Meas
     rows = [Measurement("multiply-adds of a float32 matrix product, one core", peak * 1e-9, "10^9/s")]
     for size in sizes:
         rows += _steps(size, repetitions, peak)
+        if chosen().renderer == "cuda":
+            rows.append(on_device(size, repetitions))
     rows += _accumulation(sizes[0], repetitions)
     rows.append(_by_charge(sizes[0], repetitions))
     rows.append(_against_naive(repetitions))
@@ -105,6 +113,28 @@ def _steps(size: Size, repetitions: int, peak: float) -> list[Measurement]:
             label = f"{name}, {size.splats // 1000}k splats, {size.width}x{size.height}, {rasteriser.instructions}"
             rows.append(Measurement(label, timing.best_s * 1e3, "ms", share, "of peak", target, timing.spread, threads))
     return rows
+
+
+def on_device(size: Size, repetitions: int, device: Literal["cuda", "emulated"] = "cuda") -> Measurement:
+    """A step with Adam, splats on a GPU, image and gradient in main memory, beside that of all cores."""
+    camera, splats = scene(size)
+    pose = np.eye(3)[None], np.zeros((1, 3))
+    slope = np.full((size.height, size.width), 1e-6, np.float32)
+    fits: tuple[tuple[Rasteriser, Descent], ...] = (
+        (GpuRasteriser(camera, device=device), DeviceDescent(splats, *BETAS)),
+        (Rasteriser(camera), Descent(splats.select(np.arange(len(splats))), *BETAS)),
+    )
+
+    def timed(rasteriser: Rasteriser, fit: Descent) -> Timing:
+        def step() -> None:
+            rasteriser.forward(fit.model, *pose)
+            fit.step(rasteriser, slope, (1e-9,) * 5, np.float32(np.inf))
+
+        return repeated(step, repetitions)
+
+    gpu, cpu = (timed(*one) for one in fits)
+    name = f"step with Adam, {size.splats // 1000}k splats, {size.width}x{size.height}, {fits[0][0].instructions}"
+    return Measurement(name, gpu.best_s * 1e3, "ms", gpu.best_s / cpu.best_s, "of all cores' step", "", gpu.spread)
 
 
 def passing(

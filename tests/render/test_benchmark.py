@@ -18,3 +18,9 @@ def test_every_row_is_a_positive_number() -> None:
     steps = [row for row in rows if row.name.startswith("step")]
     assert steps
     assert all(row.ratio is not None and row.ratio > 0 for row in steps)
+
+
+def test_the_row_of_a_gpu() -> None:
+    row = benchmark.on_device(benchmark.Size(300, 64, 40), repetitions=1, device="emulated")
+    assert row.name == "step with Adam, 0k splats, 64x40, emulated GPU"
+    assert row.value > 0 and row.ratio is not None and row.ratio > 0

@@ -92,6 +92,9 @@ class Lab:
     def folder(self, job: str) -> Path:
         return Path(self.one.data) / "reconstructions" / job
 
+    def store(self) -> Path:
+        return Path(self.one.data) / "cluster" / "jobs"
+
     def attempt(self, job: str) -> str:
         return str(json.loads((self.folder(job) / "reconstruction.json").read_text())["attempt"])
 
@@ -113,8 +116,7 @@ class Lab:
 
     def nothing_left(self) -> bool:
         """Whether no process, folder or object of an attempt is left."""
-        cluster = Path(self.one.data) / "cluster"
-        objects = [one for one in (cluster / "jobs").rglob("*") if one.is_file()]
+        objects = [one for one in self.store().rglob("*") if one.is_file()]
         return not (self.agents() or self.workers() or objects or list(self.scratch.iterdir()))
 
 
@@ -200,9 +202,8 @@ def test_what_ends_while_the_service_is_down_is_taken_at_its_start(lab: Lab) -> 
     until(lab.workers, "its worker runs")
     lab.one.process.kill()
     lab.one.process.wait()
-    store = Path(lab.one.data) / "cluster" / "jobs" / job
     until(lambda: not lab.agents(), "the agent has given up")
-    kept = list(store.glob("*/manifest.json"))
+    kept = list(lab.store().glob(f"*/{job}/*/manifest.json"))
     lab.start()
     row = lab.reached(job, complete, "it is complete")
     published = newest(lab.folder(job))
@@ -224,6 +225,32 @@ def test_a_silent_agent_is_fenced_off(lab: Lab) -> None:
         agent.resume()
     until(lambda: not worker.is_running() or worker.status() == psutil.STATUS_ZOMBIE, "the old worker has ended")
     assert lab.job(job)["state"] == "running"
+
+
+def test_what_an_agent_stores_after_its_job_has_ended_is_swept(lab: Lab) -> None:
+    job, going_on = lab.submit(LONG), lab.submit(LONG)
+    for one in (job, going_on):
+        lab.reached(one, lambda row: row["version"] > 0, "it has published")
+    (late,) = lab.store().glob(f"*/{job}/{lab.attempt(job)}")
+    (alive,) = lab.store().glob(f"*/{going_on}/{lab.attempt(going_on)}")
+    lab.post(f"reconstructions/{job}:cancel")
+    lab.reached(job, lambda row: row["state"] == "cancelled", "it is cancelled")
+    until(lambda: not late.exists(), "its files are removed")
+    (late / "outputs").mkdir(parents=True)
+    (late / "outputs" / "f00d").write_text("stored by an agent that was asleep")
+    lab.reached(lab.submit(SHORT), complete, "another job has ended")
+    until(lambda: not late.exists(), "it is swept when a job ends")
+    (late / "outputs").mkdir(parents=True)
+    (late / "outputs" / "f00d").write_text("stored while the service was away")
+    lab.one.close()
+    lab.start()
+    until(lambda: not late.exists(), "it is swept at the start of the service")
+    assert any((alive / "outputs").iterdir()), "what a living attempt has stored is left alone"
+    version = lab.job(going_on)["version"]
+    lab.reached(going_on, lambda row: row["version"] > version, "it goes on")
+    lab.post(f"reconstructions/{going_on}:cancel")
+    lab.reached(going_on, lambda row: row["state"] == "cancelled", "it is cancelled")
+    until(lab.nothing_left, "nothing is left of the attempts")
 
 
 def test_a_job_that_is_cancelled_is_gone_within_ten_seconds(lab: Lab) -> None:

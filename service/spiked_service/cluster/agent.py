@@ -69,7 +69,7 @@ class _Attempt:
             reports=self._reports.flush(),
             events=self._reports.kept,
         )
-        self._store.put(f"{self._attempt}/{MANIFEST}", manifest.model_dump_json().encode())
+        self._store.put(MANIFEST, manifest.model_dump_json().encode())
         self._reports.end()
 
     def _fetch(self) -> JobCommand | None:
@@ -118,7 +118,7 @@ class _Attempt:
             for path in files_in(snapshot, with_log=True):
                 stored = stored_file(path, path.relative_to(snapshot).as_posix())
                 if stored.sha256 not in self._stored:
-                    self._store.put_file(path, f"{self._attempt}/{OUTPUTS}/{stored.sha256}", stored)
+                    self._store.put_file(path, f"{OUTPUTS}/{stored.sha256}", stored)
                     self._stored.add(stored.sha256)
                 found.append(stored)
         finally:

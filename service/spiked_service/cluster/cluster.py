@@ -11,6 +11,7 @@ from spiked_service.base.ids import new_id
 from spiked_service.cluster.engine import Engine, EngineOptions
 from spiked_service.cluster.object_store import ObjectStore
 from spiked_service.cluster.remote_worker import FencedError, RemoteWorker, Terms
+from spiked_service.cluster.sweeper import Sweeper
 from spiked_service.reconstructions.executor import OnEvent, OnExit, Worker
 from spiked_service.store.rows import ReconstructionRow
 from spiked_service.workers.messages import JobCommand
@@ -18,6 +19,8 @@ from spiked_service.workers.process import StandbyWorker
 
 _KEY = "attempts.key"
 """File with the key that tokens are made with."""
+_OWNER = b"folder in the store"
+"""What the name of the service's folder is made of, with the key."""
 
 
 class Cluster:
@@ -29,12 +32,14 @@ class Cluster:
 
     def __init__(self, folder: Path, store: str, engine: EngineOptions, terms: Terms) -> None:
         """`folder` is for its key and its log. Raises ConfigurationError for a store that cannot be used."""
-        self._store = ObjectStore(store)
         self._terms = terms
         self._key = _key(folder / _KEY)
+        # What lies in there is this service's, so that it can remove what it does not know; others may share the store.
+        self._store = ObjectStore(store).below(hashlib.sha256(_OWNER + self._key).hexdigest()[:16])
         self._engine = Engine(engine, folder / "engine.log", self._engine_ended)
         self._attempts: dict[str, RemoteWorker] = {}
         self._lock = Lock()
+        self._sweeper = Sweeper(self._store, self._alive)
         self.url = ""
         """Address at which agents reach the service."""
 
@@ -57,6 +62,10 @@ class Cluster:
         """Wait for the agent of an attempt that was submitted before; it has a lease from now."""
         return self._worker(row, command, on_event, on_exit, adopted=True)
 
+    def clean_up(self) -> None:
+        """Remove what attempts have left that are over, now and whenever one ends."""
+        self._sweeper.start()
+
     def worker(self, attempt: str, token: str) -> RemoteWorker:
         """The living attempt that this is the token of. Raises FencedError."""
         with self._lock:
@@ -71,6 +80,7 @@ class Cluster:
 
     def close(self) -> None:
         """End the process of the engine; what it has started goes on."""
+        self._sweeper.close()
         self._engine.close()
 
     def _worker(
@@ -82,13 +92,14 @@ class Cluster:
         def withdraw(after_s: float) -> None:
             with self._lock:
                 self._attempts.pop(row.attempt, None)
+            self._sweeper.wake()
             self._engine.cancel(row.attempt, after_s)
 
         with self._lock:
             worker = RemoteWorker(
                 row.attempt,
                 command,
-                self._store.below(row.id),
+                self._store.below(row.id, row.attempt),
                 self._terms,
                 None if adopted else submit,
                 withdraw,
@@ -97,6 +108,10 @@ class Cluster:
             )
             self._attempts[row.attempt] = worker
         return worker
+
+    def _alive(self, attempt: str) -> bool:
+        with self._lock:
+            return attempt in self._attempts
 
     def _engine_ended(self, attempt: str, reason: str, certain: bool) -> None:
         with self._lock:

@@ -10,7 +10,7 @@ from spiked_service.store.folder import CAPTURE_ROW, RECONSTRUCTION_ROW
 from spiked_service.workers.messages import JobCommand, MergeCommand
 
 INPUTS = "inputs"
-"""Folder of the objects that attempts begin with."""
+"""Folder of the objects that an attempt begins with, below its own."""
 OUTPUTS = "outputs"
 """Folder of the objects that an attempt has made, below its own."""
 MANIFEST = "manifest.json"
@@ -44,7 +44,7 @@ def files_in(folder: Path, *, with_log: bool = False) -> Iterator[Path]:
 
 
 def stage(command: JobCommand, store: ObjectStore) -> Inputs:
-    """Store what a job begins with, in the store of the job. Raises ObjectStoreError and OSError."""
+    """Store what an attempt begins with, in its store. Raises ObjectStoreError and OSError."""
     recording = recording_of(command)
     in_place = store.local or recording is None
     return Inputs(

@@ -57,7 +57,7 @@ class AttemptWork(BaseModel):
     """With the paths of the service."""
     inputs: Inputs
     store: str
-    """URI of the folder of the job in the object store."""
+    """URI of the folder of the attempt in the object store."""
     lease_s: float
     """An agent that has not been answered for so long ends its worker: another attempt begins."""
     report_s: float
@@ -93,7 +93,7 @@ class ReportAnswer(BaseModel):
 
 
 class Manifest(BaseModel):
-    """The end of an attempt, `ATTEMPT/manifest.json` in the store, written after all files."""
+    """The end of an attempt, `manifest.json` in its store, written after all files."""
 
     attempt: str
     node: str

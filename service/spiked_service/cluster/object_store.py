@@ -4,7 +4,8 @@ import hashlib
 import os
 import time
 from collections.abc import Callable
-from pathlib import Path
+from contextlib import suppress
+from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 import fsspec
@@ -95,16 +96,29 @@ class ObjectStore:
 
         self._repeated(fetch, f"{stored.name} cannot be fetched")
 
+    def folders(self) -> list[str]:
+        """Names of the folders directly in it."""
+
+        def folders() -> list[str]:
+            try:
+                found = self._files.ls(self._root, detail=True)
+            except FileNotFoundError:
+                return []
+            return [PurePosixPath(one["name"]).name for one in found if one["type"] == "directory"]
+
+        return self._repeated(folders, "what is in it cannot be listed")
+
     def remove(self) -> None:
-        """Delete all of its objects."""
+        """Delete all of its objects, and the folder above it if nothing else is in there."""
 
         def remove() -> None:
-            try:
+            with suppress(FileNotFoundError):
                 self._files.rm(self._root, recursive=True)
-            except FileNotFoundError:
-                return
 
-        self._repeated(remove, "files of an ended job cannot be removed")
+        self._repeated(remove, "files of an ended attempt cannot be removed")
+        if self.local:
+            with suppress(OSError):  # it has others, or somebody has removed it
+                Path(self._root).parent.rmdir()
 
     def _protocols(self) -> tuple[str, ...]:
         found = self._files.protocol

@@ -72,7 +72,7 @@ class RemoteWorker:
         on_event: Callable[[WorkerEvent], None],
         on_exit: Callable[[str | None], None],
     ) -> None:
-        """`store` is that of the job. `submit` gives the attempt to the engine; None for one that it has already.
+        """`store` is that of the attempt. `submit` gives the attempt to the engine; None for one that it has already.
 
         `withdraw` has the engine end what is left of it after so many seconds.
         """
@@ -200,7 +200,7 @@ class RemoteWorker:
                 self._inputs, self._seen_s = inputs, time.monotonic()
             if not (self._detached or self._left_s):
                 self._submit()
-        elif self._store.get(f"{self._attempt}/{MANIFEST}") is not None:
+        elif self._store.get(MANIFEST) is not None:
             return self._finish("")  # it has ended meanwhile
         while not self._detached:
             try:
@@ -241,7 +241,7 @@ class RemoteWorker:
 
     def _finish(self, reason: str) -> str | None:
         """The trouble of an attempt that is over: as its manifest says, else the reason."""
-        content = self._store.get(f"{self._attempt}/{MANIFEST}")
+        content = self._store.get(MANIFEST)
         if content is None:
             return reason or "its agent has ended without a result"
         try:
@@ -261,7 +261,7 @@ class RemoteWorker:
         for stored in sorted(files, key=lambda one: one.name == INDEX):
             path = folder / stored.name
             if self._have.get(stored.name) != stored.sha256:
-                self._store.fetch(f"{self._attempt}/{OUTPUTS}/{stored.sha256}", path, stored)
+                self._store.fetch(f"{OUTPUTS}/{stored.sha256}", path, stored)
                 self._have[stored.name] = stored.sha256
         for path in files_in(folder):
             if of_a_version(path) and path.relative_to(folder).as_posix() not in names:

@@ -59,6 +59,10 @@ class Executor(Protocol):
         """Follow an attempt that was started before the service was."""
         ...
 
+    def clean_up(self) -> None:
+        """Remove what other attempts have left. Called once those of earlier services have been adopted."""
+        ...
+
 
 class LocalExecutor:
     """Starts worker processes of the service."""
@@ -81,3 +85,6 @@ class LocalExecutor:
     def adopt(self, row: ReconstructionRow, command: JobCommand, on_event: OnEvent, on_exit: OnExit) -> Worker:
         """Never called: no attempt has an id."""
         raise AssertionError("a process of the service has ended with it")
+
+    def clean_up(self) -> None:
+        """Processes of the service leave nothing elsewhere."""

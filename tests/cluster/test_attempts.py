@@ -2,10 +2,13 @@
 
 import threading
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from queue import SimpleQueue
 
 import pytest
+from spiked_service.cluster import object_store
 from spiked_service.cluster.agent_reports import AgentReports, ServiceClient, UnansweredError
 from spiked_service.cluster.messages import AttemptWork, Begin, Inputs, Order, Report, ReportAnswer
 from spiked_service.cluster.object_store import ObjectStore
@@ -14,6 +17,7 @@ from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.workers.messages import (
     FramesSkipped,
     NodeFound,
+    NotBegun,
     PlaceCompared,
     ReconstructionCommand,
     WorkerError,
@@ -40,7 +44,15 @@ def command(tmp_path: Path) -> ReconstructionCommand:
 class Attempt:
     """A worker of the service without an engine, and what it has told."""
 
-    def __init__(self, command: ReconstructionCommand, store: Path, on_event: Callable[[WorkerEvent], None]) -> None:
+    def __init__(
+        self,
+        command: ReconstructionCommand,
+        store: Path,
+        on_event: Callable[[WorkerEvent], None],
+        adopted: bool = False,
+        begun: bool = False,
+        lease_s: float = TERMS.lease_s,
+    ) -> None:
         self.submitted = threading.Event()
         self.withdrawn: list[float] = []
         self.exits: SimpleQueue[str | None] = SimpleQueue()
@@ -48,8 +60,9 @@ class Attempt:
             "one",
             command,
             ObjectStore(store.as_uri()),
-            TERMS,
-            self.submitted.set,
+            replace(TERMS, lease_s=lease_s),
+            None if adopted else self.submitted.set,
+            begun,
             self.withdrawn.append,
             on_event,
             self.exits.put,
@@ -90,16 +103,77 @@ def test_an_event_that_cannot_be_taken_ends_the_attempt(command: ReconstructionC
 def test_an_attempt_that_the_engine_has_lost_ends_unless_it_has_begun(
     command: ReconstructionCommand, tmp_path: Path
 ) -> None:
-    waiting = Attempt(command, tmp_path / "store", lambda event: None)
+    events: list[WorkerEvent] = []
+    waiting = Attempt(command, tmp_path / "store", events.append)
     assert waiting.submitted.wait(10)
     waiting.worker.engine_ended("the engine has ended", False)
     assert waiting.exits.get(timeout=30) == "the engine has ended"
-    begun = Attempt(command, tmp_path / "store", lambda event: None)
+    assert events == [NotBegun()], "nothing is known against the job"
+    events.clear()
+    begun = Attempt(command, tmp_path / "store", events.append)
     begun.begin()
     begun.worker.engine_ended("the engine has ended", False)
     assert begun.worker.report(Report(agent="a")).order is Order.GO_ON
     begun.worker.engine_ended("its process has ended", True)
     assert begun.exits.get(timeout=30) == "its process has ended"
+    assert events == [NodeFound(node="there")]
+
+
+def test_an_agent_that_the_engine_has_ended_before_it_began_counts(
+    command: ReconstructionCommand, tmp_path: Path
+) -> None:
+    events: list[WorkerEvent] = []
+    one = Attempt(command, tmp_path / "store", events.append)
+    assert one.submitted.wait(10)
+    one.worker.engine_ended("its process has ended", True)
+    assert one.exits.get(timeout=30) == "its process has ended"
+    assert events == [], "an agent that dies at its start would do so for ever"
+
+
+def test_a_restarted_service_gives_the_work_of_an_attempt_that_waited_in_the_engine(
+    command: ReconstructionCommand, tmp_path: Path
+) -> None:
+    events: list[WorkerEvent] = []
+    waiting = Attempt(command, tmp_path / "store", events.append, adopted=True)
+
+    def begins() -> AttemptWork | None:
+        with suppress(FencedError):  # its files are being staged
+            return waiting.worker.begin(Begin(agent="a", node="there"))
+        return None
+
+    assert until(begins, "it is given its work").inputs.in_place
+    until(lambda: events == [NodeFound(node="there")], "its machine is known")
+    assert not waiting.submitted.is_set(), "the engine has it already"
+    waiting.worker.dismiss()
+    waiting.worker.kill_after(0)
+
+    begun = Attempt(command, tmp_path / "store", events.append, adopted=True, begun=True)
+    with pytest.raises(FencedError):
+        begun.worker.begin(Begin(agent="b", node="there"))
+    begun.worker.report(Report(agent="a"))
+    begun.worker.kill_after(0)
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_an_attempt_that_nobody_reports_of_after_a_restart_is_over(
+    command: ReconstructionCommand, tmp_path: Path, begun: bool
+) -> None:
+    events: list[WorkerEvent] = []
+    one = Attempt(command, tmp_path / "store", events.append, adopted=True, begun=begun, lease_s=0.5)
+    assert ("does not answer" if begun else "no machine has begun") in f"{one.exits.get(timeout=30)}"
+    assert events == ([] if begun else [NotBegun()])
+
+
+def test_a_store_that_is_away_is_not_held_against_the_job(
+    command: ReconstructionCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(object_store, "_DELAYS_S", ())
+    (command.folder / "map.json").write_text("an input")
+    (tmp_path / "store").write_text("no folder")
+    events: list[WorkerEvent] = []
+    one = Attempt(command, tmp_path / "store", events.append)
+    assert "cannot be stored" in f"{one.exits.get(timeout=30)}"
+    assert events == [NotBegun()]
 
 
 class Answers(ServiceClient):

@@ -316,6 +316,18 @@ def test_a_killed_engine_costs_no_attempt_that_has_begun(lab: Lab) -> None:
     until(lab.nothing_left, "nothing is left, though the new engine does not know it")
 
 
+def test_a_job_waits_for_as_long_as_its_engine_dies(lab: Lab) -> None:
+    job = lab.submit(SHORT)
+    for _ in range(7):  # more often than a job is attempted
+        (engine,) = until(lambda: lab.processes("spiked_service.cluster.engines"), "an engine starts")
+        engine.kill()
+        lab.reached(job, lambda row: row["state"] == "queued", "the job waits")
+        assert "the engine submitit has ended" in lab.job(job)["reason"]
+    lab.reached(job, complete, "it is complete")
+    assert json.loads((lab.folder(job) / "reconstruction.json").read_text())["attempts"] == 1
+    until(lab.nothing_left, "nothing is left of the attempts")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("executor", ["submitit", "ray"])
 def test_jobs_outlive_random_kills(executor: str) -> None:

@@ -1,8 +1,10 @@
 """Order, limit, precedence and retries of the queue."""
 
+import time
 from datetime import UTC, datetime
 from typing import Any
 
+import pytest
 from spiked_service.reconstructions.queue_policy import QueuePolicy
 from spiked_service.store.rows import JobState, ReconstructionRow, Stage
 
@@ -44,3 +46,25 @@ def test_retries_are_delayed_and_counted_for_each_reconstruction() -> None:
     policy.reset_retries("one")
     assert policy.due("one") and not policy.delays
     assert policy.retry("one"), "they are counted anew"
+
+
+def test_deaths_count_however_long_the_worker_has_lived(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = QueuePolicy(delays_s=(0.0, 0.0))
+    now_s = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    for _ in range(2):
+        assert policy.retry("poison")
+        now_s += 86_400
+    assert not policy.retry("poison"), "it would come back for ever"
+
+
+def test_what_no_machine_has_begun_waits_for_as_long_as_it_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = QueuePolicy(delays_s=(0.0,))
+    now_s = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    for _ in range(100):
+        policy.postpone("one")
+        assert policy.delays and not policy.due("one")
+        now_s += 60
+        assert policy.due("one")
+    assert policy.retry("one"), "none of these was a death"

@@ -102,6 +102,7 @@ class Cluster:
                 self._store.below(row.id, row.attempt),
                 self._terms,
                 None if adopted else submit,
+                bool(adopted and row.node),
                 withdraw,
                 on_event,
                 on_exit,

@@ -55,7 +55,8 @@ class Engine:
         """Have an agent started. Raises OSError."""
         with self._lock:
             self._submitted.add(attempt)
-            self._tell({"submit": attempt, "arguments": arguments})
+            with suppress(BrokenPipeError):  # it has died, and the thread that listens will say so
+                self._tell({"submit": attempt, "arguments": arguments})
 
     def cancel(self, attempt: str, after_s: float) -> None:
         """Have what is left of an attempt after `after_s` ended."""

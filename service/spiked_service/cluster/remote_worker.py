@@ -21,10 +21,10 @@ from spiked_service.cluster.messages import (
     ReportAnswer,
     StoredFile,
 )
-from spiked_service.cluster.object_store import ObjectStore
+from spiked_service.cluster.object_store import ObjectStore, ObjectStoreError
 from spiked_service.events.logging import logger
 from spiked_service.results.versions import INDEX
-from spiked_service.workers.messages import JobCommand, Logged, NodeFound, WorkerEvent
+from spiked_service.workers.messages import JobCommand, Logged, NodeFound, NotBegun, WorkerEvent
 from spiked_service.workers.process import relay
 
 _log = logger("spiked.cluster")
@@ -68,12 +68,14 @@ class RemoteWorker:
         store: ObjectStore,
         terms: Terms,
         submit: Callable[[], None] | None,
+        begun: bool,
         withdraw: Callable[[float], None],
         on_event: Callable[[WorkerEvent], None],
         on_exit: Callable[[str | None], None],
     ) -> None:
         """`store` is that of the attempt. `submit` gives the attempt to the engine; None for one that it has already.
 
+        `begun` is whether a machine has taken it, as far as an earlier service knew.
         `withdraw` has the engine end what is left of it after so many seconds.
         """
         self._attempt = attempt
@@ -81,6 +83,7 @@ class RemoteWorker:
         self._store = store
         self._terms = terms
         self._submit = submit
+        self._begun = begun
         self._withdraw = withdraw
         self._on_event = on_event
         self._on_exit = on_exit
@@ -95,6 +98,8 @@ class RemoteWorker:
         self._order = Order.GO_ON
         self._left_s: float | None = None
         self._seen_s = time.monotonic()
+        self._not_begun = False
+        """Whether the attempt is over before any agent has begun it, for a reason that is not the job's."""
         self._messages: queue.SimpleQueue[Report | str | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._detached = False
@@ -139,7 +144,10 @@ class RemoteWorker:
 
     def engine_ended(self, reason: str, certain: bool) -> None:
         """The engine has ended the attempt; if that is not `certain`, an agent that has begun may go on."""
-        if self._agent is None or certain:
+        with self._lock:
+            begun = self._begun or self._agent is not None
+            self._not_begun = not (begun or certain)
+        if certain or not begun:
             self._messages.put(reason or "the engine has ended its task")
 
     def stop(self) -> None:
@@ -176,6 +184,9 @@ class RemoteWorker:
     def _run(self) -> None:
         try:
             trouble = self._follow()
+        except ObjectStoreError as error:
+            trouble = str(error)
+            self._not_begun = self._agent is None and not self._begun
         except (SpikedError, OSError) as error:
             _log.warning("attempt failed", attempt=self._attempt, reason=str(error))
             trouble = str(error)
@@ -186,6 +197,8 @@ class RemoteWorker:
             return
         with self._lock:
             self._ended.set()
+        if self._not_begun:
+            self._on_event(NotBegun())
         with suppress(SpikedError):
             self._store.remove()
         self._withdraw(self._terms.grace_s if self._stored else 0.0)
@@ -193,15 +206,15 @@ class RemoteWorker:
 
     def _follow(self) -> str | None:
         """Follow the attempt to its end. Return the trouble of its worker."""
-        if self._submit is not None:
+        if self._submit is None and self._store.get(MANIFEST) is not None:
+            return self._finish("")  # it has ended meanwhile
+        if not self._begun:
             inputs = stage(self._command, self._store)
             self._have = {stored.name: stored.sha256 for stored in inputs.folder}
             with self._lock:
                 self._inputs, self._seen_s = inputs, time.monotonic()
-            if not (self._detached or self._left_s):
+            if self._submit is not None and not (self._detached or self._left_s):
                 self._submit()
-        elif self._store.get(MANIFEST) is not None:
-            return self._finish("")  # it has ended meanwhile
         while not self._detached:
             try:
                 message = self._messages.get(timeout=_LOOK_S)
@@ -210,7 +223,7 @@ class RemoteWorker:
             if isinstance(message, Report):
                 self._take(message)
             elif message is not None or self._overdue():
-                return self._finish(message or "its machine does not answer any more")
+                return self._finish(message or self._silence())
             elif message is None and self._left_s and self._agent is None:
                 return "it was ended before it began"
         return None
@@ -222,6 +235,14 @@ class RemoteWorker:
             return True
         begun = self._agent is not None or self._submit is None
         return begun and now_s - self._seen_s > _OVERDUE * self._terms.lease_s
+
+    def _silence(self) -> str:
+        """Why an attempt is overdue."""
+        with self._lock:
+            if self._agent is None and not (self._begun or self._left_s):
+                self._not_begun = True  # the engine of an earlier service has forgotten it, or has no room
+                return "no machine has begun it since the service was restarted"
+            return "its machine does not answer any more"
 
     def _take(self, told: Report) -> None:
         if told.sequence and told.sequence <= self._taken:

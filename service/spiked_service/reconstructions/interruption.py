@@ -34,12 +34,24 @@ def failed(row: ReconstructionRow, reason: str) -> ReconstructionRow:
 
 
 def after_crash(
-    row: ReconstructionRow, trouble: str, rows: ReconstructionRepository, catalogue: Catalogue, policy: QueuePolicy
+    row: ReconstructionRow,
+    trouble: str,
+    rows: ReconstructionRepository,
+    catalogue: Catalogue,
+    policy: QueuePolicy,
+    *,
+    begun: bool = True,
 ) -> ReconstructionRow:
-    """The row of a job whose worker died: queued again while retries are left and there is a recording."""
+    """The row of a job whose worker died: queued again while retries are left and there is a recording.
+
+    One that was not `begun` has nothing to do with it: it is queued again, and that is no attempt.
+    """
     row = replace(row, ended_at=datetime.now(UTC), eta_s=None, attempt="")
     capture = catalogue.captures.find(row.capture_id)
     again = capture is not None and (capture.plan.record or not row.task.reads_recording)
+    if again and not begun:
+        policy.postpone(row.id)
+        return queued_again(replace(row, attempts=row.attempts - 1), trouble)
     if again and policy.retry(row.id):
         return queued_again(row, f"{trouble}; {_next_start(row, rows)} (attempt {row.attempts + 1})")
     rows.drop_checkpoint(row.id)

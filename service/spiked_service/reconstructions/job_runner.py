@@ -18,6 +18,7 @@ from spiked_service.workers.messages import (
     FramesSkipped,
     JobCommand,
     NodeFound,
+    NotBegun,
     PlaceCompared,
     PoseEstimated,
     ReconstructionStatus,
@@ -53,6 +54,8 @@ class JobRunner:
         """
         self.row = row
         """The newest row."""
+        self.not_begun = False
+        """Whether no machine has begun the attempt, for a reason that is not the job's."""
         self._executor = executor
         self._rows = rows
         self._notifier = notifier
@@ -157,6 +160,8 @@ class JobRunner:
             case NodeFound():
                 self.row = replace(self.row, node=event.node)
                 self._save()
+            case NotBegun():
+                self.not_begun = True
             case ReconstructionStatus():
                 self._advance(event)
             case PoseEstimated():

@@ -334,7 +334,7 @@ class Reconstructions:
     def _outcome(self, job: JobRunner, trouble: str | None) -> ReconstructionRow:
         row = job.outcome(trouble)
         if row is None:
-            return after_crash(job.row, f"{trouble}", self.rows, self._catalogue, self.policy)
+            return after_crash(job.row, f"{trouble}", self.rows, self._catalogue, self.policy, begun=not job.not_begun)
         if row.state is JobState.QUEUED:
             self._least_poses[row.id] = row.poses
         return row

@@ -1,5 +1,6 @@
 """The policy of the queue: order, limit, precedence and retries."""
 
+import math
 import time
 from collections.abc import Sequence
 
@@ -11,6 +12,9 @@ _DELAYS_S = (1.0, 5.0)
 
 REMOTE_DELAYS_S = (1.0, 5.0, 15.0, 30.0, 60.0)
 """The same for other machines, which are switched off and taken away more often than workers die here."""
+
+_NOT_BEGUN_S = 5.0
+"""Delay of a job that no machine has begun, because engine, store or service were away."""
 
 
 class QueuePolicy:
@@ -44,13 +48,20 @@ class QueuePolicy:
         return True
 
     def retry(self, reconstruction_id: str) -> bool:
-        """Count a death of a worker. Return whether the reconstruction is to be queued again; it is due later."""
-        backoff = self._backoffs.setdefault(reconstruction_id, Backoff(self._delays_s))
+        """Count a death of a worker. Return whether the reconstruction is to be queued again; it is due later.
+
+        Deaths count however long the worker has lived: what kills it after an hour would do so for ever.
+        """
+        backoff = self._backoffs.setdefault(reconstruction_id, Backoff(self._delays_s, math.inf))
         delay_s = backoff.delay_s()
         if delay_s is None:
             return False
         self._not_before_s[reconstruction_id] = time.monotonic() + delay_s
         return True
+
+    def postpone(self, reconstruction_id: str) -> None:
+        """Have a reconstruction that no machine has begun wait a little; that may go on for as long as it takes."""
+        self._not_before_s[reconstruction_id] = time.monotonic() + _NOT_BEGUN_S
 
     def reset_retries(self, reconstruction_id: str) -> None:
         """Forget the deaths that were counted; the reconstruction is due."""

@@ -289,6 +289,12 @@ class NodeFound(BaseModel):
     node: str
 
 
+class NotBegun(BaseModel):
+    """The attempt is over before any machine has taken the job, for a reason that is not the job's."""
+
+    type: Literal["not_begun"] = "not_begun"
+
+
 class ReconstructionStatus(BaseModel):
     """Progress of a reconstruction."""
 
@@ -425,6 +431,7 @@ WorkerEvent = Annotated[
     | RecordingFailed
     | RecordingEnded
     | NodeFound
+    | NotBegun
     | ReconstructionStatus
     | PoseEstimated
     | FramesSkipped

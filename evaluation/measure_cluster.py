@@ -205,7 +205,7 @@ def outcome(service: Service, jobs: list[str], scratch: Path) -> dict[str, Any]:
         ],
         "reasons": dict(Counter(row["reason"] for row in rows if row["state"] != "complete")),
         "left_in_store": sum(one.is_file() for one in (service.data / "cluster" / "jobs").rglob("*")),
-        "left_in_scratch": len(list(scratch.iterdir())),
+        "left_in_scratch": len(list(scratch.glob("spiked-attempt-*"))),
         "processes_left": len(processes(scratch, "submitit.core._submit", "ray::_Agent", "workers reconstruction")),
     }
 

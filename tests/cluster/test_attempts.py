@@ -13,6 +13,7 @@ from spiked_service.cluster.agent_reports import AgentReports, ServiceClient, Un
 from spiked_service.cluster.messages import AttemptWork, Begin, Inputs, Order, Report, ReportAnswer
 from spiked_service.cluster.object_store import ObjectStore
 from spiked_service.cluster.remote_worker import FencedError, RemoteWorker, Terms
+from spiked_service.cluster.shared_recordings import SharedRecordings
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.workers.messages import (
     FramesSkipped,
@@ -60,6 +61,7 @@ class Attempt:
             "one",
             command,
             ObjectStore(store.as_uri()),
+            SharedRecordings(ObjectStore(f"{store.as_uri()}/recordings")),
             replace(TERMS, lease_s=lease_s),
             None if adopted else self.submitted.set,
             begun,
@@ -192,7 +194,16 @@ class Answers(ServiceClient):
 
 def work(command: ReconstructionCommand) -> AttemptWork:
     inputs = Inputs(recording=[], folder=[], in_place=True)
-    return AttemptWork(command=command, inputs=inputs, store="file:///s", lease_s=4, report_s=0.05, grace_s=1)
+    return AttemptWork(
+        command=command,
+        inputs=inputs,
+        store="file:///s",
+        recordings="file:///r",
+        cache_bytes=0,
+        lease_s=4,
+        report_s=0.05,
+        grace_s=1,
+    )
 
 
 def test_many_events_are_told_in_several_reports_and_in_order(command: ReconstructionCommand) -> None:

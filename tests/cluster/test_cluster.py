@@ -16,6 +16,7 @@ import psutil
 import pytest
 from spiked_service.cluster.cluster import Cluster
 from spiked_service.cluster.engine import EngineOptions
+from spiked_service.cluster.object_store import ObjectStore
 from spiked_service.cluster.remote_worker import Terms
 from spiked_service.results.versions import newest, versions
 from waiting import until
@@ -46,8 +47,11 @@ def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Lab:
     """A service whose jobs run elsewhere, at one address over its restarts."""
 
-    def __init__(self, daemon: Callable[..., Any], moving: Path, scratch: Path, lease_s: float) -> None:
+    def __init__(
+        self, daemon: Callable[..., Any], moving: Path, scratch: Path, lease_s: float, store: str | None = None
+    ) -> None:
         self._lease_s = lease_s
+        self._uri = store
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self._port = free.getsockname()[1]
@@ -67,6 +71,7 @@ class Lab:
             "reconstruction_workers": "2",
             "source_folders": str(self._moving.parent),
         }
+        settings |= {} if self._uri is None else {"executor_store": self._uri}
         flags = [part for name, value in settings.items() for part in ("--set", f"{name}={value}")]
         source = f"replay:{self._moving}?pace=0"
         self.one = self._daemon("--port", str(self._port), "--device", source, "--no-capture", *flags)
@@ -138,6 +143,20 @@ def lab(
             process.kill()
 
 
+@pytest.fixture
+def far_lab(
+    daemon: Callable[..., Any],
+    moving: Path,
+    bucket: str,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Lab:
+    """A lab whose machines share no folder with it, but a bucket."""
+    scratch = tmp_path_factory.mktemp("scratch")
+    monkeypatch.setenv("SPIKED_SCRATCH", str(scratch))
+    return Lab(daemon, moving, scratch, LEASE_S, f"{bucket}/far-lab")
+
+
 def complete(row: Any) -> bool:
     assert row["state"] != "failed", row["reason"]
     return bool(row["state"] == "complete")
@@ -156,6 +175,26 @@ def test_jobs_elsewhere_end_as_those_here(lab: Lab) -> None:
         assert lab.get(f"reconstructions/{job}/timeline")["work"]["work_s"]
         assert lab.attempt(job) == ""
     until(lab.nothing_left, "nothing is left of the attempts")
+
+
+def test_many_jobs_of_a_recording_send_and_fetch_it_once(far_lab: Lab, bucket: str) -> None:
+    lab = far_lab
+    lab.reached(lab.submit(SHORT), complete, "the first one is complete")
+    (service,) = (ObjectStore(f"{bucket}/far-lab").below(name) for name in ObjectStore(f"{bucket}/far-lab").folders())
+    recordings = service.below("recordings")
+    names = recordings.objects()
+    (cache,) = lab.scratch.glob("spiked-recordings-*")
+    assert {path.name for path in cache.iterdir() if path.suffix != ".lock"} == set(names)
+    sizes = {name: (cache / name).stat().st_size for name in names}
+    assert max(sizes.values()) == lab.get(f"captures/{lab.capture}")["recording"]["bytes"]
+    for name, size in sizes.items():  # whoever fetched them again would notice
+        recordings.put(name, b"x" * size)
+    for job in [lab.submit(SHORT) for _ in range(3)]:
+        row = lab.reached(job, complete, "it is complete")
+        assert row["poses"] == 500 and row["reason"] == ""
+    assert all(recordings.get(name) == b"x" * size for name, size in sizes.items()), "nor is it sent again"
+    until(lambda: service.folders() == ["recordings"], "nothing is left of the attempts in the store")
+    until(lambda: list(lab.scratch.iterdir()) == [cache], "nor on the machine")
 
 
 def test_a_killed_agent_or_worker_costs_an_attempt_and_nothing_else(lab: Lab) -> None:

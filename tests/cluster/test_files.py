@@ -10,6 +10,7 @@ from spiked_service.cluster.job_files import INPUTS, moved, stage
 from spiked_service.cluster.messages import StoredFile
 from spiked_service.cluster.object_store import ObjectStore, ObjectStoreError, stored_file
 from spiked_service.cluster.scratch import scratch_folder
+from spiked_service.cluster.shared_recordings import SharedRecordings
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.settings.settings import load_settings
 from spiked_service.workers.messages import ReconstructionCommand
@@ -52,12 +53,16 @@ def command(tmp_path: Path) -> ReconstructionCommand:
 def test_a_job_takes_along_what_its_worker_reads(tmp_path: Path) -> None:
     given = command(tmp_path)
     store = Far((tmp_path / "store").as_uri())
-    inputs = stage(given, store)
+    recordings = SharedRecordings(Far((tmp_path / "recordings").as_uri()))
+    inputs = stage(given, store, lambda folder: recordings.hold(folder, "attempt"))
     assert not inputs.in_place
     assert {one.name for one in inputs.recording} == {"recording.dat", "recording.json"}
     assert {one.name for one in inputs.folder} == {"map-1/map.json"}
-    for stored in (*inputs.recording, *inputs.folder):
+    for stored in inputs.recording:
+        recordings.store.fetch(stored.sha256, tmp_path / "there" / stored.name, stored)
+    for stored in inputs.folder:
         store.fetch(f"{INPUTS}/{stored.sha256}", tmp_path / "there" / stored.name, stored)
+    for stored in (*inputs.recording, *inputs.folder):
         assert (tmp_path / "there" / stored.name).read_text() == Path(stored.name).name
     there = moved(given, Path("/job"), Path("/recording"))
     assert isinstance(there, ReconstructionCommand)
@@ -71,7 +76,7 @@ def test_a_job_takes_along_what_its_worker_reads(tmp_path: Path) -> None:
 
 def test_a_shared_recording_is_read_where_it_is(tmp_path: Path) -> None:
     given = command(tmp_path)
-    inputs = stage(given, ObjectStore((tmp_path / "store").as_uri()))
+    inputs = stage(given, ObjectStore((tmp_path / "store").as_uri()), lambda folder: pytest.fail("it is not stored"))
     assert inputs.in_place and inputs.recording == []
     there = moved(given, Path("/job"), None)
     assert isinstance(there, ReconstructionCommand)

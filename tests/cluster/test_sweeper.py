@@ -1,12 +1,14 @@
 """What attempts that are over leave in the store is removed, and nothing else."""
 
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from spiked_service.base.ids import new_id
 from spiked_service.cluster.job_files import OUTPUTS
 from spiked_service.cluster.object_store import ObjectStore
+from spiked_service.cluster.shared_recordings import SharedRecordings
 from spiked_service.cluster.sweeper import Sweeper
 from waiting import until
 
@@ -18,11 +20,15 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> ObjectStore:
     return ObjectStore(uri).below(new_id())
 
 
+def sweeper_of(store: ObjectStore, alive: Callable[[str], bool]) -> Sweeper:
+    return Sweeper(store, alive, SharedRecordings(store.below("recordings")))
+
+
 def test_only_what_is_over_is_swept(store: ObjectStore) -> None:
     job, alive, over, other_job, other = (new_id() for _ in range(5))
     for attempt in ((job, alive), (job, over), (other_job, other), ("of-somebody-else", "x")):
         store.below(*attempt).put(f"{OUTPUTS}/1", b"content")
-    assert Sweeper(store, lambda attempt: attempt == alive).sweep() == 2
+    assert sweeper_of(store, lambda attempt: attempt == alive).sweep() == 2
     assert store.below(job, alive).get(f"{OUTPUTS}/1") == b"content"
     assert store.below("of-somebody-else", "x").get(f"{OUTPUTS}/1") == b"content"
     assert store.below(job).folders() == [alive]
@@ -37,7 +43,7 @@ def test_an_attempt_that_begins_and_stores_during_sweeps_loses_nothing(store: Ob
         with lock:
             return attempt in alive
 
-    sweeper = Sweeper(store, is_alive)
+    sweeper = sweeper_of(store, is_alive)
 
     def sweep() -> None:
         while not over.is_set():
@@ -66,7 +72,7 @@ def test_an_attempt_that_begins_and_stores_during_sweeps_loses_nothing(store: Ob
 def test_a_sweeper_sweeps_at_its_start_and_whenever_it_is_woken(tmp_path: Path) -> None:
     store = ObjectStore(tmp_path.as_uri())
     store.below(new_id(), new_id()).put("a", b"left by an earlier service")
-    sweeper = Sweeper(store, lambda attempt: False)
+    sweeper = sweeper_of(store, lambda attempt: False)
     assert store.folders()
     sweeper.start()
     until(lambda: not store.folders(), "it has swept at the start")

@@ -15,6 +15,7 @@ from spiked_service.cluster.agent_reports import AgentReports, RefusedError, Ser
 from spiked_service.cluster.job_files import INPUTS, LOG, MANIFEST, OUTPUTS, files_in, moved, of_a_version
 from spiked_service.cluster.messages import AttemptWork, Begin, Manifest, Order, StoredFile
 from spiked_service.cluster.object_store import ObjectStore, stored_file
+from spiked_service.cluster.recording_cache import RecordingCache, cache_folder
 from spiked_service.cluster.scratch import scratch_folder
 from spiked_service.results.versions import INDEX
 from spiked_service.workers.messages import JobCommand, VersionPublished, WorkerEvent
@@ -75,13 +76,19 @@ class _Attempt:
     def _fetch(self) -> JobCommand | None:
         """Fetch the inputs. Return the command for the worker, None if they cannot be had."""
         inputs, command = self._work.inputs, self._work.command
+        recordings = ObjectStore(self._work.recordings)
+
+        def fetch(stored: StoredFile, path: Path) -> None:
+            recordings.fetch(stored.sha256, path, stored)
+
         assert isinstance(command, JobCommand)
         recording = self._folder / "recording"
         self._job.mkdir()
         try:
-            for place, files in ((self._job, inputs.folder), (recording, inputs.recording)):
-                for stored in files:
-                    self._store.fetch(f"{INPUTS}/{stored.sha256}", place / stored.name, stored)
+            for stored in inputs.folder:
+                self._store.fetch(f"{INPUTS}/{stored.sha256}", self._job / stored.name, stored)
+            if inputs.recording:
+                RecordingCache(cache_folder(), self._work.cache_bytes, fetch).put_into(recording, inputs.recording)
         except (SpikedError, OSError) as error:
             self._trouble = f"its files cannot be fetched on {socket.gethostname()}: {error}"
             return None

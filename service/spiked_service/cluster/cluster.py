@@ -11,6 +11,7 @@ from spiked_service.base.ids import new_id
 from spiked_service.cluster.engine import Engine, EngineOptions
 from spiked_service.cluster.object_store import ObjectStore
 from spiked_service.cluster.remote_worker import FencedError, RemoteWorker, Terms
+from spiked_service.cluster.shared_recordings import SharedRecordings
 from spiked_service.cluster.sweeper import Sweeper
 from spiked_service.reconstructions.executor import OnEvent, OnExit, Worker
 from spiked_service.store.rows import ReconstructionRow
@@ -19,6 +20,8 @@ from spiked_service.workers.process import StandbyWorker
 
 _KEY = "attempts.key"
 """File with the key that tokens are made with."""
+_RECORDINGS = "recordings"
+"""Folder in the store, beside those of the jobs."""
 _OWNER = b"folder in the store"
 """What the name of the service's folder is made of, with the key."""
 
@@ -39,7 +42,8 @@ class Cluster:
         self._engine = Engine(engine, folder / "engine.log", self._engine_ended)
         self._attempts: dict[str, RemoteWorker] = {}
         self._lock = Lock()
-        self._sweeper = Sweeper(self._store, self._alive)
+        self._recordings = SharedRecordings(self._store.below(_RECORDINGS))
+        self._sweeper = Sweeper(self._store, self._alive, self._recordings)
         self.url = ""
         """Address at which agents reach the service."""
 
@@ -100,6 +104,7 @@ class Cluster:
                 row.attempt,
                 command,
                 self._store.below(row.id, row.attempt),
+                self._recordings,
                 self._terms,
                 None if adopted else submit,
                 bool(adopted and row.node),

@@ -29,7 +29,7 @@ def cluster_of(settings: Settings, data: Path) -> Cluster | None:
         options=dict(value.partition("=")[::2] for value in settings.executor_options),
     )
     store = settings.executor_store or (folder / "jobs").as_uri()
-    return Cluster(folder, store, options, Terms(settings.executor_lease_s))
+    return Cluster(folder, store, options, Terms(settings.executor_lease_s, cache_bytes=settings.executor_cache_bytes))
 
 
 def _is_wildcard(host: str) -> bool:

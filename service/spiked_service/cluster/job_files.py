@@ -1,6 +1,6 @@
 """The files of a job: what an attempt begins with, and its command with the paths of another machine."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from spiked.recon.checkpoint_file import CHECKPOINT
@@ -43,24 +43,21 @@ def files_in(folder: Path, *, with_log: bool = False) -> Iterator[Path]:
             yield path
 
 
-def stage(command: JobCommand, store: ObjectStore) -> Inputs:
-    """Store what an attempt begins with, in its store. Raises ObjectStoreError and OSError."""
+def stage(command: JobCommand, store: ObjectStore, hold: Callable[[Path], list[StoredFile]]) -> Inputs:
+    """Store what an attempt begins with, in its store; `hold` stores the folder of a recording.
+
+    Raises ObjectStoreError and OSError.
+    """
     recording = recording_of(command)
     in_place = store.local or recording is None
-    return Inputs(
-        recording=[] if in_place or recording is None else _put(recording.parent, store),
-        folder=_put(command.folder, store),
-        in_place=in_place,
-    )
-
-
-def _put(folder: Path, store: ObjectStore) -> list[StoredFile]:
     found = []
-    for path in files_in(folder):
-        stored = stored_file(path, path.relative_to(folder).as_posix())
+    for path in files_in(command.folder):
+        stored = stored_file(path, path.relative_to(command.folder).as_posix())
         store.put_file(path, f"{INPUTS}/{stored.sha256}", stored)
         found.append(stored)
-    return found
+    return Inputs(
+        recording=[] if in_place or recording is None else hold(recording.parent), folder=found, in_place=in_place
+    )
 
 
 def moved(command: JobCommand, folder: Path, recording_folder: Path | None) -> JobCommand:

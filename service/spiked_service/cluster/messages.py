@@ -40,12 +40,12 @@ class StoredFile(BaseModel):
 
 
 class Inputs(BaseModel):
-    """What an attempt begins with; the object of a file is `inputs/SHA256` below `store`."""
+    """What an attempt begins with."""
 
     recording: list[StoredFile]
-    """Files of the folder of its capture."""
+    """Files of the folder of its capture, each the object SHA256 of `recordings`."""
     folder: list[StoredFile]
-    """Files of the folder of the job: earlier versions, maps, what was given."""
+    """Files of the folder of the job: earlier versions, maps, what was given. Each is `inputs/SHA256` of `store`."""
     in_place: bool
     """Whether the recording is read where the command has it: service and agents share a file system."""
 
@@ -58,6 +58,10 @@ class AttemptWork(BaseModel):
     inputs: Inputs
     store: str
     """URI of the folder of the attempt in the object store."""
+    recordings: str
+    """URI of the folder of the recordings there."""
+    cache_bytes: Annotated[int, Field(ge=0)]
+    """Bytes of recordings that a machine keeps for other attempts."""
     lease_s: float
     """An agent that has not been answered for so long ends its worker: another attempt begins."""
     report_s: float

@@ -98,15 +98,11 @@ class ObjectStore:
 
     def folders(self) -> list[str]:
         """Names of the folders directly in it."""
+        return self._list("directory")
 
-        def folders() -> list[str]:
-            try:
-                found = self._files.ls(self._root, detail=True)
-            except FileNotFoundError:
-                return []
-            return [PurePosixPath(one["name"]).name for one in found if one["type"] == "directory"]
-
-        return self._repeated(folders, "what is in it cannot be listed")
+    def objects(self) -> list[str]:
+        """Names of the objects directly in it."""
+        return self._list("file")
 
     def remove(self) -> None:
         """Delete all of its objects, and the folder above it if nothing else is in there."""
@@ -119,6 +115,16 @@ class ObjectStore:
         if self.local:
             with suppress(OSError):  # it has others, or somebody has removed it
                 Path(self._root).parent.rmdir()
+
+    def _list(self, kind: str) -> list[str]:
+        def found() -> list[str]:
+            try:
+                entries = self._files.ls(self._root, detail=True)
+            except FileNotFoundError:
+                return []
+            return [PurePosixPath(one["name"]).name for one in entries if one["type"] == kind]
+
+        return self._repeated(found, "what is in it cannot be listed")
 
     def _protocols(self) -> tuple[str, ...]:
         found = self._files.protocol

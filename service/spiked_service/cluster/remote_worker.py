@@ -22,6 +22,7 @@ from spiked_service.cluster.messages import (
     StoredFile,
 )
 from spiked_service.cluster.object_store import ObjectStore, ObjectStoreError
+from spiked_service.cluster.shared_recordings import SharedRecordings
 from spiked_service.events.logging import logger
 from spiked_service.results.versions import INDEX
 from spiked_service.workers.messages import JobCommand, Logged, NodeFound, NotBegun, WorkerEvent
@@ -46,6 +47,8 @@ class Terms:
 
     lease_s: float
     grace_s: float = 10.0
+    cache_bytes: int = 0
+    """Bytes of recordings that a machine keeps."""
 
     @property
     def report_s(self) -> float:
@@ -66,6 +69,7 @@ class RemoteWorker:
         attempt: str,
         command: JobCommand,
         store: ObjectStore,
+        recordings: SharedRecordings,
         terms: Terms,
         submit: Callable[[], None] | None,
         begun: bool,
@@ -73,17 +77,21 @@ class RemoteWorker:
         on_event: Callable[[WorkerEvent], None],
         on_exit: Callable[[str | None], None],
     ) -> None:
-        """`store` is that of the attempt. `submit` gives the attempt to the engine; None for one that it has already.
+        """`store` is that of the attempt, `recordings` are for all.
 
+        `submit` gives the attempt to the engine; None for one that it has already.
         `begun` is whether a machine has taken it, as far as an earlier service knew.
         `withdraw` has the engine end what is left of it after so many seconds.
         """
         self._attempt = attempt
         self._command = command
         self._store = store
+        self._recordings = recordings
         self._terms = terms
         self._submit = submit
         self._begun = begun
+        if begun:
+            recordings.hold_all(attempt)
         self._withdraw = withdraw
         self._on_event = on_event
         self._on_exit = on_exit
@@ -122,6 +130,8 @@ class RemoteWorker:
                 command=self._command,
                 inputs=self._inputs,
                 store=self._store.uri,
+                recordings=self._recordings.store.uri,
+                cache_bytes=self._terms.cache_bytes,
                 lease_s=self._terms.lease_s,
                 report_s=self._terms.report_s,
                 grace_s=self._terms.grace_s,
@@ -199,6 +209,7 @@ class RemoteWorker:
             self._ended.set()
         if self._not_begun:
             self._on_event(NotBegun())
+        self._recordings.release(self._attempt)
         with suppress(SpikedError):
             self._store.remove()
         self._withdraw(self._terms.grace_s if self._stored else 0.0)
@@ -209,7 +220,7 @@ class RemoteWorker:
         if self._submit is None and self._store.get(MANIFEST) is not None:
             return self._finish("")  # it has ended meanwhile
         if not self._begun:
-            inputs = stage(self._command, self._store)
+            inputs = stage(self._command, self._store, lambda folder: self._recordings.hold(folder, self._attempt))
             self._have = {stored.name: stored.sha256 for stored in inputs.folder}
             with self._lock:
                 self._inputs, self._seen_s = inputs, time.monotonic()

@@ -14,13 +14,15 @@ _LOCK = ".lock"
 """File in a folder that its owner holds a lock of, which the kernel lets go of when the owner dies."""
 
 
+def scratch_base() -> Path:
+    """$SPIKED_SCRATCH, or the folder for temporary files."""
+    return Path(os.environ.get("SPIKED_SCRATCH") or tempfile.gettempdir())
+
+
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """A folder below $SPIKED_SCRATCH, or the one for temporary files; removed at the end.
-
-    Those of agents that were killed are removed first.
-    """
-    base = Path(os.environ.get("SPIKED_SCRATCH") or tempfile.gettempdir())
+    """A folder for an attempt, removed at the end. Those of agents that were killed are removed first."""
+    base = scratch_base()
     for old in base.glob(f"{_PREFIX}*"):
         _remove_if_left(old)
     folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=base))

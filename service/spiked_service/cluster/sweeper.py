@@ -6,6 +6,7 @@ from collections.abc import Callable
 from spiked.errors import SpikedError
 from spiked_service.base.ids import is_id
 from spiked_service.cluster.object_store import ObjectStore
+from spiked_service.cluster.shared_recordings import SharedRecordings
 from spiked_service.events.logging import logger
 
 _log = logger("spiked.cluster")
@@ -20,9 +21,10 @@ class Sweeper:
     listed first and found not to be alive afterwards is over for good.
     """
 
-    def __init__(self, store: ObjectStore, alive: Callable[[str], bool]) -> None:
+    def __init__(self, store: ObjectStore, alive: Callable[[str], bool], recordings: SharedRecordings) -> None:
         """`store` has a folder for each job and in it one for each attempt; `alive` takes the id of an attempt."""
         self._store = store
+        self._recordings = recordings
         self._alive = alive
         self._wake = threading.Condition()
         self._wanted = True
@@ -49,7 +51,10 @@ class Sweeper:
             self._wake.notify_all()
 
     def sweep(self) -> int:
-        """Remove the objects of attempts that are over. Return of how many. Raises ObjectStoreError."""
+        """Remove the objects of attempts that are over, and recordings that none reads. Raises ObjectStoreError.
+
+        Returns of how many attempts.
+        """
         swept = 0
         for job in filter(is_id, self._store.folders()):
             for attempt in filter(is_id, self._store.below(job).folders()):
@@ -58,6 +63,7 @@ class Sweeper:
                 if not self._alive(attempt):
                     self._store.below(job, attempt).remove()
                     swept += 1
+        self._recordings.sweep()
         return swept
 
     def _run(self) -> None:

@@ -76,9 +76,8 @@ class Reconstructions:
             for row in [one for one in self.rows.interrupted() if one.id not in self._jobs]:
                 self._adopt(row)
             self._executor.clean_up()
-            thread = threading.Thread(target=self._run_queue, name="queue", daemon=True)
-            thread.start()
-            self._thread = thread
+            self._thread = threading.Thread(target=self._run_queue, name="queue", daemon=True)
+            self._thread.start()
 
     def begin_live(
         self,

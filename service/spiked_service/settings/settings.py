@@ -239,6 +239,12 @@ class Settings(BaseSettings):
     executor_lease_s: float = Field(
         60.0, ge=2, le=86_400, description="Silence of another machine after which its job begins again."
     )
+    executor_cache_bytes: int = Field(
+        20_000_000_000,
+        ge=0,
+        le=MOST_BYTES,
+        description="Bytes of recordings that each of the other machines keeps for further jobs; 0 for none.",
+    )
     executor_options: Annotated[Words, AfterValidator(_pairs)] = Field(
         [], description="NAME=VALUE for submitit, such as slurm_partition=gpu."
     )

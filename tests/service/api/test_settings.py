@@ -49,6 +49,7 @@ GUARDED = {
     "executor_cpus",
     "executor_gpus",
     "executor_lease_s",
+    "executor_cache_bytes",
     "executor_options",
 }
 """Who may use the service, where it listens, what it reaches, and where its jobs run."""

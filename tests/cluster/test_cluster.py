@@ -206,11 +206,19 @@ def test_a_killed_agent_or_worker_costs_an_attempt_and_nothing_else(lab: Lab) ->
     worker = next(one for one in lab.workers() if one.ppid() == other.pid)
     agent.kill()
     worker.kill()
+    reasons: list[str] = []
     for job in (first, second):
         lab.reached(job, lambda row, job=job: lab.attempt(job) not in ("", before[job][1]), "another attempt has begun")
         row = lab.reached(job, lambda row, job=job: row["version"] > before[job][0], "it publishes again")
         assert row["state"] == "running"
+        log = lab.one.http.get(f"reconstructions/{job}/log").text.splitlines()
+        begins = [line for line in log if line.endswith(f" on {socket.gethostname()} ==")]
+        assert begins == [
+            f"== attempt {one} on {socket.gethostname()} ==" for one in (before[job][1], lab.attempt(job))
+        ]
+        reasons += [line for line in log if line.startswith(f"== attempt {before[job][1]} has ended: ")]
         assert [one["version"] for one in lab.get(f"reconstructions/{job}/versions")["items"]][:1] == [1]
+    assert sorted("killed by signal 9" in reason for reason in reasons) == [False, True]
     for job in (first, second):
         lab.post(f"reconstructions/{job}:cancel")
         lab.reached(job, lambda row: row["state"] == "cancelled", "it is cancelled")

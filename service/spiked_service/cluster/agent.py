@@ -109,7 +109,8 @@ class _Attempt:
             worker.kill_after(self._work.grace_s)
 
     def _worker_ended(self, trouble: str | None) -> None:
-        self._trouble = trouble
+        # Its own log is gone with this folder, and is in that of the job.
+        self._trouble = trouble and trouble.replace(str(self._job / LOG), "the log of the job")
         self._exited.set()
 
     def _take(self, event: WorkerEvent) -> None:

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pydantic import ValidationError
 
 from spiked.errors import SpikedError
-from spiked_service.cluster.job_files import MANIFEST, OUTPUTS, files_in, of_a_version, stage
+from spiked_service.cluster.attempt_log import AttemptLog
+from spiked_service.cluster.job_files import LOG, MANIFEST, OUTPUTS, files_in, of_a_version, stage
 from spiked_service.cluster.messages import (
     AttemptWork,
     Begin,
@@ -96,6 +97,7 @@ class RemoteWorker:
         self._on_event = on_event
         self._on_exit = on_exit
         self._inputs: Inputs | None = None
+        self._log = AttemptLog(command.folder / LOG, attempt)
         self._have: dict[str, str] = {}
         """Hashes of the files in the folder of the job, by name."""
         self._agent: str | None = None
@@ -209,6 +211,9 @@ class RemoteWorker:
             self._ended.set()
         if self._not_begun:
             self._on_event(NotBegun())
+        elif trouble is not None:
+            with suppress(OSError):
+                self._log.end(trouble)
         self._recordings.release(self._attempt)
         with suppress(SpikedError):
             self._store.remove()
@@ -266,6 +271,8 @@ class RemoteWorker:
 
     def _deliver(self, events: list[WorkerEvent]) -> None:
         for event in events:
+            if isinstance(event, NodeFound):
+                self._log.begin(event.node)
             if isinstance(event, Logged):
                 relay(event)
             else:
@@ -291,10 +298,12 @@ class RemoteWorker:
         folder = self._command.folder
         names = {stored.name for stored in files}
         for stored in sorted(files, key=lambda one: one.name == INDEX):
-            path = folder / stored.name
             if self._have.get(stored.name) != stored.sha256:
+                path = self._log.arriving if stored.name == LOG else folder / stored.name
                 self._store.fetch(f"{OUTPUTS}/{stored.sha256}", path, stored)
                 self._have[stored.name] = stored.sha256
+                if stored.name == LOG:
+                    self._log.take()
         for path in files_in(folder):
             if of_a_version(path) and path.relative_to(folder).as_posix() not in names:
                 path.unlink(missing_ok=True)

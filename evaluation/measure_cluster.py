@@ -64,28 +64,35 @@ class RayNodes:
     def kill(self, random_: random.Random) -> None:
         """Kill a node with all that runs on it, and start another."""
         number = random_.randrange(2)
-        with suppress(psutil.Error):
-            for process in [*self._nodes[number].children(recursive=True), self._nodes[number]]:
-                with suppress(psutil.Error):
-                    process.kill()
+        for node in self._nodes[number]:
+            with suppress(psutil.Error):
+                for process in [*node.children(recursive=True), node]:
+                    with suppress(psutil.Error):
+                        process.kill()
         self._nodes[number] = self._node()
 
     def close(self) -> None:
         """End all nodes."""
         subprocess.run([RAY, "stop", "--force"], check=False, capture_output=True)
 
-    def _node(self) -> psutil.Process:
-        before = {one.pid for one in _raylets()}
+    def _node(self) -> list[psutil.Process]:
+        """Start a node. Return its raylet, and its log monitor, which would outlive it and slow down the others."""
+        before = {one.pid for one in _node_processes()}
         self._run(f"--address={self.address}", "--num-cpus=1")
-        return next(one for one in _raylets() if one.pid not in before)
+        return [one for one in _node_processes() if one.pid not in before]
 
     @staticmethod
     def _run(*words: str) -> None:
         subprocess.run([RAY, "start", "--disable-usage-stats", *words], check=True, capture_output=True)
 
 
-def _raylets() -> list[psutil.Process]:
-    return [one for one in psutil.process_iter(["name"]) if one.info["name"] == "raylet"]
+def _node_processes() -> list[psutil.Process]:
+    found = []
+    for one in psutil.process_iter(["name", "cmdline"]):
+        monitors = any(part.endswith("log_monitor.py") for part in one.info["cmdline"] or [])
+        if one.info["name"] == "raylet" or monitors:
+            found.append(one)
+    return found
 
 
 class Service:

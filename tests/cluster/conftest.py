@@ -1,9 +1,25 @@
-"""An S3 server of this machine."""
+"""An S3 server of this machine, and a recording."""
 
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+
+from spiked.recording import RecordingWriter
+from spiked.sensor import Intrinsics, Sensor
+from spiked.simulate import MotionKind, SimulatedCamera
+
+
+@pytest.fixture(scope="session")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of a camera that moves."""
+    path = tmp_path_factory.mktemp("recordings") / "moving.dat"
+    sensor = Sensor(160, 96, 20_000.0, intrinsics=Intrinsics.from_fov(160, 96, 60))
+    camera = SimulatedCamera(sensor, seed=4, motion=MotionKind.ARC, flow_px=0.3, parallax=0.5)
+    with RecordingWriter(path, sensor) as writer:
+        writer.append(camera.next_frames(500))
+    return path
 
 
 @pytest.fixture(scope="session")

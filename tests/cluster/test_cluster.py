@@ -21,40 +21,38 @@ from spiked_service.cluster.remote_worker import Terms
 from spiked_service.results.versions import newest, versions
 from waiting import until
 
-from spiked.recording import RecordingWriter
-from spiked.sensor import Intrinsics, Sensor
-from spiked.simulate import MotionKind, SimulatedCamera
-
 pytest.importorskip("submitit")
 
 SHORT = {"steps": 20}
 LONG = {"steps": 200_000}
+LOCALLY = {"executor": "submitit", "executor_address": "local"}
 LEASE_S = 30.0
 SHORT_LEASE_S = 4.0
 
 
-@pytest.fixture(scope="module")
-def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of a camera that moves."""
-    path = tmp_path_factory.mktemp("recordings") / "moving.dat"
-    sensor = Sensor(160, 96, 20_000.0, intrinsics=Intrinsics.from_fov(160, 96, 60))
-    camera = SimulatedCamera(sensor, seed=4, motion=MotionKind.ARC, flow_px=0.3, parallax=0.5)
-    with RecordingWriter(path, sensor) as writer:
-        writer.append(camera.next_frames(500))
-    return path
+def free_port() -> int:
+    """A port that nobody listens on."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
 
 
 class Lab:
     """A service whose jobs run elsewhere, at one address over its restarts."""
 
     def __init__(
-        self, daemon: Callable[..., Any], moving: Path, scratch: Path, lease_s: float, store: str | None = None
+        self,
+        daemon: Callable[..., Any],
+        moving: Path,
+        scratch: Path,
+        lease_s: float,
+        store: str | None = None,
+        engine: dict[str, str] = LOCALLY,
     ) -> None:
         self._lease_s = lease_s
         self._uri = store
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self._port = free.getsockname()[1]
+        self._engine = engine
+        self._port = free_port()
         self._daemon = daemon
         self._moving = moving
         self.scratch = scratch
@@ -64,9 +62,7 @@ class Lab:
         until(lambda: self.get(f"captures/{self.capture}")["state"] == "complete", "the capture is complete")
 
     def start(self) -> None:
-        settings = {
-            "executor": "submitit",
-            "executor_address": "local",
+        settings = self._engine | {
             "executor_lease_s": str(self._lease_s),
             "reconstruction_workers": "2",
             "source_folders": str(self._moving.parent),

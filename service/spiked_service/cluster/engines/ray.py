@@ -1,5 +1,9 @@
 """Agents as Ray actors: detached ones, which outlive the engine and end with their attempt."""
 
+import os
+import sys
+import threading
+import traceback
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
@@ -14,13 +18,29 @@ _NAMESPACE = "spiked"
 
 
 class _Agent:
-    """One attempt."""
+    """One attempt. It begins with the actor: a call of a method is lost with the engine that has made it.
 
-    def run(self, arguments: Sequence[str]) -> None:
-        """Work for the attempt to its end, then end this process."""
-        run_agent(*arguments)
-        exit_actor: Any = ray.actor.exit_actor
-        exit_actor()
+    An actor that waits for its resources while the engine dies would then hold them for ever, and do nothing.
+    """
+
+    def __init__(self, arguments: Sequence[str]) -> None:
+        self._thread = threading.Thread(target=self._run, args=(arguments,), name="agent")
+        self._thread.start()
+
+    def wait(self) -> None:
+        """Never returns: this process ends with the attempt."""
+        self._thread.join()
+
+    @staticmethod
+    def _run(arguments: Sequence[str]) -> None:
+        try:
+            run_agent(*arguments)
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(0)
 
 
 class RayTasks:
@@ -41,7 +61,7 @@ class RayTasks:
         resources = {"num_cpus": self._options.cpus, "num_gpus": self._options.gpus}
         remote: Any = ray.remote(_Agent)
         agent = remote.options(name=attempt, lifetime="detached", max_restarts=0, **resources)
-        self._running[agent.remote().run.remote(list(arguments))] = attempt
+        self._running[agent.remote(list(arguments)).wait.remote()] = attempt
 
     def cancel(self, attempt: str) -> None:
         """Kill the actor, which takes the worker along."""
@@ -58,6 +78,8 @@ class RayTasks:
             reason = "the agent has ended without a result"
             try:
                 ray.get(task)
+            except ray.exceptions.ActorDiedError:
+                pass  # as at the end of every attempt
             except ray.exceptions.RayError as error:
                 reason = f"Ray has ended it: {type(error).__name__}"
             found.append((self._running.pop(task), reason))

@@ -1,0 +1,57 @@
+"""Jobs on a Ray cluster of this machine."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from waiting import until
+
+from .test_cluster import LONG, SHORT, Lab, complete, free_port
+
+pytest.importorskip("ray", reason="needs Ray")
+
+
+@pytest.fixture
+def head(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of a cluster with one core."""
+    port = free_port()
+    folder = tmp_path_factory.mktemp("ray")
+    environment = os.environ | {"SPIKED_TEST_RAY": str(folder)}
+    words = ["--head", f"--port={port}", "--num-cpus=1", "--include-dashboard=false", "--disable-usage-stats"]
+    command = [str(Path(sys.executable).with_name("ray")), "start", *words]
+    subprocess.run(command, check=True, capture_output=True, env=environment)
+    yield f"127.0.0.1:{port}"
+    for process in psutil.process_iter():
+        with suppress(psutil.Error):
+            if process.environ().get("SPIKED_TEST_RAY") == str(folder):
+                process.kill()
+
+
+@pytest.mark.slow
+def test_a_killed_engine_leaves_no_agent_that_does_nothing(
+    daemon: Callable[..., Any],
+    moving: Path,
+    head: str,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An actor that waits for its core while the engine dies works for its attempt, or leaves, once it has the core."""
+    scratch = tmp_path_factory.mktemp("scratch")
+    monkeypatch.setenv("SPIKED_SCRATCH", str(scratch))
+    lab = Lab(daemon, moving, scratch, 30.0, engine={"executor": "ray", "executor_address": head})
+    first, second = lab.submit(LONG), lab.submit(LONG)
+    lab.reached(first, lambda row: row["version"] > 0, "it has published")
+    until(lambda: lab.attempt(second), "the other waits for the core")
+    (engine,) = lab.processes("spiked_service.cluster.engines")
+    engine.kill()
+    lab.post(f"reconstructions/{second}:cancel")
+    lab.post(f"reconstructions/{first}:cancel")
+    for job in (first, second):
+        lab.reached(job, lambda row: row["state"] == "cancelled", "it is cancelled")
+    lab.reached(lab.submit(SHORT), complete, "the core is free for another one")

@@ -17,7 +17,7 @@ from spiked_service.base.limits import ConcurrencyLimit
 from spiked_service.events.bus import Bus
 from spiked_service.operations.metrics import Metrics, MetricsSource, RingSample
 from spiked_service.settings.settings import Settings, load_settings
-from spiked_service.store.rows import ConsumerCounters, Counters
+from spiked_service.store.rows import CaptureState, ConsumerCounters, Counters, Grade, JobState
 
 from spiked.ring import DeviceState, Policy
 
@@ -25,23 +25,29 @@ DEPLOY = Path(__file__).parents[1] / "deploy"
 GPU = DEPLOY.parent / "evaluation/gpu"
 
 
-def exposed() -> set[str]:
-    """Names of all series of a service with a capture."""
+def series() -> list[tuple[str, dict[str, str]]]:
+    """Names and labels of all series of a service with a capture."""
     consumer = ConsumerCounters("recorder", Policy.PRIORITY, 8, 0, 0, 0.0, False)
     counters = Counters(DeviceState.STREAMING, "", 8, {"usb": 0}, 8, (consumer,))
     health = Health()
     health.add("disk", lambda: (CheckStatus.OK, ""))
     source = MetricsSource(
         lambda: [RingSample("a", "usb0", counters, over=False)],
-        lambda: {"streaming": 1},
-        lambda: {"queued": 1},
+        lambda: dict.fromkeys(map(str, CaptureState), 0),
+        lambda: dict.fromkeys(map(str, Grade), 0),
+        lambda: dict.fromkeys(map(str, JobState), 0),
         lambda: {"recorder": 1},
         lambda: Path("/"),
     )
     metrics = Metrics(source, Bus(), health, {"renders": ConcurrencyLimit("renders", 1)})
     metrics.request_s.labels("GET", "/", "200").observe(0.01)
     families = text_string_to_metric_families(metrics.exposition().decode())
-    return {sample.name for family in families for sample in family.samples}
+    return [(sample.name, sample.labels) for family in families for sample in family.samples]
+
+
+def exposed() -> set[str]:
+    """Names of all series of a service with a capture."""
+    return {name for name, _ in series()}
 
 
 def queried(expressions: list[str]) -> set[str]:
@@ -52,6 +58,14 @@ def test_alerts_ask_for_metrics_that_exist_and_say_what_to_do() -> None:
     rules = yaml.safe_load((DEPLOY / "prometheus/alerts.yml").read_text())["groups"][0]["rules"]
     assert queried([rule["expr"] for rule in rules]) <= exposed()
     assert all(rule["annotations"]["what_to_do"] for rule in rules)
+    there = series()
+    for rule in rules:
+        for name, label, operator, wanted in re.findall(r'(\w+)\{(\w+)(=~?)"([^"]*)"', rule["expr"]):
+            values = {labels[label] for other, labels in there if other == name}
+            asked = set(wanted.split("|")) if operator == "=~" else {wanted}
+            assert asked <= values or name in ("up", "spiked_http_request_seconds_count"), rule["alert"]
+    degraded = next(rule for rule in rules if rule["alert"] == "SpikedCapturesDegraded")
+    assert degraded["expr"] == 'sum(delta(spiked_recordings{grade=~"degraded|bad"}[1h])) > 0'
     scrape = yaml.safe_load((DEPLOY / "prometheus/prometheus.yml").read_text())
     assert all((DEPLOY / "prometheus" / name).is_file() for name in scrape["rule_files"])
 

@@ -191,7 +191,9 @@ def build_services(
         tokens=tokens,
         bus=bus,
         health=health,
-        metrics=Metrics(metrics_source_of(captures, reconstructions, folder.path), bus, health, limits),
+        metrics=Metrics(
+            metrics_source_of(captures, reconstructions, data_store.catalogue, folder.path), bus, health, limits
+        ),
         folder=folder,
         captures=captures,
         reconstructions=reconstructions,

@@ -456,7 +456,9 @@ def make_small_disk(tmp_path: Path) -> Iterator[Path]:
 
 def metrics_of(data_store: DataStore) -> str:
     """As Prometheus reads them."""
-    source = metrics_source_of(data_store.captures, data_store.reconstructions, data_store.folder.path)
+    source = metrics_source_of(
+        data_store.captures, data_store.reconstructions, data_store.catalogue, data_store.folder.path
+    )
     return Metrics(source, Bus(), Health(), {}).exposition().decode()
 
 

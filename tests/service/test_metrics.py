@@ -12,9 +12,12 @@ from spiked_service.base.limits import ConcurrencyLimit
 from spiked_service.events.bus import Bus, Topic
 from spiked_service.events.payloads import PosePayload
 from spiked_service.operations.metrics import Metrics, MetricsSource, RingSample
-from spiked_service.store.rows import ConsumerCounters, Counters
+from spiked_service.store.rows import CaptureState, ConsumerCounters, Counters, Grade
+from waiting import until
 
 from spiked.ring import DeviceState, Policy
+
+from .survival import SMALL
 
 
 def counters(received: int, lost: int = 0) -> Counters:
@@ -43,7 +46,9 @@ def scraped(metrics: Metrics) -> Scraped:
 
 def made(samples: list[RingSample], bus: Bus | None = None, health: Health | None = None) -> Metrics:
     return Metrics(
-        MetricsSource(lambda: list(samples), lambda: {"streaming": 1}, lambda: {"queued": 2}, dict, lambda: Path("/")),
+        MetricsSource(
+            lambda: list(samples), lambda: {"streaming": 1}, dict, lambda: {"queued": 2}, dict, lambda: Path("/")
+        ),
         bus or Bus(),
         health or Health(),
         {"renders": ConcurrencyLimit("renders", 3), "event_clients": ConcurrencyLimit("event clients", 5)},
@@ -78,7 +83,7 @@ def test_scrapes_at_the_same_time_count_frames_once() -> None:
         go_on.wait(10)
         yield from samples
 
-    source = MetricsSource(rings, dict, dict, dict, lambda: Path("/"))
+    source = MetricsSource(rings, dict, dict, dict, dict, lambda: Path("/"))
     metrics = Metrics(source, Bus(), Health(), {})
     first = threading.Thread(target=metrics.exposition)
     first.start()
@@ -136,3 +141,27 @@ def test_a_daemon_exposes_what_it_does(daemon: Callable[..., Any]) -> None:
     assert now(requests, method="GET", route="other", status="404") == 1
     assert now("process_resident_memory_bytes") > 10e6
     assert now("spiked_check_failed", check="zmq") == 0
+
+
+def test_failed_captures_and_degraded_recordings_are_counted_from_zero(daemon: Callable[..., Any]) -> None:
+    """An alert on a change never fires for a series that begins with one."""
+    one = daemon("--no-capture", "--device", f"{SMALL}&drop=0.01&drop_run=5", "--device", SMALL)
+
+    def now() -> Scraped:
+        return Scraped(httpx.get(f"{one.address}metrics").text)
+
+    before = now()
+    for grade in Grade:
+        assert before("spiked_recordings", grade=grade) == 0
+    for state in CaptureState:
+        assert before("spiked_captures", state=state) == 0
+    ids = []
+    for options in ("&drop=0.01&drop_run=5", ""):
+        body = {"device": SMALL + options, "frames": 4000, "reconstruct": False}
+        ids.append(one.http.post("captures", json=body).raise_for_status().json()["id"])
+        until(lambda: one.http.get(f"captures/{ids[-1]}").json()["verdict"], "its recording has been judged")
+    after = now()
+    assert after("spiked_recordings", grade="degraded") == 1 and after("spiked_recordings", grade="good") == 1
+    assert after("spiked_recordings", grade="bad") == 0 and after("spiked_captures", state="failed") == 0
+    one.http.delete(f"captures/{ids[0]}").raise_for_status()
+    assert now()("spiked_recordings", grade="degraded") == 0, "a removed one is not counted"

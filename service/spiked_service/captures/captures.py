@@ -225,10 +225,6 @@ class Captures:
             counts = [*(count for count in running if count is not None), *self._recent.rings()]
         return list({count.ring_id: count for count in counts}.values())
 
-    def counts(self) -> dict[str, int]:
-        """Number of captures by state, without removed ones."""
-        return self._catalogue.capture_counts()
-
     def recording(self, capture_id: str) -> Path:
         """Path of its `.dat`, which may not exist or still grow. Raises UnknownIdError."""
         return self._folder.recording(self._catalogue.captures.get(capture_id).id)

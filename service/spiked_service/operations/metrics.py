@@ -48,6 +48,7 @@ class MetricsSource:
     rings: Callable[[], Iterable[RingSample]]
     """Running ones, and once those that ended since the last call."""
     captures_by_state: Callable[[], dict[str, int]]
+    recordings_by_grade: Callable[[], dict[str, int]]
     reconstructions_by_state: Callable[[], dict[str, int]]
     workers_by_role: Callable[[], dict[str, int]]
     data: Callable[[], Path]
@@ -128,6 +129,7 @@ class _Collector(Collector):
         yield InfoMetricFamily("spiked_build", "Version and platform.", value=_build())
         yield from self._frames()
         yield _states("spiked_captures", "Captures by state.", self._source.captures_by_state())
+        yield _states("spiked_recordings", "Recordings by quality.", self._source.recordings_by_grade(), "grade")
         yield _states("spiked_reconstructions", "Jobs by state.", self._source.reconstructions_by_state())
         yield _states("spiked_workers", "Worker processes.", self._source.workers_by_role(), "role")
         yield from self._events()

@@ -8,11 +8,14 @@ from spiked.ring import LossCause
 from spiked_service.captures.captures import Captures
 from spiked_service.operations.metrics import MetricsSource, RingSample
 from spiked_service.reconstructions.queue import Reconstructions
+from spiked_service.store.catalogue import Catalogue
 from spiked_service.store.rows import Counters, Recorded
 from spiked_service.workers.messages import Role
 
 
-def metrics_source_of(captures: Captures, reconstructions: Reconstructions, data: Path) -> MetricsSource:
+def metrics_source_of(
+    captures: Captures, reconstructions: Reconstructions, catalogue: Catalogue, data: Path
+) -> MetricsSource:
     """The source for `Metrics`."""
     counted: set[str] = set()
 
@@ -34,7 +37,8 @@ def metrics_source_of(captures: Captures, reconstructions: Reconstructions, data
 
     return MetricsSource(
         rings=rings,
-        captures_by_state=captures.counts,
+        captures_by_state=catalogue.capture_counts,
+        recordings_by_grade=catalogue.grade_counts,
         reconstructions_by_state=lambda: {str(state): count for state, count in reconstructions.rows.counts().items()},
         workers_by_role=workers,
         data=lambda: data,

@@ -16,7 +16,15 @@ from spiked_service.store.disk_reserve import DiskReserve
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.migrations import MIGRATIONS, copy_before_migration, migrate, schema_of, written_by
 from spiked_service.store.row_copies import RowCopies
-from spiked_service.store.rows import CaptureRow, JobState, ReconstructionRow, UploadRow, VersionRow
+from spiked_service.store.rows import (
+    CaptureRow,
+    CaptureState,
+    Grade,
+    JobState,
+    ReconstructionRow,
+    UploadRow,
+    VersionRow,
+)
 
 _WAIT_S = 5.0
 """Longest wait for another process that writes the catalogue, seconds."""
@@ -181,7 +189,15 @@ class Catalogue:
 
     def capture_counts(self) -> dict[str, int]:
         """Number of captures by state, without removed ones."""
-        return dict(self.read("SELECT state, count(*) FROM captures WHERE deleted_at IS NULL GROUP BY state"))
+        found = self.read("SELECT state, count(*) FROM captures WHERE deleted_at IS NULL GROUP BY state")
+        return dict.fromkeys(map(str, CaptureState), 0) | dict(found)
+
+    def grade_counts(self) -> dict[str, int]:
+        """Number of captures by the grade of their recordings, without removed ones and those that have none."""
+        grade = "json_extract(document, '$.verdict.grade')"
+        graded = f"deleted_at IS NULL AND {grade} IS NOT NULL"
+        found = self.read(f"SELECT {grade}, count(*) FROM captures WHERE {graded} GROUP BY 1")
+        return dict.fromkeys(map(str, Grade), 0) | dict(found)
 
     def reconstruction_page(
         self, limit: int = 50, cursor: str | None = None, capture_id: str | None = None, state: JobState | None = None

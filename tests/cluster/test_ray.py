@@ -22,14 +22,14 @@ def head(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The address of a cluster with one core."""
     port = free_port()
     folder = tmp_path_factory.mktemp("ray")
-    environment = os.environ | {"SPIKED_TEST_RAY": str(folder)}
+    environment = os.environ | {"TEST_RAY_FOLDER": str(folder)}
     words = ["--head", f"--port={port}", "--num-cpus=1", "--include-dashboard=false", "--disable-usage-stats"]
     command = [str(Path(sys.executable).with_name("ray")), "start", *words]
     subprocess.run(command, check=True, capture_output=True, env=environment)
     yield f"127.0.0.1:{port}"
     for process in psutil.process_iter():
         with suppress(psutil.Error):
-            if process.environ().get("SPIKED_TEST_RAY") == str(folder):
+            if process.environ().get("TEST_RAY_FOLDER") == str(folder):
                 process.kill()
 
 

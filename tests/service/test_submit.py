@@ -1,6 +1,7 @@
 """`spiked submit` and `spiked jobs` against a running service."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -14,7 +15,9 @@ from waiting import until
 
 from spiked.errors import ConfigurationError
 
-from .survival import moving_recording
+from .survival import SMALL, moving_recording
+
+SECRET = "a-token-of-a-laboratory"
 
 
 @pytest.fixture(scope="module")
@@ -66,13 +69,49 @@ def test_a_recording_that_is_none_does_not_hold_up_the_others(daemon: Callable[.
 
 
 def test_a_token_is_read_from_a_file(daemon: Callable[..., Any], tmp_path: Path) -> None:
-    one = daemon("--token", "a-token-of-a-laboratory", "--set", "require_token=true", token="a-token-of-a-laboratory")
+    one = daemon("--token", SECRET, "--set", "require_token=true", token=SECRET)
     refused = spiked(one, "jobs")
     assert refused.returncode == 2 and "requires a token" in refused.stderr
     secret = tmp_path / "secret"
-    assert "cannot be read" in spiked(one, "jobs", "--token-file", str(secret)).stderr
-    secret.write_text("a-token-of-a-laboratory\n")
+    assert "cannot read the token" in spiked(one, "jobs", "--token-file", str(secret)).stderr
+    for content in ("", f"{SECRET}\nand another\n"):
+        secret.write_text(content)
+        assert "does not hold a token" in spiked(one, "jobs", "--token-file", str(secret)).stderr
+    secret.write_text(f"{SECRET}\n")
     assert spiked(one, "jobs", "--token-file", str(secret)).returncode == 0
+    assert "give one of them" in spiked(one, "jobs", "--token", "x", "--token-file", str(secret)).stderr
+
+
+@pytest.mark.parametrize(
+    ("environment", "works"),
+    [
+        ({}, False),
+        ({"SPIKED_CLIENT_TOKEN": SECRET}, True),
+        ({"SPIKED_TOKEN": SECRET}, True),
+        ({"SPIKED_TOKEN_FILE": "the file"}, True),
+        ({"SPIKED_TOKEN": "of-another-service", "SPIKED_CLIENT_TOKEN": SECRET}, True),
+        ({"SPIKED_TOKEN": SECRET, "SPIKED_CLIENT_TOKEN": ""}, True),
+        ({"SPIKED_TOKEN": "of-another-service"}, False),
+    ],
+)
+def test_commands_find_service_and_token_in_the_environment(
+    daemon: Callable[..., Any], tmp_path: Path, environment: dict[str, str], works: bool
+) -> None:
+    one = daemon("--no-capture", "--device", SMALL, "--token", SECRET, "--set", "require_token=true", token=SECRET)
+    (tmp_path / "token").write_text(SECRET)
+    given = {name: value.replace("the file", str(tmp_path / "token")) for name, value in environment.items()}
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("SPIKED_")}
+    for words in (("jobs",), ("record", SMALL, "--frames", "10")):
+        done = subprocess.run(
+            [sys.executable, "-m", "spiked_service", *words],
+            env={**kept, "SPIKED_ADDRESS": one.address, **given},
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=240,
+        )
+        assert (done.returncode == 0) == works, done.stderr
+        assert works or "token" in done.stderr
 
 
 def test_names_of_nothing_are_said(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import typer
 
 from spiked.client import JobState, ReconstructionOut, Spiked
 from spiked_service.cli.console import messages, output
-from spiked_service.cli.service_client import Address, TokenFile, client
+from spiked_service.cli.service_client import Address, Token, TokenFile, client
 
 _TITLES = ("job", "state", "machine", "done", "left", "recording", "")
 """Of the columns; the last one, why or where a job waits, is as long as it is."""
@@ -29,12 +29,13 @@ def listing(
     limit: Annotated[int, typer.Option(help="Most jobs, the newest.", min=1, max=100_000)] = 50,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, a job a line.")] = False,
     address: Address = None,
+    token: Token = None,
     token_file: TokenFile = None,
 ) -> None:
     """List the jobs of a running service, newest first: state, machine, progress, time left, and why one failed."""
     if context.invoked_subcommand is not None:
         return
-    with client(address, token_file) as service:
+    with client(address, token, token_file) as service:
         found = list(islice(service.reconstructions(state=state), limit))
         if as_json:
             for job in found:
@@ -50,10 +51,11 @@ def listing(
 def cancel(
     ids: Annotated[list[str], typer.Argument(help="Ids of jobs.")],
     address: Address = None,
+    token: Token = None,
     token_file: TokenFile = None,
 ) -> None:
     """End jobs that wait or run; what they have published stays."""
-    with client(address, token_file) as service:
+    with client(address, token, token_file) as service:
         for one in ids:
             service.cancel_reconstruction(one)
 

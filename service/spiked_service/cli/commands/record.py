@@ -14,8 +14,8 @@ from spiked.errors import ConfigurationError
 from spiked_service.base.signals import ending_signals, handling
 from spiked_service.cli import outputs
 from spiked_service.cli.console import messages, output, report_warning
+from spiked_service.cli.service_client import Address, Token, TokenFile, client
 from spiked_service.results.map_folder import file_name
-from spiked_service.settings.tokens import chosen_token
 
 _POLL_S = 0.25
 """Interval at which the captures are looked at, seconds."""
@@ -33,18 +33,9 @@ def record(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder that the recordings are copied to afterwards.")
     ] = None,
-    address: Annotated[str, typer.Option(help="Address of the service.")] = "http://127.0.0.1:8650",
-    token: Annotated[
-        str | None,
-        typer.Option(
-            help="Token of the service. Users of this machine see it in the list of processes: better set "
-            "SPIKED_TOKEN, or give a file.",
-            envvar="SPIKED_TOKEN",
-        ),
-    ] = None,
-    token_file: Annotated[
-        Path | None, typer.Option(help="File that holds the token.", envvar="SPIKED_TOKEN_FILE")
-    ] = None,
+    address: Address = None,
+    token: Token = None,
+    token_file: TokenFile = None,
 ) -> None:
     """Record devices of a running service together, and print how their clocks lie to each other.
 
@@ -73,14 +64,14 @@ def record(
         )
         for source in sources
     ]
-    with Spiked(address, token=chosen_token(token, token_file)) as client:
+    with client(address, token, token_file) as service:
         # The end of the terminal and SIGTERM stop the captures, as Ctrl-C does: nobody else would.
         with handling(dict.fromkeys(ending_signals(), signal.default_int_handler)):
-            run = _Run(client, plans)
+            run = _Run(service, plans)
             stopped = run.wait()
         _show(run)
         if out is not None:
-            _save(client, run.captures, out)
+            _save(service, run.captures, out)
     if status := _status(run.captures, stopped):
         raise typer.Exit(status)
 

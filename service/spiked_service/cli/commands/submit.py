@@ -9,7 +9,7 @@ from spiked.client import ReconstructionOptions, ReconstructionOut, Spiked
 from spiked.errors import SpikedError
 from spiked_service.cli.console import messages, output, report_error
 from spiked_service.cli.recording_uris import Found, find
-from spiked_service.cli.service_client import Address, TokenFile, client
+from spiked_service.cli.service_client import Address, Token, TokenFile, client
 
 
 def submit(
@@ -22,6 +22,7 @@ def submit(
     threads: Annotated[int | None, typer.Option(help="Threads of the rasteriser.", min=1)] = None,
     priority: Annotated[int, typer.Option(help="Higher ones run first.", min=-1000, max=1000)] = 0,
     address: Address = None,
+    token: Token = None,
     token_file: TokenFile = None,
 ) -> None:
     """Send recordings to a running service, and queue a reconstruction of each. Prints the ids of the jobs.
@@ -39,7 +40,7 @@ def submit(
     options = ReconstructionOptions.model_validate({name: value for name, value in given.items() if value is not None})
     found = find(recordings)
     failed = 0
-    with client(address, token_file) as service:
+    with client(address, token, token_file) as service:
         for one in found:
             try:
                 job = _submit(service, one, options, priority)

@@ -17,6 +17,8 @@ from spiked.sensor import Sensor
 
 __all__ = ["Trajectory", "colmap_camera", "colmap_lines", "kitti_lines", "nerfstudio_lines", "tum_lines", "tum_tables"]
 
+BRIDGED_S = 0.03
+"""Longest time between views over which the path is interpolated: hand tremor has about 10 Hz."""
 _LINES = 16_384
 """Lines of text in memory at a time."""
 

@@ -11,12 +11,11 @@ from spiked.errors import ConfigurationError, SceneError
 from spiked.frame_of_reference import FrameOfReference, KnownScale
 from spiked.pose import exp_so3, log_so3
 from spiked.recon.statistics import evenly
-from spiked.recon.view_tracking import BRIDGED_S
 from spiked.recording import Recording
 from spiked.render import Camera
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
-from spiked.trajectory import Trajectory
+from spiked.trajectory import BRIDGED_S, Trajectory
 
 __all__ = ["ExportOptions", "ExportSource"]
 

@@ -144,7 +144,7 @@ class Reconstructor:
     def track_latest(self, first_frame: int, frames: NDArray[np.uint8]) -> None:
         """Skip backlog: track one view in the middle of stored frames, uint8 [n, frame_bytes], not those before.
 
-        For tracking that cannot keep up with the camera. Over up to `view_tracking.BRIDGED_S` the path is interpolated.
+        For tracking that cannot keep up with the camera. Over up to `trajectory.BRIDGED_S` the path is interpolated.
         """
         with self._log.measure("tracking"), one_blas_thread():
             self._after_tracking(self._tracker.track_latest(first_frame, frames))

@@ -24,9 +24,8 @@ from spiked.recon.view_choice import choose
 from spiked.recon.view_store import ViewStore
 from spiked.sensor import Intrinsics, Response, Sensor
 from spiked.spline import Path, Waypoints
+from spiked.trajectory import BRIDGED_S
 
-BRIDGED_S = 0.03
-"""Longest time between views over which the path is interpolated: hand tremor has about 10 Hz."""
 KEYFRAME_SHARE = 0.125
 """Share of `Options.memory_mb` for the images of keyframes: a byte a pixel, while those of views take three or more."""
 LEAST_VIEWS = 10

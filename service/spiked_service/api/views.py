@@ -11,10 +11,10 @@ from spiked.camera import Pinhole
 from spiked.errors import ConfigurationError
 from spiked.pose import quaternion
 from spiked.poses import PoseFile
-from spiked.recon.view_tracking import BRIDGED_S
 from spiked.render import Camera
 from spiked.sensor import Intrinsics, Sensor
 from spiked.spline import Waypoints
+from spiked.trajectory import BRIDGED_S
 from spiked_service.api.problems import NoPoseError, NotReadyError
 from spiked_service.api.results import Result
 from spiked_service.api.schemas.views import MAX_PIXELS, PathModel, PointOut, ViewRequest

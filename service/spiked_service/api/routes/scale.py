@@ -9,10 +9,10 @@ from spiked.board import Board
 from spiked.board_scale import scale_by_board
 from spiked.errors import ConfigurationError, RecordingError
 from spiked.frame_of_reference import FrameOfReference
-from spiked.recon.view_tracking import BRIDGED_S
 from spiked.render import Camera
 from spiked.scene import Scene
 from spiked.tag_scale import VIEWS, scale_by_tags
+from spiked.trajectory import BRIDGED_S
 from spiked.upright import find_floor, up_by_gravity, up_by_points
 from spiked_service.api.idempotency import IdempotencyKey
 from spiked_service.api.problems import ConflictError, NoPoseError, problems

@@ -12,8 +12,8 @@ from spiked.board import DICTIONARIES, Board
 from spiked.board_scale import scale_by_board
 from spiked.errors import ConfigurationError
 from spiked.frame_of_reference import FrameOfReference
-from spiked.recon.view_tracking import BRIDGED_S
 from spiked.tag_scale import TAG_FAMILIES, scale_by_tags
+from spiked.trajectory import BRIDGED_S
 from spiked.upright import find_floor, up_by_gravity, up_by_points
 from spiked.whole_files import whole_folder
 from spiked_service.cli import outputs

@@ -75,15 +75,26 @@ class RayTasks:
         )
         found = []
         for task in done:
-            reason = "the agent has ended without a result"
+            attempt, reason = self._running.pop(task), "the agent has ended without a result"
             try:
                 ray.get(task)
+            except ray.exceptions.ActorUnavailableError:  # its machine does not answer, for now
+                if self._watch(attempt):
+                    continue
             except ray.exceptions.ActorDiedError:
                 pass  # as at the end of every attempt
             except ray.exceptions.RayError as error:
                 reason = f"Ray has ended it: {type(error).__name__}"
-            found.append((self._running.pop(task), reason))
+            found.append((attempt, reason))
         return found
+
+    def _watch(self, attempt: str) -> bool:
+        """Wait for the end of an actor that exists. Return whether it does."""
+        try:
+            self._running[ray.get_actor(attempt).wait.remote()] = attempt
+        except ValueError:
+            return False
+        return True
 
 
 def tasks(options: EngineOptions) -> RayTasks:

@@ -1,6 +1,7 @@
 """Jobs on other machines, with submitit's local executor: agents are real processes, files go through a real store."""
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -357,6 +358,15 @@ def test_a_killed_engine_costs_no_attempt_that_has_begun(lab: Lab) -> None:
     lab.post(f"reconstructions/{job}:cancel")
     lab.reached(job, lambda now: now["state"] == "cancelled", "it is cancelled")
     until(lab.nothing_left, "nothing is left, though the new engine does not know it")
+    folders = Path(lab.one.data) / "cluster" / "submitit"
+    until(lambda: len(list(folders.glob("[0-9]*"))) == 1, "only the folder of the first engine's agent is left")
+    old = folders / "1"
+    old.mkdir()
+    os.utime(old, (0, 0))
+    (engine,) = lab.processes("spiked_service.cluster.engines")
+    engine.kill()
+    lab.reached(lab.submit(SHORT), complete, "one runs by a third engine")
+    until(lambda: not list(folders.glob("[0-9]*")), "the folders of jobs that have ended are removed")
 
 
 def test_a_job_waits_for_as_long_as_its_engine_dies(lab: Lab) -> None:

@@ -1,7 +1,9 @@
 """Agents as jobs of Slurm, or as processes of this machine, by submitit."""
 
 import shutil
+import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,9 @@ import submitit
 
 from spiked_service.cluster.agent import run_agent
 from spiked_service.cluster.engine import EngineOptions
+
+_OLD_S = 14 * 86_400.0
+"""Age of a folder whose job has surely ended, or been replaced by another attempt."""
 
 
 class SubmititTasks:
@@ -24,6 +29,7 @@ class SubmititTasks:
             | given
         )
         self._jobs: dict[str, Any] = {}
+        self._remove_old()
 
     def submit(self, attempt: str, arguments: Sequence[str]) -> None:
         """Submit the job; Slurm waits for the resources."""
@@ -36,6 +42,14 @@ class SubmititTasks:
             if not job.done():
                 job.cancel()
             shutil.rmtree(job.paths.folder, ignore_errors=True)
+
+    def _remove_old(self) -> None:
+        """Remove the folders of jobs of earlier engines that have ended: with a result, or long ago."""
+        for folder in self._folder.glob("[0-9]*/"):
+            with suppress(FileNotFoundError):  # the job removes files of its own
+                old_s = time.time() - folder.stat().st_mtime
+                if any(folder.glob("*_result.pkl")) or old_s > _OLD_S:
+                    shutil.rmtree(folder, ignore_errors=True)
 
     def ended(self) -> list[tuple[str, str]]:
         """Attempts whose jobs have ended, in whatever way."""

@@ -13,7 +13,7 @@ from spiked.distortion import Distortion, LensModel
 from spiked.errors import ConfigurationError
 from spiked.native import _gpu
 from spiked.render import Camera, Rasteriser, gpu
-from spiked.render.descent import Descent, DeviceDescent
+from spiked.render.descent import Descent, DeviceDescent, descent_for
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Mosaic
 
@@ -204,8 +204,9 @@ def test_descent_on_the_device(device: str) -> None:
                 fits[i].join(more)
             if turn == 5:
                 fits[i].select(keep)
-            if turn == 6:
+            if turn == 6:  # where a checkpoint is read decides where it goes on
                 fits[i] = pickle.loads(pickle.dumps(fits[i]))
+                assert type(fits[i]) is type(descent_for(case.splats, 0.9, 0.99))
             rasteriser.forward_moving(fits[i].model, case.rotations, case.centres, case.windows)
             fits[i].step(rasteriser, slopes, rates, most)
         assert len(fits[0].model) == len(fits[1].model)

@@ -24,9 +24,6 @@ class Descent:
         """Go on with another scene, without moments."""
         self._restart(scene)
 
-    def __reduce__(self) -> tuple[object, ...]:
-        return _restored, (self.scene, *self._settings, self.adam)
-
     def _restart(self, scene: Scene) -> None:
         beta1, beta2, threads = self._settings
         self._scene = scene
@@ -46,6 +43,12 @@ class Descent:
     def opacity_logits(self) -> Floats:
         """Of the scene, [N]."""
         return self._scene.opacity_logits
+
+    def moved(self) -> "Descent":
+        """The same by the renderer that is `chosen`: it may be another one than where this was pickled."""
+        fit = descent_for(self.scene, *self._settings)
+        fit.adam = self.adam
+        return fit
 
     def join(self, splats: Scene) -> None:
         """Add splats, without moments."""
@@ -80,6 +83,10 @@ class DeviceDescent(Descent):
         self._behind = False
         """The scene here is older than the one on the device."""
         super().__init__(scene, beta1, beta2, threads)
+
+    def __getstate__(self) -> dict[str, object]:
+        self._fetch()
+        return vars(self) | {"_device": None}
 
     def adopt(self, scene: Scene) -> None:
         """See `Descent.adopt`."""
@@ -152,13 +159,6 @@ class DeviceDescent(Descent):
         self._restart(Scene(means, quats, log_scales, logits, colour, self._scene.white))
         self.adam.unpack(first, second, taken)
         self._behind = False
-
-
-def _restored(scene: Scene, beta1: float, beta2: float, threads: int | None, adam: Adam) -> Descent:
-    """What was pickled, perhaps where another renderer was the best."""
-    fit = descent_for(scene, beta1, beta2, threads)
-    fit.adam = adam
-    return fit
 
 
 def descent_for(scene: Scene, beta1: float, beta2: float, threads: int | None = None) -> Descent:

@@ -1,19 +1,24 @@
 """Schedule, densification, seeding, losses and render requests of the map, each by itself."""
 
+import pickle
+
 import numpy as np
 import pytest
 
 from spiked.recon.frontend.windowing import luminance
 from spiked.recon.mapping.densification import DensifyStrategy
 from spiked.recon.mapping.loss import RateLoss
+from spiked.recon.mapping.mapper import BETAS, Mapper
+from spiked.recon.mapping.options import MapOptions
 from spiked.recon.mapping.pyramid import Target
 from spiked.recon.mapping.render_requests import RenderPlanner
 from spiked.recon.mapping.schedule import Schedule
 from spiked.recon.mapping.seeding import Seeding, isotropic_splats
 from spiked.render import Camera
+from spiked.render.descent import DeviceDescent, descent_for
 from spiked.render.loss import dssim
 from spiked.scene import Scene
-from spiked.sensor import Intrinsics, Mosaic
+from spiked.sensor import Intrinsics, Mosaic, Sensor
 
 CAMERA = Camera(Intrinsics(200.0, 200.0, 80.0, 50.0), 160, 100)
 
@@ -150,3 +155,12 @@ def test_image_motion_is_that_of_the_median_depth() -> None:
     planner.depth = 4.0
     nearer = planner.motion_px(np.eye(3), np.zeros(3), np.eye(3), np.array([0.1, 0, 0]))
     assert nearer == pytest.approx(moved / 2)
+
+
+def test_a_map_of_a_gpu_goes_on_with_the_renderer_that_is_here() -> None:
+    sensor = Sensor(64, 40, 20_000.0, intrinsics=Intrinsics(60, 60, 32, 20))
+    mapper = Mapper(sensor, Camera(sensor.intrinsics, 64, 40), MapOptions(), seed=0)
+    mapper.descent = DeviceDescent(scene([0.5, 1.0]), *BETAS)
+    back = pickle.loads(pickle.dumps(mapper))
+    assert type(back.descent) is type(descent_for(back.scene, *BETAS))
+    np.testing.assert_array_equal(back.scene.opacity_logits, mapper.scene.opacity_logits)

@@ -74,6 +74,10 @@ class Mapper:
         self._rng = np.random.default_rng(seed)
         self._losses: dict[int, float] = {}
 
+    def __setstate__(self, state: dict[str, object]) -> None:
+        vars(self).update(state)
+        self.descent = self.descent.moved()
+
     def __len__(self) -> int:
         """The number of splats."""
         return len(self.descent.model)

@@ -4,37 +4,22 @@ A step is forward, backward and Adam for one colour; images and their gradients 
 and stay on the device in gsplat's, which makes no step of Adam.
 """
 
-import time
-from collections.abc import Callable
-
-import numpy as np
-
-from spiked.render import Rasteriser, gpu
-from spiked.render.benchmark import SIZES, Size, passing, scene
-from spiked.render.descent import Descent, DeviceDescent
-from spiked.scene import Scene
+from spiked.measurement import repeated
+from spiked.render import gpu
+from spiked.render.benchmark import SIZES, Size, scene, steps_with_adam
 
 STEPS = 50
-RATES = (1e-9,) * 5
 
 
-def median_ms(step: Callable[[], object]) -> float:
-    """Of `STEPS` calls, after five."""
-    times = []
-    for _ in range(STEPS + 5):
-        begin = time.perf_counter()
-        step()
-        times.append(time.perf_counter() - begin)
-    return 1e3 * float(np.median(times[5:]))
-
-
-def gsplat_ms(size: Size, splats: Scene, focal: float) -> float | None:
+def gsplat_ms(size: Size) -> float | None:
     """Forward and backward of gsplat with everything on the device; None where it is not installed."""
     try:
         import gsplat
         import torch
     except ImportError:
         return None
+    camera, splats = scene(size)
+    focal = camera.intrinsics.fx
     leaves = [torch.tensor(array, device="cuda", requires_grad=True) for array in splats.arrays()]
     means, quats, log_scales, logits, colour = leaves
     view = torch.eye(4, device="cuda")[None]
@@ -47,29 +32,13 @@ def gsplat_ms(size: Size, splats: Scene, focal: float) -> float | None:
         values.sum().backward()
         torch.cuda.synchronize()
 
-    return median_ms(step)
+    return 1e3 * repeated(step, STEPS).median_s
 
 
 def measure(size: Size, sub_frames: int) -> None:
     """One line; 0 sub-frames: a camera that stands still."""
-    camera, splats = scene(size)
-    slope = np.full((size.height, size.width), 1e-6, np.float32)
-    rotations, centres = passing(camera, sub_frames + 1) if sub_frames else (np.eye(3)[None], np.zeros((1, 3)))
-    windows = np.zeros((2, size.height, size.width), np.float32)
-    windows[1] = sub_frames
-    times = []
-    for rasteriser, kind in ((gpu.GpuRasteriser(camera), DeviceDescent), (Rasteriser(camera), Descent)):
-        fit = kind(splats.select(np.arange(len(splats))), 0.9, 0.99)
-
-        def step(rasteriser: Rasteriser = rasteriser, fit: Descent = fit) -> None:
-            if sub_frames:
-                rasteriser.forward_moving(fit.model, rotations, centres, windows)  # type: ignore[arg-type]
-            else:
-                rasteriser.forward(fit.model, rotations, centres)  # type: ignore[arg-type]
-            fit.step(rasteriser, slope, RATES, np.float32(9))
-
-        times.append(median_ms(step))
-    theirs = None if sub_frames else gsplat_ms(size, splats, camera.intrinsics.fx)
+    times = [1e3 * timing.median_s for _, timing in steps_with_adam(size, STEPS, sub_frames)]
+    theirs = None if sub_frames else gsplat_ms(size)
     print(
         f"{size.splats} splats, {size.width}x{size.height}, {sub_frames} sub-frames: {times[0]:.2f} ms a step, "
         f"CPU {times[1]:.1f} ms" + ("" if theirs is None else f", gsplat {theirs:.2f} ms"),

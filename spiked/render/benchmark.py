@@ -116,10 +116,24 @@ def _steps(size: Size, repetitions: int, peak: float) -> list[Measurement]:
 
 
 def on_device(size: Size, repetitions: int, device: Literal["cuda", "emulated"] = "cuda") -> Measurement:
-    """A step with Adam, splats on a GPU, image and gradient in main memory, beside that of all cores."""
+    """`steps_with_adam` as a row."""
+    (instructions, gpu), (_, cpu) = steps_with_adam(size, repetitions, device=device)
+    name = f"step with Adam, {size.splats // 1000}k splats, {size.width}x{size.height}, {instructions}"
+    return Measurement(name, gpu.best_s * 1e3, "ms", gpu.best_s / cpu.best_s, "of all cores' step", "", gpu.spread)
+
+
+def steps_with_adam(
+    size: Size, repetitions: int, sub_frames: int = 0, device: Literal["cuda", "emulated"] = "cuda"
+) -> list[tuple[str, Timing]]:
+    """Steps with Adam, splats on a GPU, image and gradient in main memory, and those of all cores, by what does them.
+
+    0 sub-frames: the camera stands still.
+    """
     camera, splats = scene(size)
-    pose = np.eye(3)[None], np.zeros((1, 3))
+    poses = passing(camera, sub_frames + 1)
     slope = np.full((size.height, size.width), 1e-6, np.float32)
+    windows = np.zeros((2, *slope.shape), np.float32)
+    windows[1] = sub_frames
     fits: tuple[tuple[Rasteriser, Descent], ...] = (
         (GpuRasteriser(camera, device=device), DeviceDescent(splats, *BETAS)),
         (Rasteriser(camera), Descent(splats.select(np.arange(len(splats))), *BETAS)),
@@ -127,14 +141,15 @@ def on_device(size: Size, repetitions: int, device: Literal["cuda", "emulated"] 
 
     def timed(rasteriser: Rasteriser, fit: Descent) -> Timing:
         def step() -> None:
-            rasteriser.forward(fit.model, *pose)
+            if sub_frames:
+                rasteriser.forward_moving(fit.model, *poses, windows)
+            else:
+                rasteriser.forward(fit.model, *poses)
             fit.step(rasteriser, slope, (1e-9,) * 5, np.float32(np.inf))
 
         return repeated(step, repetitions)
 
-    gpu, cpu = (timed(*one) for one in fits)
-    name = f"step with Adam, {size.splats // 1000}k splats, {size.width}x{size.height}, {fits[0][0].instructions}"
-    return Measurement(name, gpu.best_s * 1e3, "ms", gpu.best_s / cpu.best_s, "of all cores' step", "", gpu.spread)
+    return [(rasteriser.instructions, timed(rasteriser, fit)) for rasteriser, fit in fits]
 
 
 def passing(

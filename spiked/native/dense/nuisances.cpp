@@ -1,6 +1,5 @@
 // Evidence of the brightness of a view and of the gains of pixels, see spiked/recon/mapping/photometric.py.
 #include <cmath>
-#include <stdexcept>
 
 #include "../common/arrays.hpp"
 #include "../common/clones.hpp"
@@ -12,8 +11,7 @@ namespace {
 using Image = Array<const float, 2>;
 
 void expect_alike(size_t height, size_t width, std::initializer_list<const Image*> images) {
-    for (const Image* one : images)
-        if (one->shape(0) != height || one->shape(1) != width) throw std::invalid_argument("images must be alike");
+    for (const Image* one : images) expect(one->shape(0) == height && one->shape(1) == width, "images must be alike");
 }
 
 struct Light {
@@ -63,7 +61,7 @@ void gain_evidence(const Image& gain, const Image& rendered, const Image& observ
                    float model_error, const Array<float, 2>& xx, const Array<float, 2>& xy) {
     const size_t height = gain.shape(0), width = gain.shape(1);
     expect_alike(height, width, {&rendered, &observed, &deviation});
-    if (xx.size() != height * width || xy.size() != height * width) throw std::invalid_argument("images must be alike");
+    expect(xx.size() == height * width && xy.size() == height * width, "images must be alike");
     add_evidence(gain.data(), rendered.data(), observed.data(), deviation.data(), static_cast<int64_t>(height * width),
                  level, model_error, xx.data(), xy.data());
 }

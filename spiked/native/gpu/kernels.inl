@@ -30,6 +30,17 @@ struct Entry {
     float p, q, s, r, t, log2_opacity, z, u_rate, w_rate, colour[3];
 };
 
+// Of an entry at a pixel, with its u and w there.
+template <bool Moving>
+SPIKED_DEVICE inline float log2_alpha_at(const Entry& s, float x, float y, float time, float& u, float& w) {
+    u = s.p * x + (s.q * y + s.s), w = s.r * y + s.t;
+    if constexpr (Moving) {
+        u -= s.u_rate * time;
+        w -= s.w_rate * time;
+    }
+    return (s.log2_opacity - u * u) - w * w;
+}
+
 struct Scene {
     PinholeF camera;
     Prepared prepared;
@@ -330,12 +341,8 @@ struct Forward {
                 if (!pixel.open) return;
                 for (int i = 0; i < count; ++i) {
                     const Entry& s = entries[i];
-                    float u = s.p * pixel.x + (s.q * pixel.y + s.s), w = s.r * pixel.y + s.t;
-                    if (Moving) {
-                        u -= s.u_rate * pixel.time;
-                        w -= s.w_rate * pixel.time;
-                    }
-                    const float log2_alpha = (s.log2_opacity - u * u) - w * w;
+                    float u, w;
+                    const float log2_alpha = log2_alpha_at<Moving>(s, pixel.x, pixel.y, pixel.time, u, w);
                     if (!(log2_alpha >= -kLog2Cut)) continue;
                     const float share = fminf(exp2f(log2_alpha), kAlphaCap) * pixel.t;
                     pixel.t -= share;
@@ -479,12 +486,8 @@ struct Backward {
     SPIKED_DEVICE static bool add_pixel(const Entry& s, Pixel& pixel, bool open, Sums<float, kSlot>& out) {
         out = {};
         if (!open) return false;
-        float u = s.p * pixel.x + (s.q * pixel.y + s.s), w = s.r * pixel.y + s.t;
-        if (Moving) {
-            u -= s.u_rate * pixel.time;
-            w -= s.w_rate * pixel.time;
-        }
-        const float log2_alpha = (s.log2_opacity - u * u) - w * w;
+        float u, w;
+        const float log2_alpha = log2_alpha_at<Moving>(s, pixel.x, pixel.y, pixel.time, u, w);
         if (!(log2_alpha >= -kLog2Cut)) return false;
         const float uncapped = exp2f(log2_alpha), alpha = fminf(uncapped, kAlphaCap), share = alpha * pixel.t;
         float shown = 0, by_colour[C];

@@ -24,15 +24,7 @@ namespace {
 
 constexpr uint64_t kMaxPairs = 1u << 30;  // of a splat and a tile
 
-View view_of_pose(const double* rotation, const double* centre) {
-    View view;
-    for (int i = 0; i < 3; ++i) {
-        for (int j = 0; j < 3; ++j) view.rotation[3 * i + j] = static_cast<float>(rotation[3 * j + i]);
-        view.centre_high[i] = static_cast<float>(centre[i]);
-        view.centre_low[i] = static_cast<float>(centre[i] - view.centre_high[i]);
-    }
-    return view;
-}
+uint64_t blocks_of(uint64_t threads, int of_block) { return (threads + of_block - 1) / of_block; }
 
 // call(std::true_type or std::false_type), by the value.
 template <class Call>
@@ -118,7 +110,7 @@ class Resident final : public GpuScene {
             using Kernel = TakeRows<std::remove_reference_t<decltype(*array.data())>>;
             const uint64_t elements = static_cast<uint64_t>(count) * columns;
             device_.run(Kernel{array.data(), spare.grow(elements), rows, elements, columns},
-                        (elements + Kernel::kThreads - 1) / Kernel::kThreads);
+                        blocks_of(elements, Kernel::kThreads));
             array.swap(spare);
         };
         rearranged(means_, spare_, 3);
@@ -181,7 +173,7 @@ class Passes final : public GpuRenderer {
     void descend(const float* d_values, GpuScene& scene, const DescentRates& rates) override {
         differentiate(d_values);
         device_.run(static_cast<Resident<Device>&>(scene).step(gradients_, rates),
-                    blocks(splats_.count, Descend::kThreads));
+                    blocks_of(splats_.count, Descend::kThreads));
         device_.finish();
     }
 
@@ -220,7 +212,6 @@ class Passes final : public GpuRenderer {
     int tiles() const { return camera_.tiles_x * camera_.tiles_y; }
     size_t pixels() const { return static_cast<size_t>(camera_.width) * camera_.height; }
     size_t records() const { return static_cast<size_t>(splats_.count) * sub_poses_; }
-    static uint64_t blocks(uint64_t threads, int of_block) { return (threads + of_block - 1) / of_block; }
 
     // Brings the splats to the device.
     void take(const SplatArrays& splats) {
@@ -240,7 +231,7 @@ class Passes final : public GpuRenderer {
         moving_ = views.start != nullptr;
         sub_poses_ = moving_ ? views.count - 1 : views.count;
         std::vector<View> poses(views.count);
-        for (int i = 0; i < views.count; ++i) poses[i] = view_of_pose(views.rotations + 9 * i, views.centres + 3 * i);
+        for (int i = 0; i < views.count; ++i) poses[i] = view_of(views.rotations + 9 * i, views.centres + 3 * i);
         tiles_ = {};
         tiles_.camera = camera_;
         tiles_.sub_poses = sub_poses_;
@@ -258,7 +249,7 @@ class Passes final : public GpuRenderer {
         for (int k = 0; k < 3; ++k, at += n) scene_.prepared.mean[k] = prepare.mean[k] = at;
         for (int k = 0; k < 9; ++k, at += n) scene_.prepared.spread[k] = prepare.spread[k] = at;
         scene_.prepared.log2_opacity = prepare.log2_opacity = at;
-        device_.run(prepare, blocks(n, Prepare::kThreads));
+        device_.run(prepare, blocks_of(n, Prepare::kThreads));
         if (moving_)
             device_.run(SetSubFrames{scene_.poses, tiles_.begin, tiles_.end, static_cast<int64_t>(pixels())},
                         sub_poses_);
@@ -269,7 +260,7 @@ class Passes final : public GpuRenderer {
         const Project<Bent, Moving> kernel{scene_, records_.grow(records()),
                                            Moving ? motions_.grow(records()) : nullptr, keys_.grow(records()),
                                            order_.grow(records())};
-        device_.run(kernel, blocks(records(), kernel.kThreads));
+        device_.run(kernel, blocks_of(records(), kernel.kThreads));
         tiles_.records = kernel.records;
         tiles_.motions = kernel.motions;
     }
@@ -283,7 +274,7 @@ class Passes final : public GpuRenderer {
         device_.sort(keys_.data(), sorted, order_.data(), order, count, 32);
         uint64_t *reached = counts_.grow(count + 1), *first = first_pairs_.grow(count + 1);
         device_.run(CountTiles{camera_, tiles_.records, sorted, order, static_cast<uint32_t>(count), reached},
-                    blocks(count + 1, CountTiles::kThreads));
+                    blocks_of(count + 1, CountTiles::kThreads));
         device_.add_up(reached, first, count + 1);
         uint64_t pairs = 0;
         device_.download(&pairs, first + count, 1);
@@ -297,14 +288,14 @@ class Passes final : public GpuRenderer {
             ListPairs{camera_, tiles_.records, order, first, static_cast<uint32_t>(count),
                       static_cast<uint32_t>(splats_.count), pair_tiles_.grow(pairs_ + 1), pair_.grow(pairs_ + 1),
                       pair_record_.grow(pairs_ + 1), first_of_record_.grow(count), pairs_of_record_.grow(count)},
-            blocks(count, ListPairs::kThreads));
+            blocks_of(count, ListPairs::kThreads));
         int bits = 1;
         while (all_tiles >> bits) ++bits;
         uint32_t *by_tile = sorted_tiles_.grow(pairs_ + 1), *listed = sorted_pairs_.grow(pairs_ + 1);
         device_.sort(pair_tiles_.data(), by_tile, pair_.data(), listed, pairs_, bits);
         uint32_t* start = tile_start_.grow(all_tiles + 1);
         device_.run(FindTiles{by_tile, pairs_, all_tiles, start},
-                    blocks(static_cast<uint64_t>(pairs_) + 1, FindTiles::kThreads));
+                    blocks_of(static_cast<uint64_t>(pairs_) + 1, FindTiles::kThreads));
         tiles_.start = start;
         tiles_.pairs = listed;
         tiles_.pair_record = pair_record_.data();
@@ -338,7 +329,7 @@ class Passes final : public GpuRenderer {
         GradientArrays& out = gradients_;
         part(out.means, 3), part(out.quats, 4), part(out.log_scales, 3), part(out.opacity_logits, 1);
         part(out.colour, c), part(out.contribution, 1), part(out.radius_px, 1);
-        const uint64_t count = blocks(n, Kernel::kThreads);
+        const uint64_t count = blocks_of(n, Kernel::kThreads);
         double* partial = partial_.grow(count * poses_ * 6 + 1);
         device_.run(Kernel{scene_, first_of_record_.data(), pairs_of_record_.data(), keys_.data(), tiles_.records,
                            slots_.data(), slot_floats(splats_.colours, Moving), out, partial, poses_},

@@ -15,16 +15,6 @@ constexpr int kAhead = 16;  // splats; covers the latency of main memory
 
 int chunks_of(int count) { return (count + kChunk - 1) / kChunk; }
 
-View view_of(const double* rotation, const double* centre) {
-    View view;
-    for (int i = 0; i < 3; ++i) {
-        for (int j = 0; j < 3; ++j) view.rotation[3 * i + j] = static_cast<float>(rotation[3 * j + i]);
-        view.centre_high[i] = static_cast<float>(centre[i]);
-        view.centre_low[i] = static_cast<float>(centre[i] - view.centre_high[i]);
-    }
-    return view;
-}
-
 }  // namespace
 
 Renderer::Renderer(const PinholeF& camera, int threads)

@@ -9,6 +9,16 @@
 
 namespace spiked {
 
+inline View view_of(const double* rotation, const double* centre) {
+    View view;
+    for (int i = 0; i < 3; ++i) {
+        for (int j = 0; j < 3; ++j) view.rotation[3 * i + j] = static_cast<float>(rotation[3 * j + i]);
+        view.centre_high[i] = static_cast<float>(centre[i]);
+        view.centre_low[i] = static_cast<float>(centre[i] - view.centre_high[i]);
+    }
+    return view;
+}
+
 // State of one sub-pose, or of one sub-frame of a moving camera, that the backward pass reuses.
 struct SubPose {
     View view;

@@ -22,6 +22,14 @@ def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture
+def scratch(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of the agents of this test."""
+    folder = tmp_path_factory.mktemp("scratch")
+    monkeypatch.setenv("SPIKED_SCRATCH", str(folder))
+    return folder
+
+
 @pytest.fixture(scope="session")
 def bucket() -> Iterator[str]:
     """The URI of a bucket of a server of this process, whose address is in the environment."""

@@ -127,12 +127,9 @@ def lab(
     request: pytest.FixtureRequest,
     daemon: Callable[..., Any],
     moving: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-    monkeypatch: pytest.MonkeyPatch,
+    scratch: Path,
 ) -> Iterator[Lab]:
     """A lab; its parameter is the lease in seconds."""
-    scratch = tmp_path_factory.mktemp("scratch")
-    monkeypatch.setenv("SPIKED_SCRATCH", str(scratch))
     one = Lab(daemon, moving, scratch, getattr(request, "param", LEASE_S))
     yield one
     for process in one.agents():
@@ -145,12 +142,9 @@ def far_lab(
     daemon: Callable[..., Any],
     moving: Path,
     bucket: str,
-    tmp_path_factory: pytest.TempPathFactory,
-    monkeypatch: pytest.MonkeyPatch,
+    scratch: Path,
 ) -> Lab:
     """A lab whose machines share no folder with it, but a bucket."""
-    scratch = tmp_path_factory.mktemp("scratch")
-    monkeypatch.setenv("SPIKED_SCRATCH", str(scratch))
     return Lab(daemon, moving, scratch, LEASE_S, f"{bucket}/far-lab")
 
 

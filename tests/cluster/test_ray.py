@@ -38,12 +38,9 @@ def test_an_actor_that_waited_while_its_engine_ended_works_for_its_attempt(
     daemon: Callable[..., Any],
     moving: Path,
     head: str,
-    tmp_path_factory: pytest.TempPathFactory,
-    monkeypatch: pytest.MonkeyPatch,
+    scratch: Path,
 ) -> None:
     """One that does nothing would hold its core for ever."""
-    scratch = tmp_path_factory.mktemp("scratch")
-    monkeypatch.setenv("SPIKED_SCRATCH", str(scratch))
     lab = Lab(daemon, moving, scratch, 30.0, engine={"executor": "ray", "executor_address": head})
     first, second = lab.submit(LONG), lab.submit(SHORT)
     lab.reached(first, lambda row: row["version"] > 0, "it has published")

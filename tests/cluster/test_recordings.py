@@ -1,7 +1,6 @@
 """One copy of a recording in the store, and one on each machine, for all jobs that read it."""
 
 import multiprocessing
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from spiked_service.cluster.messages import StoredFile
 from spiked_service.cluster.object_store import ObjectStore, ObjectStoreError, stored_file
 from spiked_service.cluster.recording_cache import RecordingCache
 from spiked_service.cluster.shared_recordings import SharedRecordings
+from waiting import meanwhile
 
 from spiked.recording import Durability, RecordingWriter, index_path
 from spiked.sensor import Sensor
@@ -111,23 +111,13 @@ def test_a_recording_stays_while_an_attempt_reads_it_and_goes_afterwards(capture
 
 
 def test_sweeps_and_jobs_that_begin_do_not_disturb_each_other(capture: Path, tmp_path: Path) -> None:
-    store, over = ObjectStore(f"{tmp_path.as_uri()}/store"), threading.Event()
+    store = ObjectStore(f"{tmp_path.as_uri()}/store")
     recordings = SharedRecordings(store, keep_s=0)
-
-    def sweep() -> None:
-        while not over.is_set():
-            recordings.sweep()
-
-    thread = threading.Thread(target=sweep)
-    thread.start()
-    try:
+    with meanwhile(recordings.sweep):
         for number in range(100):
             for stored in recordings.hold(capture, f"{number}"):
                 assert store.get(stored.sha256) == (capture / stored.name).read_bytes()
             recordings.release(f"{number}")
-    finally:
-        over.set()
-        thread.join()
 
 
 @pytest.mark.parametrize("name", ["recording.dat", "recording.json"])

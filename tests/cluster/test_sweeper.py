@@ -10,7 +10,7 @@ from spiked_service.cluster.job_files import OUTPUTS
 from spiked_service.cluster.object_store import ObjectStore
 from spiked_service.cluster.shared_recordings import SharedRecordings
 from spiked_service.cluster.sweeper import Sweeper
-from waiting import until
+from waiting import meanwhile, until
 
 
 @pytest.fixture(params=["folder", "bucket"])
@@ -37,7 +37,6 @@ def test_only_what_is_over_is_swept(store: ObjectStore) -> None:
 
 def test_an_attempt_that_begins_and_stores_during_sweeps_loses_nothing(store: ObjectStore) -> None:
     job, alive, lock = new_id(), set[str](), threading.Lock()
-    over = threading.Event()
 
     def is_alive(attempt: str) -> bool:
         with lock:
@@ -45,13 +44,7 @@ def test_an_attempt_that_begins_and_stores_during_sweeps_loses_nothing(store: Ob
 
     sweeper = sweeper_of(store, is_alive)
 
-    def sweep() -> None:
-        while not over.is_set():
-            sweeper.sweep()
-
-    thread = threading.Thread(target=sweep)
-    thread.start()
-    try:
+    with meanwhile(sweeper.sweep):
         for _ in range(20):
             attempt = new_id()
             with lock:
@@ -62,9 +55,6 @@ def test_an_attempt_that_begins_and_stores_during_sweeps_loses_nothing(store: Ob
             assert all(mine.get(f"{OUTPUTS}/{number}") == b"content" for number in range(5))
             with lock:
                 alive.discard(attempt)
-    finally:
-        over.set()
-        thread.join()
     sweeper.sweep()
     assert store.folders() == []
 

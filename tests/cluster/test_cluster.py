@@ -114,12 +114,22 @@ class Lab:
         return self.processes("submitit.core._submit")
 
     def workers(self) -> list[psutil.Process]:
-        return [one for one in self.processes("spiked_service.workers") if one.cmdline()[-1] == "reconstruction"]
+        """Forked ones, whose server has their command line."""
+        found = self.processes("spiked_service.workers")
+        return [one for one in found if one.parent() in found]
+
+    def agent_of(self, worker: psutil.Process) -> int:
+        """Process id of the agent whose server has forked a worker."""
+        server = worker.parent()
+        assert server is not None
+        return server.ppid()
 
     def nothing_left(self) -> bool:
         """Whether no process, folder or object of an attempt is left."""
         objects = [one for one in self.store().rglob("*") if one.is_file()]
-        return not (self.agents() or self.workers() or objects or list(self.scratch.iterdir()))
+        return not (
+            self.agents() or self.processes("spiked_service.workers") or objects or list(self.scratch.iterdir())
+        )
 
 
 @pytest.fixture
@@ -168,6 +178,16 @@ def test_jobs_elsewhere_end_as_those_here(lab: Lab) -> None:
     until(lab.nothing_left, "nothing is left of the attempts")
 
 
+def test_an_agent_goes_on_with_the_next_job(lab: Lab) -> None:
+    jobs = [lab.submit(SHORT) for _ in range(8)]
+    for job in jobs:
+        lab.reached(job, complete, "it is complete")
+    logs = [lab.one.http.get(f"reconstructions/{job}/log").text for job in jobs]
+    numbers = [int(log.rpartition("attempt ")[2].partition(" of its agent")[0]) for log in logs]
+    assert max(numbers) > 1 and numbers.count(1) < len(jobs), f"an agent a job: {numbers}"
+    until(lab.nothing_left, "nothing is left of the attempts")
+
+
 def test_many_jobs_of_a_recording_send_and_fetch_it_once(far_lab: Lab, bucket: str) -> None:
     lab = far_lab
     lab.reached(lab.submit(SHORT), complete, "the first one is complete")
@@ -194,7 +214,7 @@ def test_a_killed_agent_or_worker_costs_an_attempt_and_nothing_else(lab: Lab) ->
         lab.reached(job, lambda row: row["version"] > 0, "it has published")
     before = {job: (lab.job(job)["version"], lab.attempt(job)) for job in (first, second)}
     agent, other = lab.agents()
-    worker = next(one for one in lab.workers() if one.ppid() == other.pid)
+    worker = next(one for one in lab.workers() if lab.agent_of(one) == other.pid)
     agent.kill()
     worker.kill()
     reasons: list[str] = []
@@ -320,6 +340,7 @@ def test_agents_without_the_token_of_a_living_attempt_are_refused(lab: Lab) -> N
     assert post(f"/{attempt}:begin", token, agent="another", node="n").status_code == 410
     assert post(f"/{attempt}:report", token, agent="another").status_code == 410
     assert post(f"/{attempt}:end", token, agent="another").status_code == 410
+    assert post(f"/{attempt}:next", token, agent="another").status_code == 410, "it has not ended this attempt"
     assert post(f"/{attempt}:report", token, agent="a", files=[{"name": "../x"}]).status_code == 422
     assert post(f"/{attempt}:report", token).status_code == 422
     assert post(f"/{job}:report", token, agent="a").status_code == 410, "the token of another"

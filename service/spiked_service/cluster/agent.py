@@ -1,6 +1,7 @@
 """Works for one attempt on the machine that an engine has chosen: fetches files, runs the worker, stores results.
 
-The worker is the same process as on the machine of the service.
+The worker is the same process as on the machine of the service, forked from one that has imported what it needs. Then
+the agent takes the next attempt that waits: neither the engine nor the imports cost time again.
 """
 
 import os
@@ -8,47 +9,101 @@ import secrets
 import shutil
 import socket
 import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
+from types import TracebackType
 
 from spiked.errors import SpikedError
 from spiked_service.cluster.agent_reports import AgentReports, RefusedError, ServiceClient
 from spiked_service.cluster.job_files import INPUTS, LOG, MANIFEST, OUTPUTS, files_in, moved, of_a_version
-from spiked_service.cluster.messages import AttemptWork, Begin, Manifest, Order, StoredFile
+from spiked_service.cluster.messages import AttemptWork, Begin, Manifest, Next, Order, StoredFile
 from spiked_service.cluster.object_store import ObjectStore, stored_file
 from spiked_service.cluster.recording_cache import RecordingCache, cache_folder
 from spiked_service.cluster.scratch import scratch_folder
 from spiked_service.results.versions import INDEX
-from spiked_service.workers.messages import JobCommand, VersionPublished, WorkerEvent
-from spiked_service.workers.process import WorkerProcess
+from spiked_service.workers.forks import ForkedWorkers
+from spiked_service.workers.messages import JobCommand, Role, VersionPublished, WorkerEvent
+from spiked_service.workers.process import StandbyWorker, WorkerProcess
 
 _LOOK_S = 0.1
 """Interval at which the orders of the service are looked at."""
+_SERVES_S = 3600.0
+"""Time after which an agent takes no more attempts, so that its place in the engine goes round."""
+_IDLE_S = 2.0
+"""How long an agent waits for another attempt, since the queue hands on the next when one has ended."""
 
 
 def run_agent(url: str, attempt: str, token: str) -> None:
-    """Work for an attempt to its end. Returns early if the attempt is over.
+    """Work for an attempt to its end, then for others that wait, for an hour at most. Returns early if one is over.
 
-    Raises SpikedError and OSError if its results cannot be stored: the service then begins another attempt.
+    Raises SpikedError and OSError if the results of one cannot be stored: the service then begins another attempt.
     """
-    service, agent = ServiceClient(url, attempt, token), secrets.token_hex(8)
-    try:
-        work = service.begin(Begin(agent=agent, node=socket.gethostname()))
-        with scratch_folder() as folder, AgentReports(service, agent, work) as reports:
-            _Attempt(attempt, work, reports, folder).run()
-    except RefusedError as error:
-        print(f"attempt {attempt}: {error}", flush=True)
-    finally:
-        service.close()
+    following: Next | None = Next(attempt=attempt, token=token)
+    with _Agent(url) as agent:
+        while following is not None:
+            following = agent.work_for(following)
+
+
+class _Agent:
+    """Works for one attempt after the other. A context manager, which ends its workers."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+        self._id = secrets.token_hex(8)
+        self._until_s = time.monotonic() + _SERVES_S
+        self._forks: dict[Role, ForkedWorkers] = {}
+        self._number = 0
+
+    def __enter__(self) -> "_Agent":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for forks in self._forks.values():
+            forks.close()
+
+    def work_for(self, given: Next) -> Next | None:
+        """Work for an attempt. Return the next one, if there is one and the hour is not over."""
+        self._number += 1
+        service = ServiceClient(self._url, given.attempt, given.token)
+        try:
+            work = service.begin(Begin(agent=self._id, node=socket.gethostname()))
+            with scratch_folder() as folder, AgentReports(service, self._id, work) as reports:
+                _Attempt(given.attempt, self._number, work, reports, folder, self._standby).run()
+            return service.next(self._id, _IDLE_S) if time.monotonic() < self._until_s else None
+        except RefusedError as error:
+            print(f"attempt {given.attempt}: {error}", flush=True)
+            return None
+        finally:
+            service.close()
+
+    def _standby(self, role: Role, log: Path) -> StandbyWorker:
+        if role not in self._forks:
+            self._forks[role] = ForkedWorkers(role)
+        return self._forks[role].standby(log)
 
 
 class _Attempt:
     """An attempt with its worker, in a folder of its own."""
 
-    def __init__(self, attempt: str, work: AttemptWork, reports: AgentReports, folder: Path) -> None:
+    def __init__(
+        self,
+        attempt: str,
+        number: int,
+        work: AttemptWork,
+        reports: AgentReports,
+        folder: Path,
+        standby: Callable[[Role, Path], StandbyWorker],
+    ) -> None:
         self._attempt = attempt
+        self._number = number
+        """How many attempts its agent has worked for."""
         self._work = work
         self._reports = reports
         self._folder = folder
+        self._standby = standby
         self._job = folder / "job"
         self._store = ObjectStore(work.store)
         self._stored: set[str] = set()
@@ -58,9 +113,15 @@ class _Attempt:
 
     def run(self) -> None:
         """Raises RefusedError once the attempt is over for the service, ObjectStoreError and OSError."""
+        begun_s = time.monotonic()
         command = self._fetch()
         if command is not None:
+            fetched_s = time.monotonic()
             self._run_worker(command)
+            worked_s = time.monotonic() - fetched_s
+            with (self._job / LOG).open("a") as log:
+                took = f"fetched its files in {fetched_s - begun_s:.2f} s, worked for {worked_s:.2f} s"
+                print(f"attempt {self._number} of its agent: {took}", file=log)
         self._reports.check()
         manifest = Manifest(
             attempt=self._attempt,
@@ -95,7 +156,8 @@ class _Attempt:
         return moved(command, self._job, None if inputs.in_place else recording)
 
     def _run_worker(self, command: JobCommand) -> None:
-        worker = WorkerProcess(command, self._job / LOG, self._take, self._worker_ended)
+        log = self._job / LOG
+        worker = WorkerProcess(command, log, self._take, self._worker_ended, self._standby(command.role, log))
         told = Order.GO_ON
         try:
             while not self._exited.wait(_LOOK_S):

@@ -6,11 +6,13 @@ from contextlib import suppress
 from types import TracebackType
 
 import httpx
+from pydantic import TypeAdapter
 
 from spiked.errors import SpikedError
 from spiked_service.cluster.messages import (
     AttemptWork,
     Begin,
+    Next,
     Order,
     Report,
     ReportAnswer,
@@ -26,10 +28,15 @@ _ANSWER_S = 10.0
 """Time for one answer."""
 _MOST_EVENTS = 500
 """Events kept while the service does not answer; then only those that the outcome depends on are."""
+_ASK_AGAIN_S = 0.2
+"""Interval at which an agent without work asks for more."""
 _EVENTS_A_REPORT = 100
 """Events of one report, which is shorter than the longest request that the service takes."""
 _REFUSED = (401, 403, 404, 409, 410, 422)
 """Status codes after which it is no use to ask again."""
+
+
+_next: TypeAdapter[Next | None] = TypeAdapter(Next | None)
 
 
 class RefusedError(SpikedError):
@@ -71,6 +78,15 @@ class ServiceClient:
             if time.monotonic() > until_s:
                 raise UnansweredError(f"the service has not answered within the lease: {why}")
             time.sleep(_PAUSE_S)
+
+    def next(self, agent: str, wait_s: float) -> Next | None:
+        """Another attempt, once this one has ended; None if none waits within `wait_s`. Raises RefusedError."""
+        until_s = time.monotonic() + wait_s
+        while True:
+            found = _next.validate_json(self.post(":next", Report(agent=agent).model_dump_json(), until_s))
+            if found is not None or time.monotonic() > until_s:
+                return found
+            time.sleep(_ASK_AGAIN_S)
 
     def close(self) -> None:
         """Close its connections."""

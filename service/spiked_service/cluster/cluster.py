@@ -3,12 +3,14 @@
 import hashlib
 import hmac
 import secrets
+import time
 from pathlib import Path
 from threading import Lock
 
 from spiked.errors import ConfigurationError
 from spiked_service.base.ids import new_id
 from spiked_service.cluster.engine import Engine, EngineOptions
+from spiked_service.cluster.messages import Next
 from spiked_service.cluster.object_store import ObjectStore
 from spiked_service.cluster.remote_worker import FencedError, RemoteWorker, Terms
 from spiked_service.cluster.shared_recordings import SharedRecordings
@@ -22,6 +24,8 @@ _KEY = "attempts.key"
 """File with the key that tokens are made with."""
 _RECORDINGS = "recordings"
 """Folder in the store, beside those of the jobs."""
+_LEFT_S = 10.0
+"""How long an agent whose attempt has ended may take another one."""
 _OWNER = b"folder in the store"
 """What the name of the service's folder is made of, with the key."""
 
@@ -41,6 +45,8 @@ class Cluster:
         self._store = ObjectStore(store).below(hashlib.sha256(_OWNER + self._key).hexdigest()[:16])
         self._engine = Engine(engine, folder / "engine.log", self._engine_ended)
         self._attempts: dict[str, RemoteWorker] = {}
+        self._left: dict[str, tuple[str, float]] = {}
+        """Attempts that have ended just now, with their agents and when that was."""
         self._lock = Lock()
         self._recordings = SharedRecordings(self._store.below(_RECORDINGS))
         self._sweeper = Sweeper(self._store, self._alive, self._recordings)
@@ -70,13 +76,42 @@ class Cluster:
         """Remove what attempts have left that are over, now and whenever one ends."""
         self._sweeper.start()
 
-    def worker(self, attempt: str, token: str) -> RemoteWorker:
-        """The living attempt that this is the token of. Raises FencedError."""
+    def check(self, attempt: str, token: str) -> None:
+        """Raises FencedError unless this is the token of the attempt."""
+        if not hmac.compare_digest(self.token(attempt).encode(), token.encode()):
+            raise FencedError("the token is not that of the attempt")
+
+    def worker(self, attempt: str) -> RemoteWorker:
+        """A living attempt. Raises FencedError."""
         with self._lock:
             worker = self._attempts.get(attempt)
-        if worker is None or not hmac.compare_digest(self.token(attempt).encode(), token.encode()):
-            raise FencedError("this attempt is over, or the token is not its own")
+        if worker is None:
+            raise FencedError("this attempt is over")
         return worker
+
+    def end(self, attempt: str, agent: str) -> None:
+        """The agent has stored all results, and may take another attempt for a while. Raises FencedError."""
+        self.worker(attempt).end(agent)
+        now_s = time.monotonic()
+        with self._lock:
+            self._left = {name: left for name, left in self._left.items() if now_s - left[1] < _LEFT_S}
+            self._left[attempt] = agent, now_s
+
+    def next_for(self, attempt: str, agent: str) -> Next | None:
+        """An attempt that waits in the engine, for the agent of one that has just ended; None if none waits.
+
+        The agent keeps its place in the engine, and what was submitted for the other attempt is cancelled. Raises
+        FencedError for any other agent.
+        """
+        with self._lock:
+            if self._left.get(attempt, ("", 0.0))[0] != agent:
+                raise FencedError("this agent has not ended the attempt, or some time ago")
+            taken = next((name for name, worker in self._attempts.items() if worker.claim(agent)), None)
+            if taken is None:
+                return None
+            del self._left[attempt]
+        self._engine.hand_on(attempt, taken)
+        return Next(attempt=taken, token=self.token(taken))
 
     def token(self, attempt: str) -> str:
         """The token of an attempt."""

@@ -48,23 +48,32 @@ class Engine:
         self._on_end = on_end
         self._lock = threading.Lock()
         self._process: subprocess.Popen[str] | None = None
-        self._submitted: set[str] = set()
+        self._tasks: dict[str, str] = {}
+        """Attempts that agents work for now, by those that they were submitted for, which the engine knows them by."""
         self._closed = False
 
     def submit(self, attempt: str, arguments: list[str]) -> None:
         """Have an agent started. Raises OSError."""
         with self._lock:
-            self._submitted.add(attempt)
+            self._tasks[attempt] = attempt
             with suppress(BrokenPipeError):  # it has died, and the thread that listens will say so
                 self._tell({"submit": attempt, "arguments": arguments})
+
+    def hand_on(self, old: str, new: str) -> None:
+        """The agent of the attempt `old`, which is over, works for `new`: what was submitted for that is cancelled."""
+        with self._lock:
+            self._tasks.pop(new, None)
+            task = self._task_of(old)
+            self._tasks[task] = new
+            self._try_to_tell({"keep": task})
+            self._try_to_tell({"cancel": new, "after_s": 0.0})
 
     def cancel(self, attempt: str, after_s: float) -> None:
         """Have what is left of an attempt after `after_s` ended."""
         with self._lock:
-            self._submitted.discard(attempt)
-            if self._process is not None and not self._closed:
-                with suppress(OSError):
-                    self._tell({"cancel": attempt, "after_s": after_s})
+            task = self._task_of(attempt)
+            if self._tasks.get(task, attempt) == attempt:  # else its agent works for another one
+                self._try_to_tell({"cancel": task, "after_s": after_s})
 
     def close(self) -> None:
         """End the process; agents go on."""
@@ -80,6 +89,16 @@ class Engine:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+
+    def _task_of(self, attempt: str) -> str:
+        """What has its agent; the attempt itself if that is not known, since an earlier engine may have it."""
+        return next((task for task, worked_for in self._tasks.items() if worked_for == attempt), attempt)
+
+    def _try_to_tell(self, message: dict[str, object]) -> None:
+        """Tell an engine that runs; another one would not know what this is about."""
+        if self._process is not None:
+            with suppress(OSError):
+                self._tell(message)
 
     def _tell(self, message: dict[str, object]) -> None:
         if self._closed:
@@ -112,15 +131,14 @@ class Engine:
                     self._forget(ended["ended"], ended["reason"], True)
         code = process.wait()
         with self._lock:
-            lost = set() if self._closed else set(self._submitted)
+            lost = [] if self._closed else list(self._tasks)
         if lost:
             _log.warning("engine ended", engine=self._options.kind, code=code, log=str(self._log))
-        for attempt in lost:
-            self._forget(attempt, f"the engine {self._options.kind} has ended; see {self._log}", False)
+        for task in lost:
+            self._forget(task, f"the engine {self._options.kind} has ended; see {self._log}", False)
 
-    def _forget(self, attempt: str, reason: str, certain: bool) -> None:
+    def _forget(self, task: str, reason: str, certain: bool) -> None:
         with self._lock:
-            known = attempt in self._submitted
-            self._submitted.discard(attempt)
-        if known:
+            attempt = self._tasks.pop(task, None)
+        if attempt is not None:
             self._on_end(attempt, reason, certain)

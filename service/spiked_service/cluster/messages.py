@@ -90,6 +90,13 @@ class Report(BaseModel):
     """All files of the job's folder, where a version among the events needs them; their content is stored."""
 
 
+class Next(BaseModel):
+    """Another attempt for an agent whose own has ended."""
+
+    attempt: str
+    token: str
+
+
 class ReportAnswer(BaseModel):
     """The answer to a report."""
 

@@ -101,6 +101,8 @@ class RemoteWorker:
         self._have: dict[str, str] = {}
         """Hashes of the files in the folder of the job, by name."""
         self._agent: str | None = None
+        self._claim: str | None = None
+        """The agent that is to begin it, after another attempt."""
         self._taken = 0
         """Number of the last report that was taken, and ..."""
         self._complete = submit is not None
@@ -119,11 +121,21 @@ class RemoteWorker:
         self._thread = threading.Thread(target=self._run, name=f"attempt {attempt}", daemon=True)
         self._thread.start()
 
+    def claim(self, agent: str) -> bool:
+        """Keep it for an agent that will begin it now. Return whether that can be: it waits in the engine."""
+        with self._lock:
+            waits = self._inputs is not None and self._agent is None and not self._begun
+            if not waits or self._claim or self._ended.is_set() or self._order is not Order.GO_ON:
+                return False
+            self._claim, self._seen_s = agent, time.monotonic()
+            return True
+
     def begin(self, asked: Begin) -> AttemptWork:
         """Give the work to an agent. Raises FencedError if another one has it or it is over."""
         with self._lock:
-            if self._ended.is_set() or self._inputs is None or self._agent not in (None, asked.agent):
-                raise FencedError("the attempt is over, or another agent has it")
+            if self._inputs is None:
+                raise FencedError("the attempt is over, or does not wait for an agent")
+            self._check(asked.agent, begins=True)
             self._seen_s = time.monotonic()
             if self._agent is None:
                 self._agent = asked.agent
@@ -188,10 +200,11 @@ class RemoteWorker:
             self._messages.put("it was withdrawn")
             self._thread.join()
 
-    def _check(self, agent: str) -> None:
-        if self._ended.is_set() or self._agent not in (None, agent):
+    def _check(self, agent: str, begins: bool = False) -> None:
+        if self._ended.is_set() or (self._agent or self._claim) not in (None, agent):
             raise FencedError("the attempt is over, or another agent has it")
-        self._agent = agent  # of an attempt that began before the service did
+        if not begins:
+            self._agent = agent  # of an attempt that began before the service did
 
     def _run(self) -> None:
         try:
@@ -249,15 +262,16 @@ class RemoteWorker:
         now_s = time.monotonic()
         if self._left_s and now_s - self._left_s > self._terms.grace_s + 2 * self._terms.report_s:
             return True
-        begun = self._agent is not None or self._submit is None
+        begun = (self._agent or self._claim) is not None or self._submit is None
         return begun and now_s - self._seen_s > _OVERDUE * self._terms.lease_s
 
     def _silence(self) -> str:
         """Why an attempt is overdue."""
         with self._lock:
             if self._agent is None and not (self._begun or self._left_s):
-                self._not_begun = True  # the engine of an earlier service has forgotten it, or has no room
-                return "no machine has begun it since the service was restarted"
+                # The engine of an earlier service has forgotten it or has no room, or who was to begin it has died.
+                self._not_begun = True
+                return "no machine has begun it within the lease"
             return "its machine does not answer any more"
 
     def _take(self, told: Report) -> None:

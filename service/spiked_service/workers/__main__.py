@@ -1,17 +1,19 @@
 """A worker process: `python -m spiked_service.workers ROLE` reads one command from stdin and executes it.
 
 The modules of the role are imported before the command arrives, so that a standby worker starts within milliseconds.
+With `--forks` the process is a server that forks into such workers.
 """
 
 import importlib
 import os
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TextIO
 
 from spiked.errors import SpikedError
 from spiked_service.store.disk_space import DiskFullError
 from spiked_service.workers.channel import WorkerChannel
+from spiked_service.workers.fork_server import FORKS, become_worker
 from spiked_service.workers.log_forwarding import join_logs
 from spiked_service.workers.messages import Role, WorkerError, commands
 
@@ -25,12 +27,21 @@ def _executor(role: Role) -> Callable[[Any, WorkerChannel], None]:
     return carrier
 
 
-def main() -> int:
-    """Entry point of the process. The exit code is 2 for errors that the user can correct."""
-    # Libraries may print to stdout. That output goes to the log; events get a file descriptor of their own.
+def _events_out() -> TextIO:
+    """Stdout. What libraries print goes to the log instead: events get a file descriptor of their own."""
     events_out = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    return events_out
+
+
+def main() -> int:
+    """Entry point of the process. The exit code is 2 for errors that the user can correct."""
+    events_out = _events_out()
     execute = _executor(Role(sys.argv[1]))
+    if FORKS in sys.argv[2:]:
+        if not become_worker():
+            return 0
+        events_out = _events_out()
     line = sys.stdin.readline()
     if not line:
         return 0  # a standby worker that was not needed

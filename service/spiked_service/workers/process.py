@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, Protocol
 
 from spiked.errors import SpikedError
 from spiked_service.events.logging import logger
@@ -20,21 +20,54 @@ _STARTUP_S = 10.0
 """Time for a standby worker that is still starting to exit."""
 
 
+class Process(Protocol):
+    """The process of a worker, which leads a group of its own: Ctrl-C in the terminal must reach the service only."""
+
+    pid: int
+    stdin: IO[bytes] | None
+    stdout: IO[bytes] | None
+
+    def poll(self) -> int | None:
+        """The exit code; None while it runs."""
+        ...
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for the exit code. Raises subprocess.TimeoutExpired."""
+        ...
+
+    def kill_group(self) -> None:
+        """Kill it with the processes that it has started."""
+        ...
+
+
+class _Spawned(subprocess.Popen[bytes]):
+    """A process that this one has started."""
+
+    def kill_group(self) -> None:
+        """Kill it with the processes that it has started."""
+        os.killpg(self.pid, signal.SIGKILL)  # it leads its group, and was not waited for yet
+
+
+def _spawn(role: Role, errors: IO[bytes]) -> Process:
+    return _Spawned(
+        # -P: do not import from the working directory of the service.
+        [sys.executable, "-P", "-m", "spiked_service.workers", role],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=errors,
+        process_group=0,
+    )
+
+
 class StandbyWorker:
     """A worker process that has imported the modules of its role and waits for a command."""
 
-    def __init__(self, role: Role, log: Path) -> None:
+    def __init__(self, role: Role, log: Path, start: Callable[[Role, IO[bytes]], Process] = _spawn) -> None:
+        """`start` gets the role and the file for errors. Raises OSError."""
         self.role = role
         self.log = log
         with log.open("ab") as errors:
-            self.process = subprocess.Popen(
-                # -P: do not import from the working directory of the service.
-                [sys.executable, "-P", "-m", "spiked_service.workers", role],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=errors,
-                process_group=0,  # Ctrl-C in the terminal must reach the service only
-            )
+            self.process = start(role, errors)
 
     def dismiss(self) -> None:
         """Close its pipes, so that it exits."""
@@ -163,11 +196,11 @@ def _reason(error: Exception) -> str:
     return "see the log of the service"
 
 
-def _wait_or_kill(process: subprocess.Popen[bytes], timeout_s: float) -> None:
+def _wait_or_kill(process: Process, timeout_s: float) -> None:
     try:
         process.wait(timeout_s)
     except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)  # it leads its group, and was not waited for yet
+        process.kill_group()
         process.wait()
 
 

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Depends, Request
 from starlette.exceptions import HTTPException
 
 from spiked_service.cluster.cluster import Cluster
-from spiked_service.cluster.messages import AttemptWork, Begin, Report, ReportAnswer
+from spiked_service.cluster.messages import AttemptWork, Begin, Next, Report, ReportAnswer
 from spiked_service.cluster.remote_worker import FencedError, RemoteWorker
 
 
@@ -15,14 +15,21 @@ def attempt_routes(cluster: Cluster | None) -> APIRouter:
     """Routes below `attempts`. They are between a service and its agents of one version, and not in the document."""
     router = APIRouter(prefix="/attempts/{attempt:id}", include_in_schema=False)
 
-    def worker_of(attempt: str, request: Request) -> RemoteWorker:
-        """The attempt whose token the request brings; checked before its body is looked at."""
+    def cluster_of(attempt: str, request: Request) -> Cluster:
+        """The cluster, if the request brings the token of the attempt; checked before its body is looked at."""
         token = request.headers.get("authorization", "").partition(" ")[2].strip()
         if not token:
             raise HTTPException(HTTPStatus.UNAUTHORIZED, "this needs the token of the attempt")
         if cluster is None:
             raise FencedError("jobs run on the machine of this service only")
-        return cluster.worker(attempt, token)
+        cluster.check(attempt, token)
+        return cluster
+
+    Granted = Annotated[Cluster, Depends(cluster_of)]
+
+    def worker_of(attempt: str, cluster: Granted) -> RemoteWorker:
+        """The living attempt."""
+        return cluster.worker(attempt)
 
     Worker = Annotated[RemoteWorker, Depends(worker_of)]
 
@@ -37,8 +44,13 @@ def attempt_routes(cluster: Cluster | None) -> APIRouter:
         return worker.report(body)
 
     @router.post(":end", status_code=HTTPStatus.NO_CONTENT)
-    def end_attempt(worker: Worker, body: Report) -> None:
+    def end_attempt(attempt: str, cluster: Granted, body: Report) -> None:
         """The results are stored."""
-        worker.end(body.agent)
+        cluster.end(attempt, body.agent)
+
+    @router.post(":next")
+    def next_attempt(attempt: str, cluster: Granted, body: Report) -> Next | None:
+        """Another attempt that waits, for an agent whose own has just ended."""
+        return cluster.next_for(attempt, body.agent)
 
     return router

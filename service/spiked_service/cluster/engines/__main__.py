@@ -37,6 +37,7 @@ def main() -> None:
         for attempt in [one for one, at_s in due.items() if at_s <= time.monotonic()]:
             del due[attempt]
             tasks.cancel(attempt)
+            tell(attempt, "it was cancelled")
         try:
             line = orders.get(timeout=_LOOK_S)
         except queue.Empty:
@@ -44,6 +45,9 @@ def main() -> None:
         if line is None:
             return
         order = json.loads(line)
+        if "keep" in order:
+            due.pop(order["keep"], None)
+            continue
         if "cancel" in order:
             due[order["cancel"]] = time.monotonic() + order["after_s"]
             continue

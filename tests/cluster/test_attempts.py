@@ -156,6 +156,35 @@ def test_a_restarted_service_gives_the_work_of_an_attempt_that_waited_in_the_eng
     begun.worker.kill_after(0)
 
 
+def test_an_attempt_that_waits_is_kept_for_the_agent_that_claims_it(
+    command: ReconstructionCommand, tmp_path: Path
+) -> None:
+    events: list[WorkerEvent] = []
+    one = Attempt(command, tmp_path / "store", events.append)
+    assert one.submitted.wait(10)
+    assert one.worker.claim("a")
+    assert not one.worker.claim("b"), "it is taken"
+    with pytest.raises(FencedError):
+        one.worker.begin(Begin(agent="b", node="late"))
+    with pytest.raises(FencedError):
+        one.worker.report(Report(agent="b"))
+    one.worker.begin(Begin(agent="a", node="there"))
+    assert not one.worker.claim("a"), "it has begun"
+    until(lambda: events == [NodeFound(node="there")], "its machine is known")
+    one.worker.dismiss()
+    one.worker.kill_after(0)
+    assert not one.worker.claim("c"), "it is over"
+
+
+def test_an_attempt_whose_next_agent_dies_counts_for_nothing(command: ReconstructionCommand, tmp_path: Path) -> None:
+    events: list[WorkerEvent] = []
+    one = Attempt(command, tmp_path / "store", events.append, lease_s=0.5)
+    assert one.submitted.wait(10)
+    assert one.worker.claim("a")
+    assert "no machine has begun it" in f"{one.exits.get(timeout=30)}"
+    assert events == [NotBegun()]
+
+
 @pytest.mark.parametrize("begun", [False, True])
 def test_an_attempt_that_nobody_reports_of_after_a_restart_is_over(
     command: ReconstructionCommand, tmp_path: Path, begun: bool

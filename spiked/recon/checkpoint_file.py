@@ -37,6 +37,8 @@ _STATE, _PART, _ARRAYS = "state", "state.part", "arrays-"
 _LOCK = "lock"
 LOCK_S = 3.0
 """Time for another process to end: a worker outlives a killed service by less than a second."""
+_PIECE_BYTES = 1 << 20
+"""Of a file that is copied."""
 _ALIGNED_BYTES = 64
 """Arrays begin at multiples of it, for the compiled code."""
 
@@ -191,6 +193,51 @@ def exists(path: Path) -> bool:
     return (path / _STATE).exists()
 
 
+def files_of(path: Path) -> list[Path]:
+    """The files of the checkpoint in a folder, those of arrays first."""
+    return [*sorted(path.glob(f"{_ARRAYS}*")), *path.glob(_STATE)]
+
+
+def copy_newest(path: Path, to: Path) -> bool:
+    """Copy the newest state, whose owner may be writing others. Return False if there is none.
+
+    Raises OSError, and CheckpointError if its header cannot be read.
+    """
+    shutil.rmtree(to, ignore_errors=True)
+    to.mkdir(parents=True)
+    while True:
+        try:
+            state = (path / _STATE).read_bytes()
+        except FileNotFoundError:
+            return False
+        try:
+            arrays = _header(state, path)["arrays"]
+            name, left = f"{_ARRAYS}{arrays['number']}", arrays["bytes"]
+            with (path / name).open("rb") as source, (to / name).open("wb") as target:
+                while left and (piece := source.read(min(left, _PIECE_BYTES))):
+                    target.write(piece)
+                    left -= len(piece)
+        except FileNotFoundError:
+            (to / name).unlink(missing_ok=True)
+            continue  # there is a newer state, with another file
+        (to / _STATE).write_bytes(state)
+        return True
+
+
+def _header(content: bytes, path: Path) -> dict[str, Any]:
+    """The header of a state of this format. Raises CheckpointError."""
+    begin = len(_MAGIC) + _LENGTH_BYTES
+    end = begin + int.from_bytes(content[len(_MAGIC) : begin], "little")
+    try:
+        header: dict[str, Any] = json.loads(content[begin:end])
+        layout = header["format"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(f"{path}: its checkpoint is damaged: its header cannot be read") from error
+    if layout != FORMAT:
+        raise CheckpointError(f"{path}: its checkpoint has format {layout}, and this program reads {FORMAT}")
+    return header
+
+
 def read(path: Path) -> State:
     """The state in a folder. Raises CheckpointError, also for one of another format."""
     try:
@@ -205,13 +252,8 @@ def read(path: Path) -> State:
     if _blake(content[:-_DIGEST_BYTES]).digest() != content[-_DIGEST_BYTES:]:
         raise CheckpointError(f"{path}: its checkpoint is damaged: its digest does not fit its {len(content)} bytes")
     end = begin + int.from_bytes(content[len(_MAGIC) : begin], "little")
-    try:
-        header = json.loads(content[begin:end])
-        layout, arrays = header["format"], header["arrays"] if header["format"] == FORMAT else {}
-    except (ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(f"{path}: its checkpoint is damaged: its header cannot be read") from error
-    if layout != FORMAT:
-        raise CheckpointError(f"{path}: its checkpoint has format {layout}, and this program reads {FORMAT}")
+    header = _header(content, path)
+    arrays = header["arrays"]
     name = path / f"{_ARRAYS}{arrays['number']}"
     try:
         stored = np.fromfile(name, np.uint8, arrays["bytes"])

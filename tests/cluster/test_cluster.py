@@ -100,6 +100,9 @@ class Lab:
     def attempt(self, job: str) -> str:
         return str(json.loads((self.folder(job) / "reconstruction.json").read_text())["attempt"])
 
+    def log(self, job: str) -> str:
+        return self.one.http.get(f"reconstructions/{job}/log").text
+
     def processes(self, word: str) -> list[psutil.Process]:
         """Processes of attempts of this test: workers, or agents."""
         found = []
@@ -182,7 +185,7 @@ def test_an_agent_goes_on_with_the_next_job(lab: Lab) -> None:
     jobs = [lab.submit(SHORT) for _ in range(8)]
     for job in jobs:
         lab.reached(job, complete, "it is complete")
-    logs = [lab.one.http.get(f"reconstructions/{job}/log").text for job in jobs]
+    logs = [lab.log(job) for job in jobs]
     numbers = [int(log.rpartition("attempt ")[2].partition(" of its agent")[0]) for log in logs]
     assert max(numbers) > 1 and numbers.count(1) < len(jobs), f"an agent a job: {numbers}"
     until(lab.nothing_left, "nothing is left of the attempts")
@@ -222,7 +225,7 @@ def test_a_killed_agent_or_worker_costs_an_attempt_and_nothing_else(lab: Lab) ->
         lab.reached(job, lambda row, job=job: lab.attempt(job) not in ("", before[job][1]), "another attempt has begun")
         row = lab.reached(job, lambda row, job=job: row["version"] > before[job][0], "it publishes again")
         assert row["state"] == "running"
-        log = lab.one.http.get(f"reconstructions/{job}/log").text.splitlines()
+        log = lab.log(job).splitlines()
         begins = [line for line in log if line.endswith(f" on {socket.gethostname()} ==")]
         assert begins == [
             f"== attempt {one} on {socket.gethostname()} ==" for one in (before[job][1], lab.attempt(job))
@@ -233,6 +236,27 @@ def test_a_killed_agent_or_worker_costs_an_attempt_and_nothing_else(lab: Lab) ->
     for job in (first, second):
         lab.post(f"reconstructions/{job}:cancel")
         lab.reached(job, lambda row: row["state"] == "cancelled", "it is cancelled")
+    until(lab.nothing_left, "nothing is left of the attempts")
+
+
+def test_another_attempt_goes_on_from_the_checkpoint_of_the_one_before(lab: Lab) -> None:
+    killed, held = lab.submit(LONG), lab.submit(LONG)
+    for job in (killed, held):
+        until(lambda job=job: list(lab.store().glob(f"*/{job}/*/checkpoint.json")), "a checkpoint is stored")
+    attempts = {job: lab.attempt(job) for job in (killed, held)}
+    assert lab.one.http.patch(f"reconstructions/{held}", json={"held": True}).is_success
+    lab.reached(held, lambda row: row["state"] == "queued", "it is held")
+    assert lab.one.http.patch(f"reconstructions/{held}", json={"held": False}).is_success
+    for agent in lab.agents():
+        agent.kill()
+    for job in (killed, held):
+        lab.reached(job, lambda row, job=job: lab.attempt(job) not in ("", attempts[job]), "another attempt has begun")
+        lab.reached(job, lambda row: row["version"] > 0 and row["stage"] == "refining", "it refines")
+        until(lambda job=job: "resumed from its checkpoint" in lab.log(job), "it goes on where it was")
+    for job in (killed, held):
+        lab.post(f"reconstructions/{job}:cancel")
+        lab.reached(job, lambda row: row["state"] == "cancelled", "it is cancelled")
+        assert not (lab.folder(job) / "checkpoint").exists()
     until(lab.nothing_left, "nothing is left of the attempts")
 
 

@@ -6,6 +6,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -336,3 +337,30 @@ def test_a_kill_at_any_moment_leaves_a_whole_checkpoint(tmp_path: Path) -> None:
         numbers.append(number)
     assert max(numbers) > 0
     assert json.dumps(state.header)
+
+
+def test_a_copy_of_a_checkpoint_that_is_being_written_is_whole(tmp_path: Path) -> None:
+    assert not checkpoint_file.copy_newest(tmp_path / "there", tmp_path / "copy")
+    over = threading.Event()
+    written = 0
+
+    def write() -> None:
+        nonlocal written
+        folder = checkpoint_file.CheckpointFolder(tmp_path / "there")
+        while not over.is_set():
+            if written % 5 == 0:
+                folder.begin_arrays()  # and the file before is removed
+            folder.write({"number": written}, bytes(100), [np.full(10_000, written)])
+            written += 1
+        folder.close()
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    numbers = set()
+    while len(numbers) < 20:
+        if checkpoint_file.copy_newest(tmp_path / "there", tmp_path / "copy"):
+            numbers.add(checkpoint_file.read(tmp_path / "copy").header["number"])
+    over.set()
+    writer.join()
+    names = [path.name for path in checkpoint_file.files_of(tmp_path / "copy")]
+    assert len(names) == 2 and names[-1] == "state", "the state comes last"

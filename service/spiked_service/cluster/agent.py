@@ -16,6 +16,7 @@ from types import TracebackType
 
 from spiked.errors import SpikedError
 from spiked_service.cluster.agent_reports import AgentReports, RefusedError, ServiceClient
+from spiked_service.cluster.checkpoint_copies import CheckpointCopies
 from spiked_service.cluster.job_files import INPUTS, LOG, MANIFEST, OUTPUTS, files_in, moved, of_a_version
 from spiked_service.cluster.messages import AttemptWork, Begin, Manifest, Next, Order, StoredFile
 from spiked_service.cluster.object_store import ObjectStore, stored_file
@@ -115,9 +116,11 @@ class _Attempt:
         """Raises RefusedError once the attempt is over for the service, ObjectStoreError and OSError."""
         begun_s = time.monotonic()
         command = self._fetch()
+        copies = CheckpointCopies(self._job, self._folder / "checkpoint", self._store)
         if command is not None:
             fetched_s = time.monotonic()
-            self._run_worker(command)
+            with copies:
+                self._run_worker(command)
             worked_s = time.monotonic() - fetched_s
             with (self._job / LOG).open("a") as log:
                 took = f"fetched its files in {fetched_s - begun_s:.2f} s, worked for {worked_s:.2f} s"
@@ -130,6 +133,7 @@ class _Attempt:
             files=self._store_files(),
             reports=self._reports.flush(),
             events=self._reports.kept,
+            checkpoint=None if command is None else copies.last(),
         )
         self._store.put(MANIFEST, manifest.model_dump_json().encode())
         self._reports.end()

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from spiked.recon.checkpoint_file import CHECKPOINT
+from spiked.recon.checkpoint_file import CHECKPOINT, files_of
 from spiked_service.cluster.messages import Inputs, StoredFile
 from spiked_service.cluster.object_store import ObjectStore, stored_file
 from spiked_service.store.folder import CAPTURE_ROW, RECONSTRUCTION_ROW
@@ -51,7 +51,7 @@ def stage(command: JobCommand, store: ObjectStore, hold: Callable[[Path], list[S
     recording = recording_of(command)
     in_place = store.local or recording is None
     found = []
-    for path in files_in(command.folder):
+    for path in [*files_in(command.folder), *files_of(command.folder / CHECKPOINT)]:
         stored = stored_file(path, path.relative_to(command.folder).as_posix())
         store.put_file(path, f"{INPUTS}/{stored.sha256}", stored)
         found.append(stored)

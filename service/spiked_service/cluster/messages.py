@@ -103,6 +103,14 @@ class ReportAnswer(BaseModel):
     order: Order
 
 
+class CheckpointCopy(BaseModel):
+    """A checkpoint in the store of its attempt."""
+
+    number: Annotated[int, Field(ge=0)]
+    """Of its folder."""
+    files: list[StoredFile]
+
+
 class Manifest(BaseModel):
     """The end of an attempt, `manifest.json` in its store, written after all files."""
 
@@ -115,3 +123,5 @@ class Manifest(BaseModel):
     events: list[WorkerEvent]
     """Those that the outcome depends on: versions, errors and the last status."""
     files: list[StoredFile]
+    checkpoint: CheckpointCopy | None
+    """Of a worker that has not done all of its work."""

@@ -1,6 +1,7 @@
 """The service's end of an attempt on another machine: its lease, its events, its results."""
 
 import queue
+import shutil
 import threading
 import time
 from collections.abc import Callable
@@ -10,11 +11,14 @@ from dataclasses import dataclass
 from pydantic import ValidationError
 
 from spiked.errors import SpikedError
+from spiked.recon.checkpoint_file import CHECKPOINT
 from spiked_service.cluster.attempt_log import AttemptLog
+from spiked_service.cluster.checkpoint_copies import fetch_copy, newest_copy
 from spiked_service.cluster.job_files import LOG, MANIFEST, OUTPUTS, files_in, of_a_version, stage
 from spiked_service.cluster.messages import (
     AttemptWork,
     Begin,
+    CheckpointCopy,
     Inputs,
     Manifest,
     Order,
@@ -296,16 +300,25 @@ class RemoteWorker:
         """The trouble of an attempt that is over: as its manifest says, else the reason."""
         content = self._store.get(MANIFEST)
         if content is None:
+            self._take_checkpoint(newest_copy(self._store), over=False)
             return reason or "its agent has ended without a result"
         try:
             manifest = Manifest.model_validate_json(content)
         except ValidationError:
             return "the manifest of its results cannot be read"
         self._fetch(manifest.files)
+        self._take_checkpoint(manifest.checkpoint, over=manifest.trouble is None)
         self._stored = True
         if not (self._complete and manifest.reports == self._taken):
             self._deliver(manifest.events)  # again, which changes nothing for those that have arrived
         return manifest.trouble
+
+    def _take_checkpoint(self, copy: CheckpointCopy | None, over: bool) -> None:
+        """The next attempt goes on from it, or from the one before unless the work is over."""
+        if copy is not None:
+            fetch_copy(self._store, copy, self._command.folder)
+        elif over:
+            shutil.rmtree(self._command.folder / CHECKPOINT, ignore_errors=True)
 
     def _fetch(self, files: list[StoredFile]) -> None:
         """Bring the folder of the job to what the attempt has, the index of the versions last."""

@@ -37,7 +37,7 @@ def command(tmp_path: Path) -> ReconstructionCommand:
         path.write_text(path.name)
     for name in ("capture.json", "thumbnail.webp", "recording.dat.part"):
         (capture / name).write_text("not for workers")
-    (job / "checkpoint" / "state").write_text("not for workers")
+    (job / "checkpoint" / "state").write_text("state")
     return ReconstructionCommand(
         ring=None,
         recording=capture / "recording.dat",
@@ -57,7 +57,7 @@ def test_a_job_takes_along_what_its_worker_reads(tmp_path: Path) -> None:
     inputs = stage(given, store, lambda folder: recordings.hold(folder, "attempt"))
     assert not inputs.in_place
     assert {one.name for one in inputs.recording} == {"recording.dat", "recording.json"}
-    assert {one.name for one in inputs.folder} == {"map-1/map.json"}
+    assert {one.name for one in inputs.folder} == {"map-1/map.json", "checkpoint/state"}
     for stored in inputs.recording:
         recordings.store.fetch(stored.sha256, tmp_path / "there" / stored.name, stored)
     for stored in inputs.folder:

@@ -161,7 +161,11 @@ class _Attempt:
 
     def _run_worker(self, command: JobCommand) -> None:
         log = self._job / LOG
-        worker = WorkerProcess(command, log, self._take, self._worker_ended, self._standby(command.role, log))
+        try:
+            worker = WorkerProcess(command, log, self._take, self._worker_ended, self._standby(command.role, log))
+        except OSError as error:
+            self._trouble = f"its worker could not be started on {socket.gethostname()}: {error.strerror}"
+            return
         told = Order.GO_ON
         try:
             while not self._exited.wait(_LOOK_S):

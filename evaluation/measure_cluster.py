@@ -30,6 +30,8 @@ from spiked.simulate import MotionKind, SimulatedCamera
 
 LEASE_S = 10
 START_S = 120.0
+MARK = "SPIKED_MEASURED_NODES"
+"""Variable of the environment of the processes of Ray that this run has started: others run Ray here, too."""
 RAY = str(Path(sys.executable).with_name("ray"))
 
 
@@ -72,27 +74,38 @@ class RayNodes:
         self._nodes[number] = self._node()
 
     def close(self) -> None:
-        """End all nodes."""
-        subprocess.run([RAY, "stop", "--force"], check=False, capture_output=True)
+        """End all nodes of this run, with what runs on them."""
+        while found := self._processes():
+            for process in found:
+                with suppress(psutil.Error):
+                    process.kill()
+            psutil.wait_procs(found, timeout=10)
 
     def _node(self) -> list[psutil.Process]:
         """Start a node. Return its raylet, and its log monitor, which would outlive it and slow down the others."""
-        before = {one.pid for one in _node_processes()}
+        before = {one.pid for one in self._processes()}
         self._run(f"--address={self.address}", "--num-cpus=1")
-        return [one for one in _node_processes() if one.pid not in before]
+        return [one for one in self._processes() if one.pid not in before and _is_of_a_node(one)]
 
-    @staticmethod
-    def _run(*words: str) -> None:
-        subprocess.run([RAY, "start", "--disable-usage-stats", *words], check=True, capture_output=True)
+    def _processes(self) -> list[psutil.Process]:
+        """All that this run has started of Ray, and what that has started: some overwrite their environment."""
+        found = {}
+        for process in psutil.process_iter():
+            with suppress(psutil.Error):
+                if process.environ().get(MARK) == self.address and process.status() != psutil.STATUS_ZOMBIE:
+                    found |= {one.pid: one for one in [process, *process.children(recursive=True)]}
+        return list(found.values())
+
+    def _run(self, *words: str) -> None:
+        environment = os.environ | {MARK: self.address}
+        command = [RAY, "start", "--disable-usage-stats", *words]
+        subprocess.run(command, check=True, capture_output=True, env=environment)
 
 
-def _node_processes() -> list[psutil.Process]:
-    found = []
-    for one in psutil.process_iter(["name", "cmdline"]):
-        monitors = any(part.endswith("log_monitor.py") for part in one.info["cmdline"] or [])
-        if one.info["name"] == "raylet" or monitors:
-            found.append(one)
-    return found
+def _is_of_a_node(process: psutil.Process) -> bool:
+    with suppress(psutil.Error):
+        return process.name() == "raylet" or any(part.endswith("log_monitor.py") for part in process.cmdline())
+    return False
 
 
 class Service:

@@ -106,7 +106,7 @@ class _Attempt:
         self._folder = folder
         self._standby = standby
         self._job = folder / "job"
-        self._store = ObjectStore(work.store)
+        self._store = ObjectStore(work.store, reports.check)
         self._stored: set[str] = set()
         """Hashes of what is stored."""
         self._trouble: str | None = None
@@ -141,7 +141,7 @@ class _Attempt:
     def _fetch(self) -> JobCommand | None:
         """Fetch the inputs. Return the command for the worker, None if they cannot be had."""
         inputs, command = self._work.inputs, self._work.command
-        recordings = ObjectStore(self._work.recordings)
+        recordings = ObjectStore(self._work.recordings, self._reports.check)
 
         def fetch(stored: StoredFile, path: Path) -> None:
             recordings.fetch(stored.sha256, path, stored)

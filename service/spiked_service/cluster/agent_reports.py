@@ -67,7 +67,11 @@ class ServiceClient:
         why = "it was not asked in time"
         while True:
             try:
-                answer = self._http.post(self._path + route, content=body, headers={"Content-Type": "application/json"})
+                # Who was cut off must notice when the lease is over, not an answer's time later.
+                wait_s = min(_ANSWER_S, max(until_s - time.monotonic(), _PAUSE_S))
+                answer = self._http.post(
+                    self._path + route, content=body, headers={"Content-Type": "application/json"}, timeout=wait_s
+                )
                 if answer.is_success:
                     return answer.content
                 if answer.status_code in _REFUSED:

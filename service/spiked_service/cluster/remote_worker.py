@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 from pydantic import ValidationError
 
@@ -38,6 +39,8 @@ _LOOK_S = 0.5
 """Interval at which lease and orders are checked."""
 _OVERDUE = 1.5
 """The service waits this many leases for an agent, so that its worker has ended before another attempt begins."""
+_LAST_S = 2.0
+"""Time for the store, once an attempt is to be over: nobody waits for one that stalls."""
 REPORT_S = 1.0
 """Interval of an agent's reports, and at most a fifth of the lease."""
 
@@ -90,7 +93,7 @@ class RemoteWorker:
         """
         self._attempt = attempt
         self._command = command
-        self._store = store
+        self._store = store.until(self._check_wanted)
         self._recordings = recordings
         self._terms = terms
         self._submit = submit
@@ -119,6 +122,7 @@ class RemoteWorker:
         self._messages: queue.SimpleQueue[Report | str | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._detached = False
+        self._withdrawn_s: float | None = None
         self._stored = False
         """Whether its agent has stored all and is about to exit."""
         self._ended = threading.Event()
@@ -201,6 +205,7 @@ class RemoteWorker:
         """Wait for the exit; withdraw the attempt after `timeout_s`."""
         self._thread.join(timeout_s)
         if self._thread.is_alive() and not self._detached:
+            self._withdrawn_s = time.monotonic()
             self._messages.put("it was withdrawn")
             self._thread.join()
 
@@ -209,6 +214,13 @@ class RemoteWorker:
             raise FencedError("the attempt is over, or another agent has it")
         if not begins:
             self._agent = agent  # of an attempt that began before the service did
+
+    def _check_wanted(self) -> None:
+        """Raises ObjectStoreError once nobody waits for the store any more."""
+        now_s = time.monotonic()
+        withdrawn = self._withdrawn_s is not None and now_s - self._withdrawn_s > _LAST_S
+        if self._detached or withdrawn or self._overstays(_LAST_S):
+            raise ObjectStoreError(f"the store {self._store.uri} has not answered before the attempt was over")
 
     def _run(self) -> None:
         try:
@@ -232,8 +244,6 @@ class RemoteWorker:
             with suppress(OSError):
                 self._log.end(trouble)
         self._recordings.release(self._attempt)
-        with suppress(SpikedError):
-            self._store.remove()
         self._withdraw(self._terms.grace_s if self._stored else 0.0)
         self._on_exit(trouble)
 
@@ -242,7 +252,7 @@ class RemoteWorker:
         if self._submit is None and self._store.get(MANIFEST) is not None:
             return self._finish("")  # it has ended meanwhile
         if not self._begun:
-            inputs = stage(self._command, self._store, lambda folder: self._recordings.hold(folder, self._attempt))
+            inputs = stage(self._command, self._store, self._hold)
             self._have = {stored.name: stored.sha256 for stored in inputs.folder}
             with self._lock:
                 self._inputs, self._seen_s = inputs, time.monotonic()
@@ -261,10 +271,18 @@ class RemoteWorker:
                 return "it was ended before it began"
         return None
 
+    def _hold(self, folder: Path) -> list[StoredFile]:
+        return self._recordings.hold(folder, self._attempt, self._check_wanted)
+
+    def _overstays(self, more_s: float) -> bool:
+        """Whether the time of grace is over since that long."""
+        grace_s = self._terms.grace_s + 2 * self._terms.report_s
+        return self._left_s is not None and time.monotonic() - self._left_s > grace_s + more_s
+
     def _overdue(self) -> bool:
         """Whether the lease has expired, or the time of grace; one that waits in the engine has no lease yet."""
         now_s = time.monotonic()
-        if self._left_s and now_s - self._left_s > self._terms.grace_s + 2 * self._terms.report_s:
+        if self._overstays(0):
             return True
         begun = (self._agent or self._claim) is not None or self._submit is None
         return begun and now_s - self._seen_s > _OVERDUE * self._terms.lease_s

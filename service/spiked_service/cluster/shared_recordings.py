@@ -3,6 +3,7 @@
 import os
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from spiked_service.cluster.job_files import files_in
@@ -11,6 +12,8 @@ from spiked_service.cluster.object_store import ObjectStore, sha256_of
 
 KEEP_S = 600.0
 """How long a recording stays after the last attempt that reads it: a queue has many jobs of one recording."""
+_LOOK_S = 0.5
+"""Interval at which who waits for another attempt's upload looks whether it is still wanted."""
 _MOST_HASHES = 100_000
 """Files whose hash is remembered."""
 
@@ -34,10 +37,10 @@ class SharedRecordings:
         self._hashes: dict[tuple[str, int, int, int], str] = {}
         """By path, size, time of change and inode of a file."""
 
-    def hold(self, folder: Path, attempt: str) -> list[StoredFile]:
+    def hold(self, folder: Path, attempt: str, check: Callable[[], None] = lambda: None) -> list[StoredFile]:
         """Store what is not yet there of a recording's folder; it stays there until the attempt is released.
 
-        Raises ObjectStoreError and OSError.
+        `check` raises once that is wanted no more. Raises what it raises, ObjectStoreError and OSError.
         """
         found = []
         for path in files_in(folder):
@@ -46,10 +49,11 @@ class SharedRecordings:
             with self._lock:
                 self._held.setdefault(attempt, set()).add(stored.sha256)
                 while stored.sha256 in self._busy:
-                    self._lock.wait()
+                    self._lock.wait(_LOOK_S)
+                    check()
                 self._busy.add(stored.sha256)
             try:
-                self.store.put_file(path, stored.sha256, stored)
+                self.store.until(check).put_file(path, stored.sha256, stored)
             finally:
                 self._free(stored.sha256)
             found.append(stored)

@@ -2,11 +2,15 @@
 
 Starts a service with an executor (and for Ray a head and two nodes on this machine), queues so many small jobs, and at
 random moments kills a worker, an agent, a node of Ray, the engine's process or the service, which are started again.
-Then it looks whether every job is complete, and whether the files of every version that is listed are there. Prints one
-JSON object; the exit status is 1 if a job is lost or half. With `local` and no kills it is the figure to compare with.
+`--store s3-moto` and `--store s3-s3rver` start a server of S3; with `--store-faults 0.05` one of twenty requests to it
+is stalled, refused or truncated. Then it looks whether every job is complete, whether the files of every version are
+there that is listed, and what is left in the store. All jobs are alike, and so are their results, which are compared by
+hash. Prints one JSON object; the exit status is 1 if a job is lost or half. With `local` and no kills it is the figure
+to compare with.
 """
 
 import argparse
+import hashlib
 import json
 import os
 import random
@@ -22,6 +26,7 @@ from typing import Any
 
 import httpx
 import psutil
+from cluster_stores import SERVERS, Store, s3_store
 from spiked_service.results.versions import versions
 
 from spiked.recording import RecordingWriter
@@ -30,6 +35,8 @@ from spiked.simulate import MotionKind, SimulatedCamera
 
 LEASE_S = 10
 START_S = 120.0
+SWEPT_S = 60.0
+"""Time after the last job for what is left to be swept: what still stalls must have failed, too."""
 MARK = "SPIKED_MEASURED_NODES"
 """Variable of the environment of the processes of Ray that this run has started: others run Ray here, too."""
 RAY = str(Path(sys.executable).with_name("ray"))
@@ -212,7 +219,21 @@ def broken(service: Service, jobs: list[str]) -> list[str]:
     return found
 
 
-def outcome(service: Service, jobs: list[str], scratch: Path) -> dict[str, Any]:
+def contents(service: Service, jobs: list[str]) -> list[int]:
+    """How many jobs have the same newest scene and trajectory, by content."""
+    found: Counter[str] = Counter()
+    for job in jobs:
+        folder = service.data / "reconstructions" / job
+        newest = versions(folder)[-1]
+        found[
+            "".join(
+                hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in (newest.scene, newest.trajectory)
+            )
+        ] += 1
+    return sorted(found.values(), reverse=True)
+
+
+def outcome(service: Service, jobs: list[str], scratch: Path, store: Store | None) -> dict[str, Any]:
     """What has become of the jobs, and what is left of their attempts."""
     rows = [service.ask("GET", f"/reconstructions/{job}") for job in jobs]
     complete = [row for row in rows if row["state"] == "complete"]
@@ -224,10 +245,16 @@ def outcome(service: Service, jobs: list[str], scratch: Path) -> dict[str, Any]:
             row["id"] for row in complete if [one.version for one in newest[row["id"]]] != [row["version"]]
         ],
         "reasons": dict(Counter(row["reason"] for row in rows if row["state"] != "complete")),
-        "left_in_store": sum(one.is_file() for one in (service.data / "cluster" / "jobs").rglob("*")),
+        "alike": contents(service, [row["id"] for row in complete]),
+        "store": left_in(service.data / "cluster" / "jobs") if store is None else store.left(),
         "left_in_scratch": len(list(scratch.glob("spiked-attempt-*"))),
         "processes_left": len(processes(scratch, "submitit.core._submit", "ray::_Agent", "workers reconstruction")),
     }
+
+
+def left_in(folder: Path) -> dict[str, int]:
+    """What is there of a folder that is the store."""
+    return {"left_in_store": sum(one.is_file() for one in folder.rglob("*"))}
 
 
 def arguments() -> argparse.Namespace:
@@ -238,7 +265,8 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--every", type=float, default=4.0, help="mean seconds between two kills")
     parser.add_argument("--at-once", type=int, default=4, help="jobs that are handed to the engine at a time")
-    parser.add_argument("--store", help="URI of the store; a folder if not given")
+    parser.add_argument("--store", choices=list(SERVERS), help="a server of S3 to start; a folder if not given")
+    parser.add_argument("--store-faults", type=float, default=0.0, help="share of requests to S3 that fail")
     parser.add_argument("--seed", type=int, default=0)
     return parser.parse_args()
 
@@ -253,6 +281,7 @@ def main() -> None:
         scratch.mkdir()
         os.environ["SPIKED_SCRATCH"] = str(scratch)
         recording(folder / "small.dat")
+        store = s3_store(asked.store, folder, free_port(), ends) if asked.store else None
         nodes = RayNodes() if asked.executor == "ray" else None
         if nodes is not None:
             ends.callback(nodes.close)
@@ -262,7 +291,7 @@ def main() -> None:
             "executor_lease_s": str(LEASE_S),
         }
         settings |= {"executor_address": "local" if nodes is None else nodes.address}
-        settings |= {"executor_store": asked.store} if asked.store else {}
+        settings |= {"executor_store": store.uri} if store else {}
         service = Service(folder, settings)
         ends.callback(service.close)
         capture = service.ask("POST", "/captures", json={"device": service.source, "reconstruct": False})["id"]
@@ -270,6 +299,8 @@ def main() -> None:
             time.sleep(0.1)
         body = {"capture_id": capture, "options": {"steps": 0, "threads": 1}}
         jobs = [service.ask("POST", "/reconstructions", json=body)["id"] for _ in range(asked.jobs)]
+        if store is not None:
+            store.proxy.share = asked.store_faults
         begun_s = time.monotonic()
         kinds = ["worker", "worker", "agent", "agent", "engine", "service"] + (["node"] if nodes else [])
         killed: Counter[str] = Counter()
@@ -285,17 +316,26 @@ def main() -> None:
             else:
                 time.sleep(2)
         wall_s = time.monotonic() - begun_s
-        time.sleep(2 * LEASE_S if asked.executor != "local" else 0)
+        if store is not None:
+            store.proxy.share = 0.0
+        time.sleep(SWEPT_S if asked.executor != "local" else 0)
         report = {
             "executor": asked.executor,
             "jobs": asked.jobs,
-            **outcome(service, jobs, scratch),
+            **outcome(service, jobs, scratch, store),
+            "faults": dict(store.proxy.happened) if store else {},
+            "requests": store.proxy.requests if store else 0,
             "kills": dict(killed),
             "wall_s": round(wall_s, 1),
             "s_a_job": round(wall_s / asked.jobs, 3),
         }
         print(json.dumps(report))
-    if report["states"] != {"complete": asked.jobs} or report["half"] or report["versions_differ"]:
+    if (
+        report["states"] != {"complete": asked.jobs}
+        or report["half"]
+        or report["versions_differ"]
+        or len(report["alike"]) > 1
+    ):
         raise SystemExit(1)
 
 

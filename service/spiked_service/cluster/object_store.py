@@ -74,16 +74,19 @@ class ObjectStore:
         return ObjectStore(self.uri, check)
 
     def put_file(self, path: Path, name: str, stored: StoredFile) -> None:
-        """Store a file, unless an object of its size is there: names contain the hash of the content."""
+        """Store a file."""
 
         def put() -> None:
-            if self._size(name) != stored.bytes:
-                self._make_parent(name)
-                self._upload(path, self._at(name), stored.bytes)
+            self._make_parent(name)
+            self._upload(path, self._at(name), stored.bytes)
             if self._size(name) != stored.bytes:
                 raise OSError(f"{self.uri}/{name} was stored in part")
 
         self._repeated(put, f"{path.name} cannot be stored")
+
+    def has(self, name: str, stored: StoredFile) -> bool:
+        """Whether there is an object of a file's size: names that are asked for are hashes of the content."""
+        return self._repeated(lambda: self._size(name) == stored.bytes, f"{stored.name} cannot be looked for")
 
     def put(self, name: str, content: bytes) -> None:
         """Store bytes."""
@@ -91,7 +94,7 @@ class ObjectStore:
         def put() -> None:
             self._make_parent(name)
             self._call("pipe_file", self._at(name), content)
-            if self._call("cat_file", self._at(name)) != content:
+            if self._read(name) != content:
                 raise OSError(f"{self.uri}/{name} was stored in part")
 
         self._repeated(put, f"{name} cannot be stored")
@@ -101,7 +104,7 @@ class ObjectStore:
 
         def get() -> bytes | None:
             try:
-                return bytes(self._call("cat_file", self._at(name)))
+                return self._read(name)
             except FileNotFoundError:
                 return None
 
@@ -170,6 +173,10 @@ class ObjectStore:
         except FileNotFoundError:
             return None
         return int(found["size"])
+
+    def _read(self, name: str) -> bytes:
+        """An object that is not empty. S3 is not asked for its size first, as it is without a range."""
+        return bytes(self._call("cat_file", self._at(name), start=0))
 
     def _upload(self, path: Path, at: str, size: int) -> None:
         part_bytes = max(_PART_BYTES, -(-size // _MOST_PARTS))

@@ -53,7 +53,9 @@ class SharedRecordings:
                     check()
                 self._busy.add(stored.sha256)
             try:
-                self.store.until(check).put_file(path, stored.sha256, stored)
+                store = self.store.until(check)
+                if not store.has(stored.sha256, stored):
+                    store.put_file(path, stored.sha256, stored)
             finally:
                 self._free(stored.sha256)
             found.append(stored)

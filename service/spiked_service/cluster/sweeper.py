@@ -12,6 +12,8 @@ from spiked_service.events.logging import logger
 _log = logger("spiked.cluster")
 _SWEEP_S = 600.0
 """Interval of sweeps: a machine that was asleep may store something long after its attempt has been fenced off."""
+_AGAIN_S = 20.0
+"""Pause after a sweep that has failed, because the store did not answer."""
 
 
 class Sweeper:
@@ -67,17 +69,20 @@ class Sweeper:
         return swept
 
     def _run(self) -> None:
+        pause_s = _SWEEP_S
         while True:
             with self._wake:
                 if not (self._wanted or self._closed):
-                    self._wake.wait(_SWEEP_S)
+                    self._wake.wait(pause_s)
                 if self._closed:
                     return
                 self._wanted = False
             try:
                 swept = self.sweep()
-            except SpikedError as error:  # at the next time
-                _log.warning("store not swept", reason=str(error))
+            except SpikedError as error:
+                _log.warning("store not swept", reason=str(error), again_s=_AGAIN_S)
+                pause_s = _AGAIN_S
                 continue
+            pause_s = _SWEEP_S
             if swept:
                 _log.info("store swept", attempts=swept)

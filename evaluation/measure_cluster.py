@@ -96,7 +96,7 @@ class RayNodes:
 
     def _processes(self) -> list[psutil.Process]:
         """All that this run has started of Ray, and what that has started: some overwrite their environment."""
-        found = {}
+        found: dict[int, psutil.Process] = {}
         for process in psutil.process_iter():
             with suppress(psutil.Error):
                 if process.environ().get(MARK) == self.address and process.status() != psutil.STATUS_ZOMBIE:
@@ -246,13 +246,13 @@ def outcome(service: Service, jobs: list[str], scratch: Path, store: Store | Non
         ],
         "reasons": dict(Counter(row["reason"] for row in rows if row["state"] != "complete")),
         "alike": contents(service, [row["id"] for row in complete]),
-        "store": left_in(service.data / "cluster" / "jobs") if store is None else store.left(),
+        "left": left_in(service.data / "cluster" / "jobs") if store is None else store.left(),
         "left_in_scratch": len(list(scratch.glob("spiked-attempt-*"))),
         "processes_left": len(processes(scratch, "submitit.core._submit", "ray::_Agent", "workers reconstruction")),
     }
 
 
-def left_in(folder: Path) -> dict[str, int]:
+def left_in(folder: Path) -> dict[str, int | None]:
     """What is there of a folder that is the store."""
     return {"left_in_store": sum(one.is_file() for one in folder.rglob("*"))}
 
@@ -269,6 +269,26 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--store-faults", type=float, default=0.0, help="share of requests to S3 that fail")
     parser.add_argument("--seed", type=int, default=0)
     return parser.parse_args()
+
+
+def storm(
+    asked: argparse.Namespace, service: Service, nodes: RayNodes | None, scratch: Path, random_: random.Random
+) -> Counter[str]:
+    """Kill until all jobs are over. Return how often what was killed."""
+    kinds = ["worker", "worker", "agent", "agent", "engine", "service"] + (["node"] if nodes else [])
+    killed: Counter[str] = Counter()
+    while True:
+        counts = service.counts()
+        if counts["queued"] + counts["running"] == 0:
+            return killed
+        if killed.total() < asked.kills:
+            time.sleep(random_.expovariate(1 / asked.every))
+            kind = random_.choice(kinds)
+            if kill(kind, service, nodes, scratch, random_):
+                killed[kind] += 1
+        else:
+            time.sleep(2)
+        print(dict(counts), dict(killed), file=sys.stderr, flush=True)
 
 
 def main() -> None:
@@ -302,25 +322,14 @@ def main() -> None:
         if store is not None:
             store.proxy.share = asked.store_faults
         begun_s = time.monotonic()
-        kinds = ["worker", "worker", "agent", "agent", "engine", "service"] + (["node"] if nodes else [])
-        killed: Counter[str] = Counter()
-        while True:
-            counts = service.counts()
-            if counts["queued"] + counts["running"] == 0:
-                break
-            if killed.total() < asked.kills:
-                time.sleep(random_.expovariate(1 / asked.every))
-                kind = random_.choice(kinds)
-                if kill(kind, service, nodes, scratch, random_):
-                    killed[kind] += 1
-            else:
-                time.sleep(2)
+        killed = storm(asked, service, nodes, scratch, random_)
         wall_s = time.monotonic() - begun_s
         if store is not None:
             store.proxy.share = 0.0
         time.sleep(SWEPT_S if asked.executor != "local" else 0)
         report = {
             "executor": asked.executor,
+            "store": asked.store or "folder",
             "jobs": asked.jobs,
             **outcome(service, jobs, scratch, store),
             "faults": dict(store.proxy.happened) if store else {},

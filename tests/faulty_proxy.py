@@ -40,8 +40,8 @@ ALL = tuple(Fault)
 class FaultyProxy:
     """Passes requests on, one a connection, some with a fault. A context manager; attributes may change at any time."""
 
-    def __init__(self, port: int, seed: int = 0, stall_s: float = 30.0) -> None:
-        """`port` is that of the server; what is stalled is let go of after `stall_s`."""
+    def __init__(self, port: int, seed: int = 0, stall_s: float = 30.0, host: str = "127.0.0.1") -> None:
+        """`port` is that of the server, `host` where it seems to be; what is stalled is let go of after `stall_s`."""
         self.share = 0.0
         """Probability of a fault."""
         self.faults: tuple[Fault, ...] = ALL
@@ -56,14 +56,14 @@ class FaultyProxy:
         self._stall_s = stall_s
         self._serving: set[asyncio.Task[None]] = set()
         self._loop = asyncio.new_event_loop()
-        self._listening = socket.create_server(("127.0.0.1", 0), backlog=256)
-        self.port = int(self._listening.getsockname()[1])
+        self._listening = socket.create_server((host, 0), backlog=256)
+        self.host, self.port = host, int(self._listening.getsockname()[1])
         self._thread = threading.Thread(target=self._run, name="faulty proxy", daemon=True)
 
     @property
     def url(self) -> str:
         """Where the server seems to be."""
-        return f"http://127.0.0.1:{self.port}"
+        return f"http://{self.host}:{self.port}"
 
     def __enter__(self) -> "FaultyProxy":
         self._thread.start()

@@ -93,6 +93,21 @@ def test_a_report_that_is_sent_again_counts_once(command: ReconstructionCommand,
     assert one.withdrawn == [0.0]
 
 
+def test_a_job_that_is_cancelled_ends_even_if_its_agent_does_not(
+    command: ReconstructionCommand, tmp_path: Path
+) -> None:
+    waiting = Attempt(command, tmp_path / "store", lambda event: None)
+    assert waiting.submitted.wait(10)
+    waiting.worker.cancel()
+    assert "before it began" in f"{waiting.exits.get(timeout=30)}"
+    begun = Attempt(command, tmp_path / "store", lambda event: None)
+    begun.begin()
+    begun.worker.cancel()
+    assert begun.worker.report(Report(agent="a")).order is Order.STOP, "what it has is published"
+    assert "does not answer" in f"{begun.exits.get(timeout=30)}", "it did not end within the grace"
+    assert begun.withdrawn == [0.0]
+
+
 def test_an_event_that_cannot_be_taken_ends_the_attempt(command: ReconstructionCommand, tmp_path: Path) -> None:
     def refuse(event: WorkerEvent) -> None:
         raise RuntimeError("a fault of this service")

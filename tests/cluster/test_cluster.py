@@ -49,11 +49,12 @@ class Lab:
         lease_s: float,
         store: str | None = None,
         engine: dict[str, str] = LOCALLY,
+        port: int | None = None,
     ) -> None:
         self._lease_s = lease_s
         self._uri = store
         self._engine = engine
-        self._port = free_port()
+        self._port = free_port() if port is None else port
         self._daemon = daemon
         self._moving = moving
         self.scratch = scratch
@@ -421,14 +422,17 @@ def test_a_job_waits_for_as_long_as_its_engine_dies(lab: Lab) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("executor", ["submitit", "ray"])
-def test_jobs_outlive_random_kills(executor: str) -> None:
+@pytest.mark.parametrize(
+    ("executor", "store"),
+    [("submitit", []), ("ray", []), ("submitit", ["--store", "s3-moto", "--store-faults", "0.03"])],
+)
+def test_jobs_outlive_random_kills(executor: str, store: list[str]) -> None:
     if executor == "ray":
         pytest.importorskip("ray")
     script = Path(__file__).parents[2] / "evaluation" / "measure_cluster.py"
-    command = [sys.executable, str(script), executor, "--jobs", "40", "--kills", "15", "--every", "3"]
+    command = [sys.executable, str(script), executor, "--jobs", "40", "--kills", "15", "--every", "3", *store]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=550)
     assert done.returncode == 0, done.stdout + done.stderr[-3000:]
     report = json.loads(done.stdout)
     assert report["states"] == {"complete": 40} and sum(report["kills"].values()) > 5
-    assert (report["left_in_store"], report["processes_left"]) == (0, 0)
+    assert (report["left"]["left_in_store"], report["processes_left"]) == (0, 0)

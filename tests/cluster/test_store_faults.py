@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Any
 
 import pytest
 from faulty_proxy import ALL, Fault, FaultyProxy
@@ -20,6 +21,8 @@ from spiked_service.cluster.sweeper import Sweeper
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.workers.messages import NotBegun, ReconstructionCommand, WorkerEvent
 from waiting import until
+
+from .test_cluster import LEASE_S, SHORT, Lab
 
 PART_BYTES = 5 << 20
 TRIES = 3
@@ -83,7 +86,7 @@ def test_a_store_that_stalls_is_given_up_after_a_known_number_of_requests(
     proxy.faults, proxy.share = (fault,), 1.0
     with pytest.raises(ObjectStoreError, match=rf"manifest cannot be read, after {TRIES} tries: .*check the store s3:"):
         store.get("manifest")
-    assert proxy.requests <= 2 * TRIES
+    assert proxy.requests <= 4 * TRIES
 
 
 def test_a_store_that_stops_reading_is_given_up(store: ObjectStore, proxy: FaultyProxy, large: Path) -> None:
@@ -138,14 +141,14 @@ def command(folder: Path) -> ReconstructionCommand:
 
 
 @pytest.fixture
-def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+def patient(proxy: FaultyProxy, monkeypatch: pytest.MonkeyPatch) -> None:
     """As it is when it is not tested: the store has minutes."""
     monkeypatch.setattr(object_store, "_READ_S", 3600)
     monkeypatch.setattr(object_store, "_QUIET_S", 3600.0)
 
 
 @pytest.mark.usefixtures("patient")
-@pytest.mark.parametrize("end", [RemoteWorker.detach, RemoteWorker.dismiss])
+@pytest.mark.parametrize("end", [RemoteWorker.detach, RemoteWorker.dismiss, RemoteWorker.cancel])
 def test_nobody_waits_for_a_store_that_stalls(
     end: Callable[[RemoteWorker], None], store: ObjectStore, proxy: FaultyProxy, tmp_path: Path
 ) -> None:
@@ -168,11 +171,28 @@ def test_nobody_waits_for_a_store_that_stalls(
     until(lambda: proxy.requests, "it stores its files")
     end(worker)
     worker.kill_after(20.0)
-    if end is RemoteWorker.dismiss:
+    if end is not RemoteWorker.detach:
         assert "before the attempt was over" in f"{exits.get(timeout=20)}"
         assert events == [NotBegun()]
     else:
         assert exits.empty() and events == []
+
+
+def test_a_service_whose_store_stalls_answers_cancels_and_ends(
+    daemon: Callable[..., Any], moving: Path, scratch: Path, bucket: str, proxy: FaultyProxy
+) -> None:
+    pytest.importorskip("submitit")
+    lab = Lab(daemon, moving, scratch, LEASE_S, f"{bucket}/{new_id()}")
+    proxy.faults, proxy.share = (Fault.STALL_ANSWER,), 1.0
+    job = lab.submit(SHORT)
+    until(proxy.happened.total, "its files are stored")
+    lab.post(f"reconstructions/{job}:cancel")
+    lab.reached(job, lambda row: row["state"] == "cancelled", "it is cancelled")
+    before = proxy.happened.total()
+    lab.submit(SHORT)
+    until(lambda: proxy.happened.total() > before, "the files of another one are stored")
+    lab.one.close()
+    assert lab.one.process.returncode == 0
 
 
 def test_a_sweep_that_failed_is_repeated_soon(

@@ -67,8 +67,9 @@ class ServiceClient:
         why = "it was not asked in time"
         while True:
             try:
-                # Who was cut off must notice when the lease is over, not an answer's time later.
-                wait_s = min(_ANSWER_S, max(until_s - time.monotonic(), _PAUSE_S))
+                # Who was cut off must notice when the lease is over, and be heard again before: by another connection,
+                # since the packets of this one are repeated ever more rarely.
+                wait_s = min(_ANSWER_S, max((until_s - time.monotonic()) / 2, _PAUSE_S))
                 answer = self._http.post(
                     self._path + route, content=body, headers={"Content-Type": "application/json"}, timeout=wait_s
                 )

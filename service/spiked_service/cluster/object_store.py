@@ -22,7 +22,7 @@ _CONNECT_S = 5
 _READ_S = 15
 """Silence of S3, when it is its turn, after which a request has failed."""
 _REQUESTS = 2
-"""How often a request to S3 is sent before the operation that it belongs to has failed."""
+"""How often a request to S3 is sent before the operation that it belongs to has failed; twice as often to read."""
 _QUIET_S = 60.0
 """Time without progress after which an operation has failed: a store that stops reading has no other limit."""
 _LOOK_S = 0.5

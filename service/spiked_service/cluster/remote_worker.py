@@ -189,6 +189,16 @@ class RemoteWorker:
                 self._order = Order.STOP
         self._messages.put(None)
 
+    def cancel(self) -> None:
+        """Ask it to finish its work and exit within the time of grace, or at once if no machine has begun it."""
+        with self._lock:
+            if self._agent is None and not self._begun:
+                self._order = Order.LEAVE
+            elif self._order is Order.GO_ON:
+                self._order = Order.STOP
+            self._left_s = self._left_s or time.monotonic()
+        self._messages.put(None)
+
     def dismiss(self) -> None:
         """Ask it to exit; it is withdrawn after the time of grace."""
         with self._lock:

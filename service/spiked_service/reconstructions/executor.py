@@ -24,6 +24,10 @@ class Worker(Protocol):
         """Ask it to finish its work and exit, which may take a while."""
         ...
 
+    def cancel(self) -> None:
+        """Ask it to finish its work and exit, and end it if that takes long and it is on another machine."""
+        ...
+
     def dismiss(self) -> None:
         """Ask it to exit at once."""
         ...

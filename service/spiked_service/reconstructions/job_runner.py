@@ -93,7 +93,8 @@ class JobRunner:
         """Stop the worker; published versions are kept."""
         self._cancelled = True
         if self.row.task.reconstructs:
-            self._stop()
+            if self._worker is not None:
+                self._worker.cancel()
         else:
             self.dismiss()  # it publishes at its end only
 

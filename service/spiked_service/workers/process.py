@@ -129,6 +129,10 @@ class WorkerProcess:
         """Ask it to finish its work and exit, which may take a while."""
         self._send(STOP)
 
+    def cancel(self) -> None:
+        """Ask it to finish its work and exit, as nobody waits for it."""
+        self.stop()
+
     def dismiss(self) -> None:
         """Ask it to exit at once."""
         with self._writing:

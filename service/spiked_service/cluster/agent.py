@@ -29,19 +29,19 @@ from spiked_service.workers.process import StandbyWorker, WorkerProcess
 
 _LOOK_S = 0.1
 """Interval at which the orders of the service are looked at."""
-_SERVES_S = 3600.0
+SERVES_S = 3600.0
 """Time after which an agent takes no more attempts, so that its place in the engine goes round."""
 _IDLE_S = 2.0
 """How long an agent waits for another attempt, since the queue hands on the next when one has ended."""
 
 
-def run_agent(url: str, attempt: str, token: str) -> None:
-    """Work for an attempt to its end, then for others that wait, for an hour at most. Returns early if one is over.
+def run_agent(url: str, attempt: str, token: str, serves_s: float = SERVES_S) -> None:
+    """Work for an attempt to its end, then for others that wait, until `serves_s`. Returns early if one is over.
 
     Raises SpikedError and OSError if the results of one cannot be stored: the service then begins another attempt.
     """
     following: Next | None = Next(attempt=attempt, token=token)
-    with _Agent(url) as agent:
+    with _Agent(url, serves_s) as agent:
         while following is not None:
             following = agent.work_for(following)
 
@@ -49,10 +49,10 @@ def run_agent(url: str, attempt: str, token: str) -> None:
 class _Agent:
     """Works for one attempt after the other. A context manager, which ends its workers."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, serves_s: float) -> None:
         self._url = url
         self._id = secrets.token_hex(8)
-        self._until_s = time.monotonic() + _SERVES_S
+        self._until_s = time.monotonic() + serves_s
         self._forks: dict[Role, ForkedWorkers] = {}
         self._number = 0
 
@@ -66,7 +66,7 @@ class _Agent:
             forks.close()
 
     def work_for(self, given: Next) -> Next | None:
-        """Work for an attempt. Return the next one, if there is one and the hour is not over."""
+        """Work for an attempt. Return the next one, if there is one and its time is not over."""
         self._number += 1
         service = ServiceClient(self._url, given.attempt, given.token)
         try:

@@ -9,11 +9,15 @@ from typing import Any
 
 import submitit
 
-from spiked_service.cluster.agent import run_agent
+from spiked_service.cluster.agent import SERVES_S, run_agent
 from spiked_service.cluster.engine import EngineOptions
 
 _OLD_S = 14 * 86_400.0
 """Age of a folder whose job has surely ended, or been replaced by another attempt."""
+
+
+_OF_THE_LIMIT = 0.25
+"""Share of Slurm's limit of time after which an agent takes no more attempts: the rest is for its last one."""
 
 
 class SubmititTasks:
@@ -22,18 +26,20 @@ class SubmititTasks:
     def __init__(self, options: EngineOptions) -> None:
         self._folder = Path(options.folder)
         self._executor = submitit.AutoExecutor(folder=self._folder / "%j", cluster=options.address or None)
-        given: dict[str, Any] = {name: _number(value) for name, value in options.options.items()}
+        given: dict[str, Any] = {"timeout_min": 24 * 60}
+        given |= {name: _number(value) for name, value in options.options.items()}
         self._executor.update_parameters(
-            **{"name": "spiked", "timeout_min": 24 * 60, "cpus_per_task": options.cpus}
+            **{"name": "spiked", "cpus_per_task": options.cpus}
             | ({"gpus_per_node": int(options.gpus)} if options.gpus else {})
             | given
         )
+        self._serves_s = min(SERVES_S, given["timeout_min"] * 60 * _OF_THE_LIMIT)
         self._jobs: dict[str, Any] = {}
         self._remove_old()
 
     def submit(self, attempt: str, arguments: Sequence[str]) -> None:
         """Submit the job; Slurm waits for the resources."""
-        self._jobs[attempt] = self._executor.submit(run_agent, *arguments)
+        self._jobs[attempt] = self._executor.submit(run_agent, *arguments, self._serves_s)
 
     def cancel(self, attempt: str) -> None:
         """Cancel the job. One of an earlier engine has no job here: its agent is refused and exits."""

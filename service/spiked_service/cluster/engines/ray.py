@@ -34,7 +34,8 @@ class _Agent:
     @staticmethod
     def _run(arguments: Sequence[str]) -> None:
         try:
-            run_agent(*arguments)
+            url, attempt, token = arguments
+            run_agent(url, attempt, token)
         except BaseException:
             traceback.print_exc()
         finally:

@@ -26,6 +26,12 @@ _PAUSE_S = 0.5
 """Pause between two attempts to reach the service."""
 _ANSWER_S = 10.0
 """Time for one answer."""
+_LEAST_ANSWER_S = 1.0
+"""The same as the end of the lease comes closer.
+
+Who was cut off must notice in time, and be heard again before, by another connection: packets of the one that had no
+answer are repeated ever more rarely.
+"""
 _MOST_EVENTS = 500
 """Events kept while the service does not answer; then only those that the outcome depends on are."""
 _ASK_AGAIN_S = 0.2
@@ -62,14 +68,15 @@ class ServiceClient:
             self.post(":begin", asked.model_dump_json(), time.monotonic() + _BEGIN_S)
         )
 
-    def post(self, route: str, body: str, until_s: float) -> bytes:
-        """Post, again until the time `until_s` of the monotonic clock. Raises RefusedError, UnansweredError."""
+    def post(self, route: str, body: str, until_s: float, answer_s: float | None = None) -> bytes:
+        """Post, again until the time `until_s` of the monotonic clock. Raises RefusedError, UnansweredError.
+
+        One answer has `answer_s`, or half of the time that is left.
+        """
         why = "it was not asked in time"
         while True:
             try:
-                # Who was cut off must notice when the lease is over, and be heard again before: by another connection,
-                # since the packets of this one are repeated ever more rarely.
-                wait_s = min(_ANSWER_S, max((until_s - time.monotonic()) / 2, _PAUSE_S))
+                wait_s = answer_s or min(_ANSWER_S, max((until_s - time.monotonic()) / 2, _LEAST_ANSWER_S))
                 answer = self._http.post(
                     self._path + route, content=body, headers={"Content-Type": "application/json"}, timeout=wait_s
                 )
@@ -88,7 +95,7 @@ class ServiceClient:
         """Another attempt, once this one has ended; None if none waits within `wait_s`. Raises RefusedError."""
         until_s = time.monotonic() + wait_s
         while True:
-            found = _next.validate_json(self.post(":next", Report(agent=agent).model_dump_json(), until_s))
+            found = _next.validate_json(self.post(":next", Report(agent=agent).model_dump_json(), until_s, _ANSWER_S))
             if found is not None or time.monotonic() > until_s:
                 return found
             time.sleep(_ASK_AGAIN_S)

@@ -124,7 +124,16 @@ class Service:
         self._port = free_port()
         flags = [part for name, value in settings.items() for part in ("--set", f"{name}={value}")]
         source = f"replay:{folder / 'small.dat'}?pace=0"
-        self._command = [sys.executable, "-m", "spiked_service", "serve", "--no-capture", "--port", str(self._port)]
+        self._command = [
+            sys.executable,
+            "-m",
+            "spiked_service",
+            "serve",
+            "--no-capture",
+            "--no-zmq",
+            "--port",
+            str(self._port),
+        ]
         self._command += ["--device", source, "--data", str(self.data), "--runtime", str(folder / "runtime")]
         self._command += [*flags, "--set", f"source_folders={folder}", "--set", "log_level=warning"]
         self.http = httpx.Client(base_url=f"http://127.0.0.1:{self._port}/api/v1", timeout=60)

@@ -59,6 +59,22 @@ def test_an_attempt_that_begins_and_stores_during_sweeps_loses_nothing(store: Ob
     assert store.folders() == []
 
 
+def test_uploads_that_nobody_goes_on_with_are_ended(bucket: str) -> None:
+    """Of agents and services that were killed while they stored something large: no listing of objects shows them."""
+    import s3fs
+
+    files, store = s3fs.S3FileSystem(), ObjectStore(bucket).below(new_id())
+    job, alive, over, name = (new_id() for _ in range(4))
+    root = store.uri.partition("://")[2].partition("/")[2]
+    wanted = {f"{root}/{job}/{alive}/outputs/1", f"{root}-of-somebody-else/x"}
+    left = {f"{root}/{job}/{over}/outputs/1", f"{root}/recordings/{name}"}
+    for key in wanted | left:
+        files.call_s3("create_multipart_upload", Bucket="spiked-test", Key=key)
+    sweeper_of(store, lambda attempt: attempt == alive).sweep()
+    assert {one["Key"] for one in files.list_multipart_uploads("spiked-test")} >= wanted
+    assert not {one["Key"] for one in files.list_multipart_uploads("spiked-test")} & left
+
+
 def test_a_sweeper_sweeps_at_its_start_and_whenever_it_is_woken(tmp_path: Path) -> None:
     store = ObjectStore(tmp_path.as_uri())
     store.below(new_id(), new_id()).put("a", b"left by an earlier service")

@@ -1,6 +1,7 @@
 """The object store of a job's files: any URI that fsspec knows, such as `file:///shared/jobs` or `s3://bucket/jobs`."""
 
 import asyncio
+import errno
 import hashlib
 import os
 import time
@@ -145,6 +146,31 @@ class ObjectStore:
         if self.local:
             with suppress(OSError):  # it has others, or somebody has removed it
                 Path(self._root).parent.rmdir()
+
+    def end_uploads(self, is_over: Callable[[str], bool]) -> int:
+        """Give up uploads in parts that nobody goes on with: S3 keeps what came of them, and lists it nowhere else.
+
+        `is_over` takes the name of the object, below this store. Returns how many; 0 for a store without such things.
+        """
+        if not self._is("s3"):
+            return 0
+        bucket, _, key = self._root.partition("/")
+        prefix = f"{key.rstrip('/')}/"
+
+        def end() -> int:
+            try:
+                found = self._call("call_s3", "list_multipart_uploads", Bucket=bucket, Prefix=prefix).get("Uploads", [])
+            except OSError as error:
+                if error.errno == errno.ENOSYS:
+                    return 0
+                raise
+            over = [one for one in found if one["Key"].startswith(prefix) and is_over(one["Key"].removeprefix(prefix))]
+            for one in over:
+                with suppress(FileNotFoundError):  # it has ended meanwhile
+                    self._call("abort_mpu", bucket, one["Key"], one["UploadId"])
+            return len(over)
+
+        return self._repeated(end, "uploads that nobody goes on with cannot be ended")
 
     def _list(self, kind: str) -> list[str]:
         def found() -> list[str]:

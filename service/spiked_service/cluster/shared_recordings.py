@@ -90,6 +90,11 @@ class SharedRecordings:
                 self._free(sha256)
         return swept
 
+    def is_left(self, sha256: str) -> bool:
+        """Whether an upload of a recording that was listed before is nobody's: one that goes on is this service's."""
+        with self._lock:
+            return sha256 not in self._busy
+
     def _free(self, sha256: str) -> None:
         with self._lock:
             self._busy.discard(sha256)

@@ -1,6 +1,7 @@
 """Removes what attempts that are over have left in the object store."""
 
 import threading
+import time
 from collections.abc import Callable
 
 from spiked.errors import SpikedError
@@ -31,6 +32,7 @@ class Sweeper:
         self._wake = threading.Condition()
         self._wanted = True
         self._closed = False
+        self._uploads_s: float | None = None
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -66,7 +68,16 @@ class Sweeper:
                     self._store.below(job, attempt).remove()
                     swept += 1
         self._recordings.sweep()
+        if self._uploads_s is None or time.monotonic() - self._uploads_s > _SWEEP_S:
+            self._store.end_uploads(self._is_over)
+            self._recordings.store.end_uploads(self._recordings.is_left)
+            self._uploads_s = time.monotonic()
         return swept
+
+    def _is_over(self, name: str) -> bool:
+        """Whether an object belongs to an attempt that is over."""
+        job, attempt, *_ = (*name.split("/"), "")
+        return is_id(job) and is_id(attempt) and not self._alive(attempt)
 
     def _run(self) -> None:
         pause_s = _SWEEP_S

@@ -19,6 +19,8 @@ from spiked.render.camera import Camera
 from spiked.scene import Scene
 
 DILATION_PX2 = 0.3
+LENS_DILATION_PX2 = 0.05
+"""Part of the dilation that is added in the picture of a lens; the rest is bent with the picture."""
 """Added to the diagonal of a projected covariance, px^2. This and the next three are the values of the code of 3D
 Gaussian splatting (Kerbl et al. 2023)."""
 ALPHA_CAP = 0.99
@@ -130,7 +132,7 @@ def render_moving(
         time = torch.where(length > 0, (low + high) / 2 - s - 0.5, 0.0)
         motion = end.centres - begin.centres
         half = (begin.halves + end.halves) / 2
-        sharp = half @ half.transpose(1, 2) + DILATION_PX2 * torch.eye(2, dtype=torch.float64)
+        sharp = half @ half.transpose(1, 2) + begin.dilation
         blurred = sharp + blur * motion[:, :, None] * motion[:, None, :]
         fade = torch.sqrt(torch.linalg.det(sharp) / torch.linalg.det(blurred))
         order = torch.argsort((begin.z + end.z).detach(), stable=True)
@@ -150,8 +152,10 @@ class _Projection:
     centres: Tensor
     """Means on screen, px; [N, 2]."""
     halves: Tensor
-    """M whose M M^T is the covariance on screen without dilation; [N, 2, 3]."""
+    """M whose M M^T is the covariance on screen without `dilation`; [N, 2, 3], or [N, 2, 5] through a lens."""
     z: Tensor
+    dilation: Tensor
+    """What is added to the covariances, [2, 2]."""
 
 
 @dataclass(frozen=True)
@@ -174,14 +178,19 @@ def _project(parameters: Parameters, camera: Camera, pose: tuple[Tensor, Tensor]
     slope_y = (y / z).clamp(-limit_y, limit_y)
     jacobian = torch.stack([k.fx / z, zero, -k.fx * slope_x / z, zero, k.fy / z, -k.fy * slope_y / z], 1).view(-1, 2, 3)
     spread = _rotations(parameters.quats) * torch.exp(parameters.log_scales)[:, None, :]
+    halves = jacobian @ rotation.T @ spread
+    dilation = DILATION_PX2
     seen_x, seen_y = x / z, y / z
     if k.distortion is not None:
         z = torch.where(seen_x**2 + seen_y**2 <= reach**2, z, zero)  # beyond its reach a lens would fold the image
         seen_x, seen_y, bend = _bent(k.distortion, seen_x, seen_y)
         focal = torch.tensor([k.fx, k.fy], dtype=torch.float64)
-        jacobian = (focal[:, None] * bend / focal) @ jacobian
+        bend = focal[:, None] * bend / focal
+        bent_dilation = np.sqrt(DILATION_PX2 - LENS_DILATION_PX2) * torch.eye(2, dtype=torch.float64)
+        halves = bend @ torch.cat([halves, bent_dilation.expand(len(z), 2, 2)], 2)
+        dilation = LENS_DILATION_PX2
     centres = torch.stack([k.fx * seen_x + k.cx, k.fy * seen_y + k.cy], 1)
-    return _Projection(centres, jacobian @ rotation.T @ spread, z)
+    return _Projection(centres, halves, z, dilation * torch.eye(2, dtype=torch.float64))
 
 
 def _limits(camera: Camera) -> tuple[float, float, float]:
@@ -231,7 +240,7 @@ def render_pose(
     order = torch.argsort(seen.z.detach(), stable=True)
     order = order[seen.z[order].detach() >= near]
     half = seen.halves[order]
-    covariance = half @ half.transpose(1, 2) + DILATION_PX2 * torch.eye(2, dtype=torch.float64)
+    covariance = half @ half.transpose(1, 2) + seen.dilation
     splats = _OnScreen(seen.centres[order], covariance, seen.z[order])
     opacity = torch.sigmoid(parameters.opacity_logits[order])
     return _composite(camera, splats, opacity, parameters.colours[order], background, None)

@@ -87,3 +87,23 @@ def test_splats_beyond_the_reach_of_a_lens_are_not_folded_back() -> None:
 
 def test_the_cpu_renders_images_with_distortion() -> None:
     assert isinstance(rasteriser_for(bent(scenes.camera(), "barrel")), Rasteriser)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_thin_splats_are_as_thick_as_without_the_lens(lens: str) -> None:
+    """But for a sixth, the added blur is that of a pinhole camera's picture, bent with it."""
+    camera = bent(scenes.camera(160, 120, 140.0), lens)
+    splats = scenes.splats(400, 1, 2, 1e-3)
+    splats.means[:, 2] = np.abs(splats.means[:, 2])
+    k, pose = camera.intrinsics, (np.eye(3)[None], np.zeros((1, 3)))
+    y, x = np.mgrid[0:120, 0:160] + 0.5
+    at = k.unproject(np.stack([x, y], -1))
+    wide = Camera(Intrinsics(k.fx, k.fy, 200.0, 150.0), 400, 300)
+    plain = Rasteriser(wide).forward(splats, *pose).values
+    places = (wide.intrinsics.project(at) - 0.5).astype(np.float32)
+    radius = np.hypot(x - 80, y - 60)
+    outer = ((places > 2) & (places < [397, 297])).all(-1) & (radius > 60)
+    expected = cv2.remap(plain, places, None, cv2.INTER_LINEAR)[outer]
+    seen = Rasteriser(camera).forward(splats, *pose).values[outer]
+    # With all of the blur in the picture of the lens it would be 3 for the fisheye.
+    assert abs(seen.sum() / expected.sum() - 1) < (0.4 if lens == "fisheye" else 0.1)

@@ -63,7 +63,7 @@ SPIKED_DEVICE static inline void cover(const Planes& planes, int64_t count, doub
 struct SubFrameProjection {
     ProjectionLanes begin, end;
     Vec u, v, du, dv;                                             // mean in the middle, px; motion from begin to end
-    Vec m0[3], m1[3];                                             // averages of M's rows
+    Vec m0[kMostColumns], m1[kMostColumns];                       // averages of M's rows
     Vec xx, xy, yy, determinant;                                  // of the covariance in the middle
     Vec blurred_xx, blurred_xy, blurred_yy, blurred_determinant;  // with the blur
     Vec p, q, r;                                                  // of the blurred covariance
@@ -82,31 +82,23 @@ SPIKED_DEVICE static inline SubFrameProjection project_sub_frame(const Prepared&
     o.v = 0.5f * camera.fy * (by + ey) + camera.cy;
     o.du = camera.fx * (ex - bx);
     o.dv = camera.fy * (ey - by);
-    Vec along{}, across{}, mixed{}, area{}, swept{};
-    for (int k = 0; k < 3; ++k) {
+    Vec swept{};
+    for (int k = 0; k < kColumns<Bent>; ++k) {
         o.m0[k] = 0.5f * (b.m0[k] + e.m0[k]);
         o.m1[k] = 0.5f * (b.m1[k] + e.m1[k]);
-        along += o.m0[k] * o.m0[k];
-        across += o.m1[k] * o.m1[k];
-        mixed += o.m0[k] * o.m1[k];
         const Vec beside = o.m0[k] * o.dv - o.m1[k] * o.du;
         swept += beside * beside;
     }
-    for (int k = 0; k < 3; ++k) {
-        const int i = (k + 1) % 3, j = (k + 2) % 3;
-        const Vec c = o.m0[i] * o.m1[j] - o.m0[j] * o.m1[i];
-        area += c * c;
-    }
-    o.xx = along + kDilation;
-    o.yy = across + kDilation;
-    o.xy = mixed;
-    // The squared areas between the columns of M, the motion and the dilation, free of the cancellation in xx yy -
-    // xy^2.
-    o.determinant = area + kDilation * (along + across) + kDilation * kDilation;
+    constexpr float added = kAdded<Bent>;
+    Vec along, across, area;
+    squares_of<kColumns<Bent>>(o.m0, o.m1, along, across, o.xy, area);
+    o.xx = along + added;
+    o.yy = across + added;
+    o.determinant = area + added * (along + across) + added * added;
     o.blurred_xx = o.xx + sub_frame.blur * o.du * o.du;
     o.blurred_xy = o.xy + sub_frame.blur * o.du * o.dv;
     o.blurred_yy = o.yy + sub_frame.blur * o.dv * o.dv;
-    o.blurred_determinant = o.determinant + sub_frame.blur * (swept + kDilation * (o.du * o.du + o.dv * o.dv));
+    o.blurred_determinant = o.determinant + sub_frame.blur * (swept + added * (o.du * o.du + o.dv * o.dv));
     o.p = sqrt(kHalfLog2e * o.blurred_yy / o.blurred_determinant);
     o.q = -kHalfLog2e * o.blurred_xy / (o.blurred_determinant * o.p);
     o.r = sqrt(kHalfLog2e / o.blurred_yy);
@@ -191,8 +183,8 @@ SPIKED_DEVICE SPIKED_INLINED static inline void unproject_moving_at(const Prepar
     const Vec g_dv = scale * (o.q * sum(kVut) + o.r * sum(kVwt)) + sub_frame.blur * (b_xy * o.du + b_yy * o.dv);
     const Vec unfade = opacity / o.determinant;
     const Vec c_xx = b_xx + unfade * o.yy, c_xy = b_xy - unfade * o.xy, c_yy = b_yy + unfade * o.xx;
-    Vec d_m0[3], d_m1[3];
-    for (int k = 0; k < 3; ++k) {
+    Vec d_m0[kMostColumns], d_m1[kMostColumns];
+    for (int k = 0; k < kColumns<Bent>; ++k) {
         d_m0[k] = 0.5f * (c_xx * o.m0[k] + c_xy * o.m1[k]);
         d_m1[k] = 0.5f * (c_xy * o.m0[k] + c_yy * o.m1[k]);
     }

@@ -9,6 +9,18 @@ constexpr float kLog2Cut = 7.994353437f;    // log2(255)
 constexpr float kHalfLog2e = 0.721347520f;  // log2(e) / 2
 constexpr float kLog2e = 1.442695041f;
 
+// Through a lens only a part of the dilation is added to the covariance in its picture. The rest is added to that of a
+// pinhole camera of the same focal length and bent with it, as two more columns of M: otherwise a map that was fitted
+// where the lens shrinks the scene would have gaps when it is shown without distortion
+// (docs/decisions/0023-lenses-in-the-projection.md).
+constexpr float kLensDilation = 0.05f;  // px^2
+constexpr float kBentDilation = 0.5f;   // px; its square and kLensDilation are kDilation
+constexpr int kMostColumns = 5;
+template <bool Bent>
+constexpr int kColumns = Bent ? kMostColumns : 3;
+template <bool Bent>
+constexpr float kAdded = Bent ? kLensDilation : kDilation;
+
 // Columns of an array of rows, kLanes rows from `first`; beyond the count the last row is repeated.
 template <int Columns>
 SPIKED_DEVICE static inline void read_rows(const float* rows, int first, int count, Vec out[Columns]) {
@@ -77,7 +89,7 @@ struct ProjectionLanes {
     Vec seen_x, seen_y;    // x/z and y/z, bent by the lens
     BendLanes bend;        // only with a lens
     Vec b[9];              // W times spread
-    Vec m0[3], m1[3];
+    Vec m0[kMostColumns], m1[kMostColumns];
     Vec xx, xy, yy, determinant;
     Vec p, q, r;
 };
@@ -135,6 +147,26 @@ SPIKED_DEVICE static inline void bend_lanes(const PinholeF& camera, ProjectionLa
         o.m0[i] = b.xx * m0 + across * b.xy * m1;
         o.m1[i] = down * b.xy * m0 + b.yy * m1;
     }
+    o.m0[3] = kBentDilation * b.xx, o.m1[3] = kBentDilation * down * b.xy;
+    o.m0[4] = kBentDilation * across * b.xy, o.m1[4] = kBentDilation * b.yy;
+}
+
+// The sums of squares of both rows of M, and the squared areas between its columns: the determinant of M M^T, free of
+// the cancellation in xx yy - xy^2.
+template <int Columns>
+SPIKED_DEVICE static inline void squares_of(const Vec* a, const Vec* b, Vec& aa, Vec& bb, Vec& ab, Vec& area) {
+    aa = bb = ab = area = Vec{};
+    for (int i = 0; i < Columns; ++i) {
+        aa += a[i] * a[i];
+        bb += b[i] * b[i];
+        ab += a[i] * b[i];
+    }
+    for (int k = 0; k < Columns; ++k)
+        for (int step = 1; step <= Columns / 2; ++step) {
+            const int i = (k + 1) % Columns, j = (k + 1 + step) % Columns;
+            const Vec c = a[i] * b[j] - a[j] * b[i];
+            area += c * c;
+        }
 }
 
 template <bool Bent>
@@ -162,15 +194,12 @@ SPIKED_DEVICE static inline ProjectionLanes project_lanes(const Prepared& s, con
         o.m1[k] = jy * (o.b[3 + k] - o.slope_y * o.b[6 + k]);
     }
     if constexpr (Bent) bend_lanes(camera, o);
-    Vec* a = o.m0;
-    Vec* b = o.m1;
-    Vec aa = a[0] * a[0] + a[1] * a[1] + a[2] * a[2], bb = b[0] * b[0] + b[1] * b[1] + b[2] * b[2];
-    o.xx = aa + kDilation;
-    o.yy = bb + kDilation;
-    o.xy = a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-    // |a x b|^2 is the determinant without the dilation, free of the cancellation in xx yy - xy^2.
-    Vec c0 = a[1] * b[2] - a[2] * b[1], c1 = a[2] * b[0] - a[0] * b[2], c2 = a[0] * b[1] - a[1] * b[0];
-    o.determinant = c0 * c0 + c1 * c1 + c2 * c2 + kDilation * (aa + bb) + kDilation * kDilation;
+    constexpr float added = kAdded<Bent>;
+    Vec aa, bb, area;
+    squares_of<kColumns<Bent>>(o.m0, o.m1, aa, bb, o.xy, area);
+    o.xx = aa + added;
+    o.yy = bb + added;
+    o.determinant = area + added * (aa + bb) + added * added;
     o.p = sqrt(kHalfLog2e * o.yy / o.determinant);
     o.q = -kHalfLog2e * o.xy / (o.determinant * o.p);
     o.r = sqrt(kHalfLog2e / o.yy);
@@ -238,7 +267,7 @@ SPIKED_DEVICE static inline void add(float* p, Vec v) { store(p, load(p) + v); }
 
 // From gradients by what the lens shows to gradients by what a camera without distortion would show.
 SPIKED_DEVICE static inline void straighten_gradients(const PinholeF& camera, const ProjectionLanes& o, Vec& g_u,
-                                                      Vec& g_v, Vec d_m0[3], Vec d_m1[3], Vec& d_x, Vec& d_y) {
+                                                      Vec& g_v, Vec* d_m0, Vec* d_m1, Vec& d_x, Vec& d_y) {
     const BendLanes& b = o.bend;
     const float across = camera.fx / camera.fy, down = camera.fy / camera.fx;
     const Vec u = g_u, v = g_v;
@@ -255,6 +284,9 @@ SPIKED_DEVICE static inline void straighten_gradients(const PinholeF& camera, co
         d_m0[k] = b.xx * d0 + down * b.xy * d1;
         d_m1[k] = across * b.xy * d0 + b.yy * d1;
     }
+    xx += kBentDilation * d_m0[3];
+    mixed += kBentDilation * (down * d_m1[3] + across * d_m0[4]);
+    yy += kBentDilation * d_m1[4];
     d_x = xx * b.xxx + mixed * b.xxy + yy * b.xyy;
     d_y = xx * b.xxy + mixed * b.xyy + yy * b.yyy;
 }
@@ -264,11 +296,12 @@ SPIKED_DEVICE static inline void straighten_gradients(const PinholeF& camera, co
 template <bool Bent>
 SPIKED_DEVICE static inline void unproject_lanes(const Prepared& splats, const PinholeF& camera, const View& view,
                                                  const ProjectionLanes& o, Int seen, int base, int into, Vec g_u,
-                                                 Vec g_v, const Vec by_m0[3], const Vec by_m1[3],
-                                                 const SplatGradients& out, double pose[6]) {
+                                                 Vec g_v, const Vec* by_m0, const Vec* by_m1, const SplatGradients& out,
+                                                 double pose[6]) {
     Vec jx = camera.fx * o.over_z, jy = camera.fy * o.over_z;
     Vec d_spread[9], d_jx{}, d_jy{}, d_jxz{}, d_jyz{};
-    Vec d_m0[3] = {by_m0[0], by_m0[1], by_m0[2]}, d_m1[3] = {by_m1[0], by_m1[1], by_m1[2]};
+    Vec d_m0[kMostColumns], d_m1[kMostColumns];
+    for (int k = 0; k < kColumns<Bent>; ++k) d_m0[k] = by_m0[k], d_m1[k] = by_m1[k];
     Vec d_x{}, d_y{};  // by the slopes, through the derivatives of the lens
     if constexpr (Bent) straighten_gradients(camera, o, g_u, g_v, d_m0, d_m1, d_x, d_y);
     for (int k = 0; k < 3; ++k) {
@@ -337,8 +370,8 @@ SPIKED_DEVICE SPIKED_INLINED static inline void unproject_at(const Prepared& spl
     Vec c_xy = scale * scale * o.p * (o.q * suu + o.r * suw);
     Vec c_yy = scale * scale * (o.q * (o.q * suu + 2 * o.r * suw) + o.r * o.r * sww);
 
-    Vec d_m0[3], d_m1[3];
-    for (int k = 0; k < 3; ++k) {
+    Vec d_m0[kMostColumns], d_m1[kMostColumns];
+    for (int k = 0; k < kColumns<Bent>; ++k) {
         d_m0[k] = c_xx * o.m0[k] + c_xy * o.m1[k];
         d_m1[k] = c_xy * o.m0[k] + c_yy * o.m1[k];
     }

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from spiked.render.choice import AnyRasteriser, chosen
 from spiked.render.gpu import GpuRasteriser, device_errors
 from spiked.render.optimiser import Adam
-from spiked.render.splats import AnySplats, DeviceScene, Floats
+from spiked.render.splats import AnySplats, DeviceScene, Floats, SizeLimits
 from spiked.scene import Scene
 
 
@@ -60,19 +60,17 @@ class Descent:
         self._scene = self.scene.select(rows)
         self.adam.keep(rows)
 
-    def step(
-        self, rasteriser: AnyRasteriser, slope: Floats, rates: tuple[float, ...], most_log_scale: np.float32
-    ) -> None:
+    def step(self, rasteriser: AnyRasteriser, slope: Floats, rates: tuple[float, ...], limits: SizeLimits) -> None:
         """Change the splats that the last image of `rasteriser`, a render of `model`, shows: slope is the gradient by
         its values, and rates are those of the five arrays.
 
-        Colours below 0 become 0, as viewers show them as black, and log scales stay at or below most_log_scale.
+        Colours below 0 become 0, as viewers show them as black, and splats stay within the `limits`.
         """
         gradients = rasteriser.backward(slope)
         scene = self._scene
         self.adam.step(scene.arrays(), gradients.arrays(), rates, gradients.radius_px > 0)
         np.maximum(scene.colours, 0, out=scene.colours)
-        np.minimum(scene.log_scales, most_log_scale, out=scene.log_scales)
+        np.minimum(scene.log_scales, limits.most(scene.means), out=scene.log_scales)
 
 
 class DeviceDescent(Descent):
@@ -132,9 +130,7 @@ class DeviceDescent(Descent):
             self._device.native.select(np.flatnonzero(rows).astype(np.uint32))
         self._behind = True
 
-    def step(
-        self, rasteriser: AnyRasteriser, slope: Floats, rates: tuple[float, ...], most_log_scale: np.float32
-    ) -> None:
+    def step(self, rasteriser: AnyRasteriser, slope: Floats, rates: tuple[float, ...], limits: SizeLimits) -> None:
         """See `Descent.step`."""
         assert isinstance(rasteriser, GpuRasteriser)
         if self._device is None:
@@ -143,7 +139,7 @@ class DeviceDescent(Descent):
                 device.native.set(*self._scene.arrays(), *self.adam.packed())
             self._device = device
         beta1, beta2, _ = self._settings
-        rasteriser.descend(slope, self._device, rates, beta1, beta2, self.adam.epsilon, float(most_log_scale))
+        rasteriser.descend(slope, self._device, rates, beta1, beta2, self.adam.epsilon, limits)
         self._behind = True
 
     def _fetch(self) -> None:

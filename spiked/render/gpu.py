@@ -16,7 +16,7 @@ import spiked.native._gpu as _gpu
 from spiked.errors import ConfigurationError
 from spiked.render.camera import Camera
 from spiked.render.cpu import Rasteriser
-from spiked.render.splats import AnySplats, DeviceScene, Floats, Gradients, RenderedImage
+from spiked.render.splats import AnySplats, DeviceScene, Floats, Gradients, RenderedImage, SizeLimits
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics
 
@@ -95,7 +95,7 @@ class GpuRasteriser(Rasteriser):
         beta1: float,
         beta2: float,
         epsilon: float,
-        most_log_scale: float,
+        limits: SizeLimits,
     ) -> None:
         """`backward` and a step of Adam on the device, as in `Descent.step`. The last image was of `scene`, or of the
         splats that it was set to."""
@@ -103,7 +103,7 @@ class GpuRasteriser(Rasteriser):
         with device_errors():
             self._native.descend(
                 np.ascontiguousarray(d_values, np.float32), scene.native, np.array(rates, np.float32), beta1, beta2,
-                epsilon, most_log_scale,
+                epsilon, limits.log_scale, limits.widest, np.array(limits.centre, np.float32),
             )  # fmt: skip
 
     def _splats(self, splats: AnySplats) -> tuple[tuple[Any, ...], int, int]:

@@ -26,6 +26,28 @@ AnySplats = Scene | DeviceScene
 
 
 @dataclass(frozen=True)
+class SizeLimits:
+    """How large splats may become in a step of gradient descent."""
+
+    log_scale: float = np.inf
+    """Largest logarithm of a standard deviation."""
+    widest: float = np.inf
+    """Largest standard deviation over the distance from `centre`: as seen from there, radians."""
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of a camera."""
+
+    def most(self, means: Floats) -> Floats:
+        """Largest logarithms of the standard deviations of splats at means [N, 3]; [N, 1], or [] for all."""
+        most = np.float32(self.log_scale)
+        if not np.isfinite(self.widest):
+            return np.asarray(most)
+        offset = means - np.array(self.centre, np.float32)
+        square = np.maximum(np.einsum("nd,nd->n", offset, offset), np.finfo(np.float32).tiny)
+        seen: Floats = 0.5 * np.log(square) + np.float32(np.log(self.widest))
+        return np.minimum(most, seen)[:, None]
+
+
+@dataclass(frozen=True)
 class RenderedImage:
     """A rendered image of H rows and W columns; with sub-poses, sums or means over them."""
 

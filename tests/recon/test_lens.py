@@ -11,6 +11,7 @@ from spiked.distortion import Distortion, LensModel
 from spiked.evaluate import score_trajectory
 from spiked.pose import exp_so3
 from spiked.recon import Options, Reconstructor
+from spiked.recon.mapping.pruning import Pruning
 from spiked.recon.mapping.frame_warp import FrameWarp
 from spiked.recon.odometry.bundle_adjustment import Bundle
 from spiked.recon.odometry.initialisation import Views, bootstrap
@@ -143,8 +144,11 @@ def test_a_room_is_reconstructed_through_a_lens(k: Intrinsics) -> None:
     views = [reconstructor.views.image(i) for i in reconstructor.views.spread(reconstructor.views.kept, 4)]
     path = reconstructor.path
     assert path is not None
+    scene, widest = reconstructor.scene(), Pruning().widest
     for view in views:
         (rotation,), (centre,) = path.poses([view.time])
+        distance = np.linalg.norm(scene.means - centre, axis=1)
+        assert (np.exp(scene.log_scales.max(1)) < 1.5 * widest * distance).all()
         shown = reconstructor.view(rotation, centre)[..., 0]
         assert np.corrcoef(shown.ravel(), view.rate.ravel())[0, 1] > 0.9
     assert reconstructor.report()["distortion"]["k1"] == k.distortion.coefficients[0]  # type: ignore[index, union-attr]

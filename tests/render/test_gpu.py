@@ -14,6 +14,7 @@ from spiked.errors import ConfigurationError
 from spiked.native import _gpu
 from spiked.render import Camera, Rasteriser, gpu
 from spiked.render.descent import Descent, DeviceDescent, descent_for
+from spiked.render.splats import SizeLimits
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Mosaic
 
@@ -192,7 +193,7 @@ def test_descent_on_the_device(device: str) -> None:
     """Steps, splats added and removed, and a checkpoint: the scene is that of the CPU."""
     case = Case("three colours")
     rates = (1e-3, 2e-3, 3e-3, 4e-2, 5e-3)
-    most, rng = np.float32(np.log(0.2)), np.random.default_rng(8)
+    limits, rng = SizeLimits(float(np.log(0.1)), 0.04, (0.1, -0.2, -1.0)), np.random.default_rng(8)
     keep = rng.random(150) < 0.8
     fits: list[Descent] = [Descent(_copy(case.splats), 0.9, 0.99, 1), DeviceDescent(_copy(case.splats), 0.9, 0.99, 1)]
     rasterisers = Rasteriser(case.camera, 1), gpu.GpuRasteriser(case.camera, device=device)
@@ -210,7 +211,7 @@ def test_descent_on_the_device(device: str) -> None:
                 fits[i] = fits[i].moved()
                 assert type(fits[i]) is type(descent_for(case.splats, 0.9, 0.99))
             rasteriser.forward_moving(fits[i].model, case.rotations, case.centres, case.windows)
-            fits[i].step(rasteriser, slopes, rates, most)
+            fits[i].step(rasteriser, slopes, rates, limits)
         assert len(fits[0].model) == len(fits[1].model)
     ours, theirs = (fit.scene for fit in fits)
     for mine, other, begin, rate in zip(
@@ -218,7 +219,10 @@ def test_descent_on_the_device(device: str) -> None:
     ):
         assert np.abs(mine - begin).max() > rate  # they moved
         assert np.abs(mine - other).max() < 0.05 * rate
-    assert theirs.log_scales.max() <= most
+    most = limits.most(theirs.means)
+    assert (theirs.log_scales <= most + 1e-5).all()
+    assert (theirs.log_scales > most - 1e-5).any()
+    assert 0.1 < (most < limits.log_scale).mean() < 0.9
     assert np.array_equal(fits[0].adam.taken, fits[1].adam.taken)
 
 

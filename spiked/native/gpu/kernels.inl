@@ -633,7 +633,13 @@ struct Descend {
                 move(colour, gradients.colour, n, colours, rates.rates[4] * correction, m, v);
             }
             for (int k = 0; k < colours; ++k) colour[n * colours + k] = fmaxf(colour[n * colours + k], 0);
-            for (int k = 0; k < 3; ++k) log_scales[3 * n + k] = fminf(log_scales[3 * n + k], rates.most_log_scale);
+            float square = 0;
+            for (int k = 0; k < 3; ++k) {
+                const float offset = means[3 * n + k] - rates.centre[k];
+                square += offset * offset;
+            }
+            const float most = fminf(rates.most_log_scale, logf(rates.widest * sqrtf(square)));
+            for (int k = 0; k < 3; ++k) log_scales[3 * n + k] = fminf(log_scales[3 * n + k], most);
         });
     }
 

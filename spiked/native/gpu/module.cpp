@@ -21,15 +21,18 @@ void forward_scene(GpuRenderer& self, GpuScene& scene, Array<const double, 3> ro
 }
 
 void descend(GpuRenderer& self, AnyArray<const float> d_values, GpuScene& scene, Array<const float, 1> rates,
-             float beta1, float beta2, float epsilon, float most_log_scale) {
+             float beta1, float beta2, float epsilon, float most_log_scale, float widest,
+             Array<const float, 1> centre) {
     expect(self.poses() > 0, "backward follows forward");
     const size_t pixels = static_cast<size_t>(self.camera().height) * self.camera().width;
     expect(d_values.size() == pixels * (self.mosaic() ? 1 : scene.colours()), "d_values has the wrong size");
     expect(self.splats().count == scene.count() && self.splats().colours == scene.colours(),
            "the last image is of another scene");
     expect(rates.shape(0) == 5, "a rate for each of the five arrays");
-    const float* r = rates.data();
-    const DescentRates given{{r[0], r[1], r[2], r[3], r[4]}, beta1, beta2, epsilon, most_log_scale};
+    expect(centre.shape(0) == 3, "a centre has three coordinates");
+    const float *r = rates.data(), *c = centre.data();
+    const DescentRates given{
+        {r[0], r[1], r[2], r[3], r[4]}, beta1, beta2, epsilon, most_log_scale, widest, {c[0], c[1], c[2]}};
     nb::gil_scoped_release release;
     self.descend(d_values.data(), scene, given);
 }
@@ -101,7 +104,7 @@ NB_MODULE(_gpu, m) {
              nb::arg("windows").none().noconvert(), nb::arg("channels").none().noconvert(), nb::arg("background"),
              nb::arg("values").noconvert(), nb::arg("alpha").noconvert(), nb::arg("depth").noconvert())
         .def("descend", &descend, nb::arg("d_values"), nb::arg("scene"), nb::arg("rates"), nb::arg("beta1"),
-             nb::arg("beta2"), nb::arg("epsilon"), nb::arg("most_log_scale"))
+             nb::arg("beta2"), nb::arg("epsilon"), nb::arg("most_log_scale"), nb::arg("widest"), nb::arg("centre"))
         .def("scene", &GpuRenderer::scene);
     m.def(
         "renderer",

@@ -35,6 +35,8 @@ struct DescentRates {
     float rates[5];  // of the five arrays
     float beta1, beta2, epsilon;
     float most_log_scale;  // log scales stay below, and colours at or above 0
+    float widest;          // and so do standard deviations over the distance from the camera at `centre`
+    float centre[3];
 };
 
 class GpuRenderer {

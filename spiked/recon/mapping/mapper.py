@@ -22,6 +22,7 @@ from spiked.recon.statistics import WHITE_PERCENTILE
 from spiked.render import AnyRasteriser, Camera
 from spiked.render.charge import ChargeLoss
 from spiked.render.descent import descent_for
+from spiked.render.splats import SizeLimits
 from spiked.scene import Scene
 from spiked.sensor import Image, Sensor
 
@@ -69,7 +70,7 @@ class Mapper:
         self.extent = 1.0
         """Size of the map in units of that of a short path, see `MapOptions.extent_px`."""
         self.steps = 0
-        self._most_log_scale = np.float32(np.inf)
+        self._most_log_scale = np.inf
         self._charge_error: Image = np.zeros((1, 1), np.float32)
         self._rng = np.random.default_rng(seed)
         self._losses: dict[int, float] = {}
@@ -164,21 +165,29 @@ class Mapper:
             slope = self._compare_rates(key, view, request, level, background)
         else:
             slope = self._compare_charge(key, request, level, background)
-        self._descend(level.rasteriser, slope, decay)
+        self._descend(level.rasteriser, slope, decay, request.centres[len(request.centres) // 2])
 
     def replay(self, replay: Replay, decay: float) -> None:
         """One gradient step towards what another map shows."""
         background = float(self._rng.uniform(0, self.options.background)) * self.white
         image = replay.render(self.descent.model, background)
         slope = self.rate_loss(image.values, replay.target(image.values), self.white)[1]
-        self._descend(replay.rasteriser, slope, decay)
+        self._descend(replay.rasteriser, slope, decay, replay.centre)
 
-    def _descend(self, rasteriser: AnyRasteriser, slope: Image, decay: float) -> None:
+    def _descend(self, rasteriser: AnyRasteriser, slope: Image, decay: float, centre: Array) -> None:
+        """A step along the gradient of an image that was seen from `centre`."""
         self.steps += 1
         o = self.options
         others = (o.rate_quats, o.rate_scales, o.rate_opacities, o.rate_colours * self.white)
         rates = tuple(decay * rate for rate in (o.rate_means * self.depth, *others))
-        self.descent.step(rasteriser, slope, rates, self._most_log_scale)
+        self.descent.step(rasteriser, slope, rates, self._limits(centre))
+
+    def _limits(self, centre: Array) -> SizeLimits:
+        """How large splats may be after a step on an image that was seen from `centre`."""
+        pruning = self.options.pruning
+        if self.camera.intrinsics.distortion is None or self.steps % pruning.widths_every:
+            return SizeLimits(self._most_log_scale)
+        return SizeLimits(self._most_log_scale, pruning.widest, (centre[0], centre[1], centre[2]))
 
     def _compare_rates(self, key: int, view: View, request: RenderRequest, level: Level, background: float) -> Image:
         """Gradient of the loss by the image, from a view's rates over its pixels' windows."""
@@ -269,7 +278,7 @@ class Mapper:
 
     def limit_sizes(self) -> None:
         """Let no splat grow beyond what `options.pruning` allows in a scene of the present size."""
-        self._most_log_scale = np.float32(np.log(self.options.pruning.largest(self.scene)))
+        self._most_log_scale = float(np.log(self.options.pruning.largest(self.scene)))
 
     def prune(self, poses: Iterable[tuple[Array, Array, float]]) -> None:
         """Remove splats that no view needs: rotation, centre and depth of the nearest points of each."""

@@ -33,6 +33,11 @@ class Pruning:
     """Percentile of the depths of a view's points that counts as the nearest."""
     span_share: float = 1 / 12
     """Largest standard deviation of a splat over the size of the scene: three of them are a quarter of it."""
+    widest: float = 0.05
+    """Largest standard deviation of a splat over its distance from a camera with distortion, radians: the picture of a
+    wider one is not that of its Jacobian, and a camera without distortion shows it elsewhere (decision 23)."""
+    widths_every: int = 20
+    """Steps between those that limit it, each by the camera of its view."""
 
     def due(self, share: float) -> int:
         """Number of prunings that should have been made at that share of the refinement."""

@@ -6,7 +6,7 @@ import pytest
 import spiked.native._bundle as _bundle
 import spiked.native._geometry as _geometry
 
-from spiked.blocks import Window
+from spiked.blocks import Window, aligned_window
 from spiked.pose import exp_so3
 from spiked.recon.frontend.feature_tracks import Tracks, flow, picture, pyramid, white_of
 from spiked.recon.frontend.spike_intervals import JITTER, SpikeIntervals
@@ -128,12 +128,14 @@ def test_a_view_is_measured_as_its_window_says(far: int) -> None:
     view = make_view(window, Sensor(W, H, 20000.0), after_gap=False)
     valid = window.valid
     assert view.intervals.start.dtype == (np.uint16 if far else np.uint8)
-    np.testing.assert_allclose(view.rate, window.rate(fill=True), rtol=1e-6)
-    np.testing.assert_array_equal(view.preview_rate(np.empty((H, W), np.float32)), view.rate)
+    shown = view.preview_rate(np.empty((H, W), np.float32))
+    np.testing.assert_allclose(shown, window.rate(fill=True), rtol=1e-6)
+    np.testing.assert_array_equal(view.rate[valid], shown[valid])
+    assert (view.rate[:10] == 0).all()
     p, m = window.rate()[valid], spikes[valid].astype(float)
     charge = p * p / 6 + JITTER * m + (0.01 * m) ** 2  # clock at both ends, jitter of each interval, scale
     np.testing.assert_allclose(view.deviation[valid], np.sqrt(charge) / window.duration()[valid], rtol=1e-5)
-    np.testing.assert_allclose(view.deviation[~valid], window.rate_bound()[~valid], rtol=1e-6)
+    np.testing.assert_allclose(view.deviation[~valid], 1 / window.frames, rtol=1e-6)
     assert view.spikes_a_pixel == pytest.approx(spikes.mean())
     first, last = view.intervals.times()
     middle = np.where(valid, np.nan_to_num(window.centre() - view.time), 0)
@@ -249,6 +251,18 @@ def test_results_are_never_written_to_a_copy() -> None:
     edges = edges_with(np.zeros((H, W)), np.uint8)
     for out in (np.empty((H, W)), np.empty((H, 2 * W), np.float32)[:, ::2]):
         with pytest.raises(TypeError):
-            edges.rate(out)  # type: ignore[arg-type]
+            edges.picture(out)  # type: ignore[arg-type]
     with pytest.raises(TypeError):
         _geometry.exponentials(np.zeros((2, 3)), np.empty((2, 9), np.float32))
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.002, 0.008, 0.012, 0.017, 0.022, 0.03])
+def test_rates_of_the_dark_are_right_in_the_mean(rate: float) -> None:
+    """Of windows in which few or no pixels fire twice: a map is fitted to their mean."""
+    frames, sensor = 80, Sensor(W, H, 20000.0)
+    phase = np.random.default_rng(5).random((H, W))
+    charge = phase + rate * np.arange(frames + 1)[:, None, None]
+    bits = (np.floor(charge[1:]) > np.floor(charge[:-1])).astype(np.uint8)
+    stored = np.packbits(bits.reshape(frames, -1), axis=1, bitorder="little")
+    view = make_view(aligned_window(stored, sensor, 0, 24, 56), sensor, after_gap=False)
+    assert float(view.rate.mean()) == pytest.approx(rate, rel=0.03)

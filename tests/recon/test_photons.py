@@ -47,7 +47,7 @@ def test_counts_tell_the_flux_and_its_noise(flux: float) -> None:
     assert 0.9 < float(np.sqrt((deviation**2).mean()) / rate.std()) < 1.15
     assert counts.times()[0].min() == -32 and counts.times()[1].max() == 32
     out = np.empty(rate.shape, np.float32)
-    assert counts.rate(out) is out
+    assert counts.picture(out) is out
     np.testing.assert_array_equal(out, rate)
 
 

@@ -44,24 +44,30 @@ constexpr uint8_t kByte = 0xFF;  // the largest number of a byte; all of them ar
 constexpr uint16_t kWord = 0xFFFF;
 // Relative error of the scale of a charge, which does not fall with the number of spikes.
 constexpr float kChargeError = 0.01f;
-SPIKED_INLINE float bound(bool seen, float per_frame) { return (seen ? 2.0f : 1.0f) * per_frame; }
 
+// Where no interval was seen there is a spike or none in all frames read. As half of the bounds; or so that the mean
+// over windows that begin anywhere between two spikes is the rate. A spike is alone if D = 1 / rate exceeds its
+// distance d to the farther end of the n frames: its rate is n / (2 d^2), because the mean of that from n / 2 to D is 1
+// / D.
 template <class T>
-SPIKED_INLINE void rate_pixels(Intervals<T> e, T never, float per_frame, float* __restrict out) {
+SPIKED_INLINE void rate_pixels(Intervals<T> e, T never, float frames, bool unbiased, float* __restrict out) {
+    const float per_frame = 1 / frames, silent = unbiased ? 0.0f : 0.5f * per_frame;
     for (int64_t i = 0; i < e.count; ++i) {
         const float m = e.spikes[i], time = static_cast<float>(e.stop[i] - e.start[i]);
-        out[i] = m > 0 ? m / time : 0.5f * bound(e.start[i] != never, per_frame);
+        const float at = static_cast<float>(e.start[i]) + 0.5f, far = std::max(at, frames - at);
+        const float alone = unbiased ? 0.5f * frames / (far * far) : per_frame;
+        out[i] = m > 0 ? m / time : e.start[i] != never ? alone : silent;
     }
 }
 
 template <class T>
-SPIKED_INLINE void deviation_pixels(Intervals<T> e, T never, float per_frame, float jitter, float* __restrict out) {
+SPIKED_INLINE void deviation_pixels(Intervals<T> e, float per_frame, float jitter, float* __restrict out) {
     for (int64_t i = 0; i < e.count; ++i) {
         const float m = e.spikes[i], per_time = 1 / std::max(static_cast<float>(e.stop[i] - e.start[i]), 1.0f);
         const float p = m * per_time;
         // Both spikes are known to the frame: twice the variance 1/12 of a uniform distribution.
         const float charge = p * p / 6 + jitter * m + (kChargeError * m) * (kChargeError * m);
-        out[i] = m > 0 ? std::sqrt(charge) * per_time : bound(e.start[i] != never, per_frame);
+        out[i] = m > 0 ? std::sqrt(charge) * per_time : per_frame;
     }
 }
 
@@ -74,17 +80,17 @@ SPIKED_INLINE void time_pixels(Intervals<T> e, float middle, float half, float* 
     }
 }
 
-SPIKED_CLONES void rate_all(Intervals<uint8_t> e, float per_frame, float* out) {
-    rate_pixels(e, kByte, per_frame, out);
+SPIKED_CLONES void rate_all(Intervals<uint8_t> e, float frames, bool unbiased, float* out) {
+    rate_pixels(e, kByte, frames, unbiased, out);
 }
-SPIKED_CLONES void rate_all(Intervals<uint16_t> e, float per_frame, float* out) {
-    rate_pixels(e, kWord, per_frame, out);
+SPIKED_CLONES void rate_all(Intervals<uint16_t> e, float frames, bool unbiased, float* out) {
+    rate_pixels(e, kWord, frames, unbiased, out);
 }
 SPIKED_CLONES void deviation_all(Intervals<uint8_t> e, float per_frame, float jitter, float* out) {
-    deviation_pixels(e, kByte, per_frame, jitter, out);
+    deviation_pixels(e, per_frame, jitter, out);
 }
 SPIKED_CLONES void deviation_all(Intervals<uint16_t> e, float per_frame, float jitter, float* out) {
-    deviation_pixels(e, kWord, per_frame, jitter, out);
+    deviation_pixels(e, per_frame, jitter, out);
 }
 SPIKED_CLONES void time_all(Intervals<uint8_t> e, float middle, float half, float* first, float* last) {
     time_pixels(e, middle, half, first, last);
@@ -93,25 +99,26 @@ SPIKED_CLONES void time_all(Intervals<uint16_t> e, float middle, float half, flo
     time_pixels(e, middle, half, first, last);
 }
 
-float per_frame(int frames) {
+float at_least_one(int frames) {
     if (frames < 1) throw std::invalid_argument("a window has at least one frame");
-    return 1 / static_cast<float>(frames);
+    return static_cast<float>(frames);
 }
 
 template <class T>
-void rates(const Offsets<T>& spikes, const Offsets<T>& start, const Offsets<T>& stop, int frames, const Image& out) {
+void rates(const Offsets<T>& spikes, const Offsets<T>& start, const Offsets<T>& stop, int frames, bool unbiased,
+           const Image& out) {
     expect_same_shape(spikes, out);
-    const float share = per_frame(frames);
+    const float read = at_least_one(frames);
     const auto intervals = intervals_of<T>(spikes, start, stop);
     nb::gil_scoped_release release;
-    rate_all(intervals, share, out.data());
+    rate_all(intervals, read, unbiased, out.data());
 }
 
 template <class T>
 void deviations(const Offsets<T>& spikes, const Offsets<T>& start, const Offsets<T>& stop, int frames, double jitter,
                 const Image& out) {
     expect_same_shape(spikes, out);
-    const float share = per_frame(frames);
+    const float share = 1 / at_least_one(frames);
     const auto intervals = intervals_of<T>(spikes, start, stop);
     nb::gil_scoped_release release;
     deviation_all(intervals, share, static_cast<float>(jitter), out.data());
@@ -327,10 +334,10 @@ template <class T>
 void bind_intervals(nb::module_& m) {
     const auto spikes = nb::arg("spikes").noconvert(), start = nb::arg("start").noconvert();
     const auto stop = nb::arg("stop").noconvert(), out = nb::arg("out").noconvert();
-    m.def("rates", &rates<T>, spikes, start, stop, nb::arg("frames"), out,
-          "Spikes a frame, or half of their upper bound where no interval was seen.");
+    m.def("rates", &rates<T>, spikes, start, stop, nb::arg("frames"), nb::arg("unbiased"), out,
+          "Spikes a frame. Without an interval half of their upper bound, or what is right in the mean of windows.");
     m.def("deviations", &deviations<T>, spikes, start, stop, nb::arg("frames"), nb::arg("jitter"), out,
-          "Standard deviations of rates, or their upper bounds.");
+          "Standard deviations of rates; that of one spike in all frames read where no interval was seen.");
     m.def("times", &times<T>, spikes, start, stop, nb::arg("middle"), nb::arg("length"), nb::arg("first").noconvert(),
           nb::arg("last").noconvert(),
           "Frames from `middle` to the first and to the last spike of each pixel's interval.");

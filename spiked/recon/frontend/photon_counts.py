@@ -48,8 +48,12 @@ class PhotonCounts(Exposed):
         """Bytes of the arrays."""
         return self.count.nbytes
 
-    def rate(self, out: Image | None = None) -> Image:
-        """Photons a frame. Written to `out` if given."""
+    def rate(self) -> Image:
+        """Photons a frame."""
+        return self.picture(np.empty(self.count.shape, np.float32))
+
+    def picture(self, out: Image) -> Image:
+        """`rate`, written to `out`."""
         numbers = np.arange(self.length + 1)
         flux = -np.log((self.length - numbers + 0.5) / (self.length + 0.5))
         return np.take(flux.astype(np.float32), self.count, out=out)

@@ -56,14 +56,22 @@ class SpikeIntervals(Exposed):
         """Bytes of the arrays."""
         return self.spikes.nbytes + self.start.nbytes + self.stop.nbytes
 
-    def rate(self, out: Image | None = None) -> Image:
-        """Spikes a frame; where no whole interval was seen, half of its upper bound. Written to `out` if given."""
-        out = np.empty(self.spikes.shape, np.float32) if out is None else out
-        _spikes.rates(self.spikes, self.start, self.stop, self.frames, out)
+    def rate(self) -> Image:
+        """Spikes a frame; where no whole interval was seen, what is right in the mean of many windows: a map is fitted
+        to that, and the bounds of `picture` would lift its dark parts."""
+        return self._rate(True, np.empty(self.spikes.shape, np.float32))
+
+    def picture(self, out: Image) -> Image:
+        """`rate`, written to `out`; half of the upper bound where no whole interval was seen, which is less noisy."""
+        return self._rate(False, out)
+
+    def _rate(self, unbiased: bool, out: Image) -> Image:
+        _spikes.rates(self.spikes, self.start, self.stop, self.frames, unbiased, out)
         return out
 
     def deviation(self) -> Image:
-        """Standard deviation of `rate` (native/spikes/rates.cpp); its upper bound where no whole interval was seen."""
+        """Standard deviation of `rate` (native/spikes/rates.cpp); that of one spike where no whole interval was
+        seen: the same with a spike and without, or their mean would be wrong."""
         out = np.empty(self.spikes.shape, np.float32)
         _spikes.deviations(self.spikes, self.start, self.stop, self.frames, JITTER, out)
         return out

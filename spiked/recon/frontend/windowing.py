@@ -105,7 +105,7 @@ class View:
 
     @property
     def rate(self) -> Image:
-        """Spikes a frame; where no whole interval was seen, half of the rate's upper bound."""
+        """Spikes a frame; where no whole interval was seen, what is right in the mean of many windows."""
         return self.light[0]
 
     @property
@@ -121,8 +121,11 @@ class View:
         return self.intervals.nbytes + frames + sharp + sum(target.nbytes for target in self.targets)
 
     def preview_rate(self, out: Image) -> Image:
-        """`rate` without caching; written to `out` if there is no calibration."""
-        return self.rate if self.calibration is not None else self.intervals.rate(out)
+        """`rate` as one picture shows it best, without caching; written to `out` if there is no calibration."""
+        shown = self.intervals.picture(out)
+        if self.calibration is None:
+            return shown
+        return self.calibration.apply(shown, self.intervals.deviation(), self.mosaic)[0]
 
     def exposure_times(self, parts: int) -> NDArray[np.float64]:
         """The times [parts + 1] in frames of the poses of `exposure`, evenly spaced over that of most pixels."""

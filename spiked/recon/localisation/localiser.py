@@ -127,7 +127,10 @@ class Localiser:
         )
 
     def _add(self, view: View) -> None:
-        grey = luminance(view.rate, self.sensor.mosaic) if view.sharp is None else view.sharp
+        grey = view.sharp
+        if grey is None:
+            rate = view.preview_rate(np.empty((self.sensor.height, self.sensor.width), np.float32))
+            grey = luminance(rate, self.sensor.mosaic)
         image = picture(grey, white_of(grey))
         motion = self._tracks.add(self._seen, image, view.after_gap)
         if self._seen:

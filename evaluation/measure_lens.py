@@ -3,14 +3,15 @@
     .venv/bin/python evaluation/measure_lens.py FOLDER=RESULT ...
 
 FOLDER: a recording of `spiked simulate` with its truth. RESULT: that of `spiked reconstruct`. A row of the table
-has the mean PSNR of the held-out views, of those on the path and beside it, of the worst, and of the pixels within
-`NEAR_DEG` of the optical axis of those on the path. `undistorted`: pictures of a pinhole camera, as `spiked
+has the mean PSNR of the held-out views, of those on the path and beside it, of the worst, and of the pixels of those on
+the path between the angles `RINGS_DEG` from the optical axis. `undistorted`: pictures of a pinhole camera, as `spiked
 evaluate` scores them. `lens`: pictures of the lens itself. `true lens picture, undistorted`: exact pictures of the
 lens, resampled to those of the pinhole camera and compared with the exact ones: what one picture through this lens
 knows of the undistorted view.
 """
 
 import argparse
+import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -32,8 +33,8 @@ from spiked.undistortion import Undistortion
 Array = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
-NEAR_DEG = 25.0
-"""A part of the scene that lenses of 60 to 120 degrees have in common, in pixels of nearly the same angle."""
+RINGS_DEG = 0, 15, 25, 35, 46, 80
+"""Lenses of 60 to 120 degrees have the scene within 25 degrees in common, in pixels of nearly the same angle."""
 
 
 def picture(path: Path) -> Picture:
@@ -47,19 +48,21 @@ def renderer(scene: Scene, camera: Camera) -> Callable[[Array, Array], Picture]:
     return lambda rotation, centre: rasteriser.forward(scene, rotation[None], centre[None]).values
 
 
-def near(optics: Intrinsics, width: int, height: int) -> NDArray[np.bool_]:
-    """The pixels [H, W] within `NEAR_DEG` of the axis."""
+def rings(optics: Intrinsics, width: int, height: int) -> list[NDArray[np.bool_]]:
+    """The pixels [H, W] of each ring around the axis."""
     y, x = np.mgrid[0:height, 0:width] + 0.5
     rays = optics.unproject(np.stack([x, y], -1))
-    return np.asarray(np.hypot(rays[..., 0], rays[..., 1]) < np.tan(np.radians(NEAR_DEG)))
+    angles = np.degrees(np.arctan(np.hypot(rays[..., 0], rays[..., 1])))
+    return [(angles >= low) & (angles < high) for low, high in itertools.pairwise(RINGS_DEG)]
 
 
-def row(name: str, pairs: list[tuple[Picture, Picture]], on_path: list[bool], inside: NDArray[np.bool_]) -> str:
-    """All, on the path, beside it, worst, and near the axis on the path."""
+def row(name: str, pairs: list[tuple[Picture, Picture]], on_path: list[bool], parts: list[NDArray[np.bool_]]) -> str:
+    """All, on the path, beside it, worst, and each of the parts on the path; nothing where a camera sees none of it."""
     db, on = np.array([psnr(a, b) for a, b in pairs]), np.array(on_path)
-    middle = np.mean([psnr(a[inside], b[inside]) for (a, b), along in zip(pairs, on_path, strict=True) if along])
-    cells = (db.mean(), db[on].mean(), db[~on].mean(), db.min(), middle)
-    return f"| {name} | " + " | ".join(f"{value:.2f}" for value in cells) + " |"
+    along = [pair for pair, chosen in zip(pairs, on_path, strict=True) if chosen]
+    inside = [np.mean([psnr(a[part], b[part]) for a, b in along]) if part.any() else None for part in parts]
+    cells = (db.mean(), db[on].mean(), db[~on].mean(), db.min(), *inside)
+    return f"| {name} | " + " | ".join("" if value is None else f"{value:.2f}" for value in cells) + " |"
 
 
 def measure(folder: Path, result: Path) -> list[str]:
@@ -90,10 +93,10 @@ def measure(folder: Path, result: Path) -> list[str]:
         return [(np.clip(gain * image, 0, 1), truth) for image, truth in zip(refined, truths, strict=True)]
 
     optics, size = sensor.intrinsics, (sensor.width, sensor.height)
-    straight = near(optics.pinhole, *size)
+    straight = rings(optics.pinhole, *size)
     rows = [row(f"{folder.name}: undistorted", shown(optics.pinhole, "file"), on_path, straight)]
     if optics.distortion is not None:
-        rows.append(row(f"{folder.name}: lens", shown(optics, "lens_file"), on_path, near(optics, *size)))
+        rows.append(row(f"{folder.name}: lens", shown(optics, "lens_file"), on_path, rings(optics, *size)))
         undistortion = Undistortion.of(optics, *size)
         exact = [picture(folder / view["file"]) for view in views]
         seen = undistortion.straighten(np.ones(size[::-1], np.float32)) > 0
@@ -106,7 +109,9 @@ def measure(folder: Path, result: Path) -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pairs", nargs="+", metavar="FOLDER=RESULT")
-    print("| pictures | PSNR dB | on the path | beside it | worst | near the axis |\n|---|---|---|---|---|---|")
+    names = [f"{low} to {high} degrees" for low, high in itertools.pairwise(RINGS_DEG)]
+    print("| pictures | PSNR dB | on the path | beside it | worst | " + " | ".join(names) + " |")
+    print("|" + "---|" * (5 + len(names)))
     for pair in parser.parse_args().pairs:
         folder, _, result = pair.partition("=")
         print("\n".join(measure(Path(folder), Path(result))), flush=True)

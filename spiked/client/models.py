@@ -2369,7 +2369,11 @@ class CaptureOut(BaseModel):
     ]
     frames_planned: Annotated[int | None, Field(description="Length of the capture if it is known.")]
     recording: RecordingOut | None
-    reconstruction_ids: Annotated[list[str], Field(description="Oldest first.")]
+    reconstruction_ids: Annotated[
+        list[str],
+        Field(description="The newest 100, the oldest of these first; `GET reconstructions?capture_id=` lists all."),
+    ]
+    reconstruction_count: Annotated[int, Field(description="Number of all its reconstructions.")]
     counters: CountersOut | None
     sensor: Annotated[SensorOut | None, Field(description="Null until the source is open.")]
     group: Annotated[

@@ -29,6 +29,11 @@ def over(data_store: DataStore, capture_id: str) -> Snapshot:
     return data_store.captures.get(capture_id)
 
 
+def jobs_of(data_store: DataStore, capture_id: str) -> list[ReconstructionRow]:
+    """The reconstructions of a capture, oldest first."""
+    return data_store.reconstructions.rows.page(capture_id=capture_id).items[::-1]
+
+
 def ended(data_store: DataStore, job: ReconstructionRow) -> ReconstructionRow:
     """The reconstruction when it is over."""
     until(lambda: data_store.reconstructions.rows.get(job.id).state.over, f"{job.id} is over")

@@ -27,7 +27,7 @@ from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Mosaic, Sensor
 from spiked.simulate import SimulatedCamera
 
-from .survival import children, kept, over, random_recording
+from .survival import children, jobs_of, kept, over, random_recording
 
 SIZE = "width=96&height=64"
 
@@ -80,7 +80,7 @@ def test_a_colour_camera_is_mapped_in_colour_live(data_store: DataStore) -> None
     options = ReconstructionOptions(steps=30)
     started = data_store.captures.start(Plan(f"{source}&pace=0", frames=480, record=False, options=options))
     done = over(data_store, started.id)
-    (job,) = done.reconstructions
+    (job,) = jobs_of(data_store, done.id)
     assert (job.state, job.live) == (JobState.COMPLETE, True), job.reason
     folder = data_store.folder.reconstruction(job.id)
     scene = Scene.read_ply(folder / versions(folder)[-1].scene)

@@ -44,6 +44,7 @@ from .survival import (
     SMALL,
     assert_holds,
     children,
+    jobs_of,
     kept,
     moving_recording,
     over,
@@ -74,7 +75,7 @@ def test_a_recording_holds_what_the_source_gave(data_store: DataStore, tmp_path:
     assert row.recording is not None and (row.recording.frames, row.recording.lost) == (1000, 0)
     assert row.recording.bytes == frames.nbytes
     assert row.verdict is not None and row.verdict.grade is Grade.GOOD
-    assert done.reconstructions == ()
+    assert jobs_of(data_store, done.id) == []
     path = data_store.captures.recording(row.id)
     assert path.read_bytes() == frames.tobytes()
     checked = verify(path)
@@ -169,8 +170,8 @@ def test_what_came_after_the_last_of_many_killed_recorders_is_told_as_lost(
 def test_a_reconstruction_killed_before_it_reads_holds_nobody_up(data_store: DataStore, tmp_path: Path) -> None:
     random_recording(tmp_path / "noise.dat", 500)
     capture_id = data_store.captures.start(Plan(f"replay:{tmp_path / 'noise.dat'}?repeat=10")).id
-    until(lambda: data_store.captures.get(capture_id).reconstructions, "the reconstruction begins")
-    job = data_store.captures.get(capture_id).reconstructions[0]
+    until(lambda: jobs_of(data_store, capture_id), "the reconstruction begins")
+    job = jobs_of(data_store, capture_id)[0]
     os.kill(data_store.reconstructions.processes()[job.id], signal.SIGKILL)
     row = over(data_store, capture_id).row
     assert row.recording is not None and (row.recording.frames, row.recording.lost) == (5000, 0)
@@ -196,7 +197,7 @@ def test_a_capture_stopped_while_the_camera_is_absent_ends_and_says_so(data_stor
     data_store.captures.stop(capture_id)
     done = over(data_store, capture_id)
     assert (done.row.state, done.row.reason) == (CaptureState.COMPLETE, "no frames: the camera was absent")
-    job = done.reconstructions[0]
+    job = jobs_of(data_store, done.id)[0]
     assert (job.state, job.reason) == (
         JobState.CANCELLED,
         "no frames were received, so there is nothing to reconstruct",
@@ -212,7 +213,7 @@ def test_a_capture_stopped_while_it_starts_ends_and_says_so(data_store: DataStor
     done = over(data_store, capture_id)
     assert done.row.state is CaptureState.COMPLETE
     assert done.row.reason in ("no frames: the camera was absent", "no frames: it was stopped before the first frame")
-    assert all(job.state is JobState.CANCELLED for job in done.reconstructions)
+    assert all(job.state is JobState.CANCELLED for job in jobs_of(data_store, done.id))
 
 
 def test_states_are_updated_again_after_the_catalogue_could_not_be_read(
@@ -220,7 +221,7 @@ def test_states_are_updated_again_after_the_catalogue_could_not_be_read(
 ) -> None:
     random_recording(tmp_path / "noise.dat", 100)
     capture_id = data_store.captures.start(recorded_only(f"replay:{tmp_path / 'noise.dat'}?repeat=10000")).id
-    read, ticks = data_store.catalogue.reconstructions_of, 0
+    read, ticks = data_store.catalogue.job_ids, 0
 
     def fails_once(capture_id: str) -> list[ReconstructionRow]:
         nonlocal ticks
@@ -230,7 +231,7 @@ def test_states_are_updated_again_after_the_catalogue_could_not_be_read(
                 raise StoreError("the catalogue cannot be read: disk I/O error")
         return read(capture_id)
 
-    monkeypatch.setattr(data_store.catalogue, "reconstructions_of", fails_once)
+    monkeypatch.setattr(data_store.catalogue, "job_ids", fails_once)
     until(lambda: ticks > 2, "the thread that updates the states continues")
     data_store.captures.stop(capture_id)
     assert over(data_store, capture_id).row.state is CaptureState.COMPLETE
@@ -568,7 +569,7 @@ def test_a_job_whose_row_could_not_be_saved_begins_when_the_disk_has_room(
     random_recording(tmp_path / "noise.dat", 500)
     with kept(small_disk) as data_store:
         done = over(data_store, data_store.captures.start(Plan(f"replay:{tmp_path / 'noise.dat'}?pace=0")).id)
-        job = done.reconstructions[0]
+        job = jobs_of(data_store, done.id)[0]
         assert job.state.over
         filler = fill_to_the_last_byte(small_disk)
         with pytest.raises(StoreError):
@@ -604,13 +605,13 @@ def test_stopping_twice_cuts_the_refinement(data_store: DataStore, tmp_path: Pat
     plan = Plan(source, options=ReconstructionOptions(steps=200_000))
     capture_id = data_store.captures.start(plan).id
     until(lambda: data_store.captures.get(capture_id).row.state is CaptureState.FINISHING, "the source ends")
-    job = data_store.captures.get(capture_id).reconstructions[0]
+    job = jobs_of(data_store, capture_id)[0]
     until(lambda: data_store.reconstructions.rows.get(job.id).stage in ("refining", "done"), "it refines")
     data_store.captures.stop(capture_id)
     done = over(data_store, capture_id)
     assert done.row.state is CaptureState.COMPLETE
-    assert done.reconstructions[0].state is JobState.COMPLETE
-    assert done.reconstructions[0].progress < 1
+    assert jobs_of(data_store, done.id)[0].state is JobState.COMPLETE
+    assert jobs_of(data_store, done.id)[0].progress < 1
 
 
 def test_the_end_of_a_refinement_is_never_worse_than_what_was_there(data_store: DataStore, tmp_path: Path) -> None:
@@ -618,10 +619,10 @@ def test_the_end_of_a_refinement_is_never_worse_than_what_was_there(data_store: 
     source = f"replay:{moving_recording(tmp_path / 'moving.dat')}?pace=0"
     capture_id = data_store.captures.start(Plan(source, options=ReconstructionOptions(steps=200_000))).id
     until(lambda: data_store.captures.get(capture_id).row.state is CaptureState.FINISHING, "the source ends")
-    job_id = data_store.captures.get(capture_id).reconstructions[0].id
+    job_id = jobs_of(data_store, capture_id)[0].id
     until(lambda: data_store.reconstructions.rows.get(job_id).stage == Stage.REFINING, "it refines")
     data_store.captures.stop(capture_id)
-    row = over(data_store, capture_id).reconstructions[0]
+    row = jobs_of(data_store, over(data_store, capture_id).id)[0]
     assert row.state is JobState.COMPLETE and "the refinement was ended at" in row.reason
     folder = data_store.reconstructions.rows.folder(job_id)
     listed = versions(folder)

@@ -23,7 +23,7 @@ from waiting import until
 
 from spiked.recording import open_recording
 
-from .survival import assert_holds, kept, over, random_recording, received
+from .survival import assert_holds, jobs_of, kept, over, random_recording, received
 from .test_recovery import SHM, Service
 
 FIRST_SEED = int(os.environ.get("KILLS_SEED", "0"))
@@ -76,7 +76,7 @@ class Kill:
     def _process(self, data_store: DataStore, capture_id: str) -> int | None:
         if self.role != "reconstruction":
             return data_store.captures.processes().get(capture_id, {}).get(self.role)
-        jobs = data_store.captures.get(capture_id).reconstructions
+        jobs = jobs_of(data_store, capture_id)
         return data_store.reconstructions.processes().get(jobs[0].id) if jobs else None
 
     def _strike(self, data_store: DataStore, capture_id: str) -> None:
@@ -105,7 +105,7 @@ def assert_accounted(data_store: DataStore, done: Snapshot, frames: NDArray[np.u
         assert recording.warnings == ()
     if came and recorded[1]:
         assert row.verdict is not None and row.verdict.grade is not Grade.GOOD, row
-    told = " ".join([row.reason, *row.warnings, *(job.reason for job in done.reconstructions)])
+    told = " ".join([row.reason, *row.warnings, *(job.reason for job in jobs_of(data_store, done.id))])
     assert not any(word in told for word in ("Traceback", "Error", "/dev/shm", " ring ")), told
     assert not (SHM / f"spiked-{row.id}").exists()
 

@@ -29,7 +29,7 @@ from waiting import until
 
 from spiked.recon.time_left import typical_work_s
 
-from .survival import SENSOR, over
+from .survival import SENSOR, jobs_of, over
 
 CAMERA = "sim:?width=160&height=100&pace=0"
 FRAMES = 512
@@ -57,8 +57,8 @@ def take(data_store: DataStore, options: ReconstructionOptions) -> str:
 
 
 def job(data_store: DataStore, capture_id: str) -> ReconstructionRow:
-    until(lambda: data_store.captures.get(capture_id).reconstructions, "its reconstruction has begun")
-    return data_store.captures.get(capture_id).reconstructions[-1]
+    until(lambda: jobs_of(data_store, capture_id), "its reconstruction has begun")
+    return jobs_of(data_store, capture_id)[-1]
 
 
 def test_the_next_take_starts_while_the_last_refines_and_waits_for_its_turn(data_store: DataStore, told: Bus) -> None:
@@ -98,7 +98,7 @@ def test_one_that_nobody_recorded_does_not_give_way(data_store: DataStore) -> No
     until(lambda: job(data_store, first).stage is Stage.REFINING, "the first refines")
     plan = Plan(CAMERA, frames=FRAMES, options=SHORT, record=False)
     done = over(data_store, data_store.captures.start(plan).id)
-    assert done.reconstructions[0].state is JobState.COMPLETE
+    assert jobs_of(data_store, done.id)[0].state is JobState.COMPLETE
     data_store.captures.stop(first)
 
 

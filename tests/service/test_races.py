@@ -95,7 +95,7 @@ def test_a_running_job_spares_its_capture_and_no_other(data_store: DataStore) ->
     data_store.retention.apply(NOW)
     assert data_store.catalogue.captures.find(idle.id) is None
     assert data_store.catalogue.captures.find(busy.id) is not None
-    assert [row.state for row in data_store.catalogue.reconstructions_of(busy.id)] == [
+    assert [row.state for row in data_store.catalogue.reconstruction_page(capture_id=busy.id).items[::-1]] == [
         JobState.COMPLETE,
         JobState.RUNNING,
     ]

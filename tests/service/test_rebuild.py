@@ -22,7 +22,7 @@ from waiting import until
 
 from spiked.recording import index_path, open_recording, sidecar_path
 
-from .survival import assert_holds, kept, over, random_recording, received
+from .survival import assert_holds, jobs_of, kept, over, random_recording, received
 
 FRAMES = 512
 
@@ -74,7 +74,7 @@ def assert_as_before(snapshot: Snapshot, data_store: DataStore, origin: Origin =
     assert row.recording is not None and (row.recording.frames, row.recording.lost) == (FRAMES, 0)
     assert row.verdict is not None and row.verdict.grade is Grade.GOOD
     assert open_recording(data_store.captures.recording(row.id)).frames == FRAMES
-    (job,) = snapshot.reconstructions
+    (job,) = jobs_of(data_store, snapshot.id)
     assert (job.state, job.capture_id, job.options.steps) == (JobState.COMPLETE, row.id, 5)
     versions = data_store.reconstructions.rows.versions(job.id)
     assert versions and versions[-1].version == job.version

@@ -20,7 +20,7 @@ from waiting import PATIENCE_S, until
 
 from spiked.errors import ConfigurationError
 
-from .survival import SMALL, ended, over, random_recording, still_recording
+from .survival import SMALL, ended, jobs_of, over, random_recording, still_recording
 
 SHORT = ReconstructionOptions(steps=5)
 LONG = ReconstructionOptions(steps=200_000)
@@ -92,7 +92,7 @@ def test_a_reconstruction_without_a_path_has_failed_and_says_why(house: tuple[Da
     source = f"replay:{still_recording(tmp_path / 'still.dat')}?pace=0"
     live = over(data_store, data_store.captures.start(Plan(source, options=SHORT)).id)
     again = ended(data_store, data_store.reconstructions.submit(live.row.id, SHORT))
-    for job in (*live.reconstructions[:1], again):
+    for job in (*jobs_of(data_store, live.id)[:1], again):
         assert (job.state, job.poses, job.version) == (JobState.FAILED, 0, 0)
         assert job.reason.startswith("the camera stood still"), job.reason
     assert live.row.state is CaptureState.COMPLETE and live.row.warnings == (again.reason,)
@@ -145,12 +145,12 @@ def test_one_at_a_time_the_most_important_first(house: tuple[DataStore, str]) ->
 def test_a_live_reconstruction_does_not_wait_and_the_queue_waits_for_it(house: tuple[DataStore, str]) -> None:
     data_store, capture_id = house
     live = data_store.captures.start(Plan(f"{SMALL}&seed=7", options=SHORT))
-    until(lambda: data_store.captures.get(live.id).reconstructions, "the live one runs")
+    until(lambda: jobs_of(data_store, live.id), "the live one runs")
     queued = data_store.reconstructions.submit(capture_id, SHORT)
-    until(lambda: data_store.captures.get(live.id).reconstructions[0].frames > 200, "it takes frames")
+    until(lambda: jobs_of(data_store, live.id)[0].frames > 200, "it takes frames")
     assert data_store.reconstructions.rows.get(queued.id).state is JobState.QUEUED
     data_store.captures.stop(live.id)
-    assert over(data_store, live.id).reconstructions[0].live
+    assert jobs_of(data_store, over(data_store, live.id).id)[0].live
     assert ended(data_store, queued).state is JobState.COMPLETE
 
 

@@ -17,7 +17,7 @@ from waiting import until
 
 from spiked.recording import open_recording, verify
 
-from .survival import SMALL, assert_holds, kept, over, random_recording, received
+from .survival import SMALL, assert_holds, jobs_of, kept, over, random_recording, received
 
 SHM = Path("/dev/shm")
 _SERVICE = """
@@ -104,9 +104,9 @@ def test_after_a_kill_recordings_are_whole_and_jobs_are_taken_up(tmp_path: Path)
         assert_holds(path, frames)
         assert "as they were written" not in str(verify(path).reasons)
         assert not any((SHM / f"spiked-{key}").exists() for key in (live, record))
-        until(lambda: data_store.captures.get(live).reconstructions[0].state.over, "taken up again")
+        until(lambda: jobs_of(data_store, live)[0].state.over, "taken up again")
         snapshot = data_store.captures.get(live)
-        job = snapshot.reconstructions[0]
+        job = jobs_of(data_store, snapshot.id)[0]
         assert (job.live, job.attempts) == (False, 2)
         assert snapshot.row.recording is not None and job.frames == snapshot.row.recording.frames
         assert data_store.captures.list().items[0].id == record
@@ -118,7 +118,7 @@ def test_a_job_without_a_recording_fails_honestly_after_a_kill(tmp_path: Path) -
     with kept(data) as data_store:
         capture_id = data_store.captures.start(Plan(SMALL, record=False)).id
         until(lambda: received(data_store, capture_id) > 100, "frames come")
-        row = data_store.captures.get(capture_id).reconstructions[0]
+        row = jobs_of(data_store, capture_id)[0]
         # As a kill would leave it: the row says that it runs, and nothing of the capture's end is noted.
         data_store.catalogue.reconstructions.put(row)
         capture = data_store.captures.get(capture_id).row

@@ -9,7 +9,7 @@ from spiked_service.events.logging import logger
 from spiked_service.events.payloads import PosePayload, PreviewPayload, ScenePayload
 from spiked_service.results.published import Published
 from spiked_service.store.rows import ReconstructionRow
-from spiked_service.store.snapshot import CaptureSummary
+from spiked_service.store.snapshot import Snapshot
 from spiked_service.workers.messages import PreviewKind, PreviewTaken
 
 _LOG = logger("spiked.service")
@@ -22,7 +22,7 @@ class BusNotifier:
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
 
-    def capture(self, snapshot: CaptureSummary) -> None:
+    def capture(self, snapshot: Snapshot) -> None:
         """A capture has changed, or its counters have."""
         self._bus.publish(Topic.CAPTURE, CaptureOut.of(snapshot), capture_id=snapshot.id)
 

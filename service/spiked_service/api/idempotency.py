@@ -64,6 +64,7 @@ class IdempotencyKeys:
                 "CREATE TABLE IF NOT EXISTS idempotency (key TEXT PRIMARY KEY, fingerprint TEXT NOT NULL, "
                 "at TEXT NOT NULL, status INTEGER, headers TEXT, body BLOB) WITHOUT ROWID"
             )
+            connection.execute("CREATE INDEX IF NOT EXISTS idempotency_by_age ON idempotency (at)")
             # Requests of an earlier service: nobody knows how far they went.
             connection.execute("UPDATE idempotency SET status = ? WHERE status IS NULL", (_UNKNOWN,))
 

@@ -30,7 +30,7 @@ from spiked_service.results.scene_scale import MetricPoses, read_scale, scale_he
 from spiked_service.results.shown_scene import ShownScene
 from spiked_service.results.versions import at
 from spiked_service.store.catalogue import UnknownIdError
-from spiked_service.store.rows import ReconstructionRow, Task
+from spiked_service.store.rows import ReconstructionRow
 
 _ENCODED = 8
 """SPZ files, samples and changes in memory, so that each is encoded once for many viewers."""
@@ -201,12 +201,12 @@ class Results:
         Raises UnknownIdError, NotReadyError, NothingError.
         """
         capture = self._captures.get(capture_id)
-        rows = [row for row in capture.reconstructions if row.task is not Task.LOCALISE]
-        if not rows and capture.row.state.acquiring and capture.row.plan.reconstruct:
+        row = next(iter(self._rows.shown_of([capture_id])), None)
+        if row is None and capture.row.state.acquiring and capture.row.plan.reconstruct:
             raise NotReadyError(f"the reconstruction of capture {capture_id} has not begun yet")
-        if not rows:
+        if row is None:
             raise NothingError(f"capture {capture_id} has no reconstruction; POST reconstructions starts one")
-        return next((row for row in reversed(rows) if row.version), rows[-1])
+        return row
 
     def row(self, reconstruction_id: str) -> ReconstructionRow:
         """A reconstruction. Raises UnknownIdError."""

@@ -90,6 +90,7 @@ class DataStore:
         self._guarded(lambda: self._recovery.run(self._over.is_set))
         self._recovered = True
         self._guarded(self.reconstructions.start)
+        self._guarded(lambda: self._recovery.check_results(self._over.is_set))
         while not self._over.wait(_CLEAN_S):
             self._guarded(self.captures.retry_saving)
             self._guarded(self.reconstructions.rows.retry_saving)

@@ -24,7 +24,7 @@ from spiked_service.store.catalogue import Catalogue, Page, StoreError, UnknownI
 from spiked_service.store.disk_space import DiskSpace, recording_bytes
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import CaptureEdit, CaptureRow, Plan
-from spiked_service.store.snapshot import CaptureSummary, Snapshot
+from spiked_service.store.snapshot import CaptureJobs, Snapshot
 from spiked_service.workers.messages import PreviewTaken
 
 _CLOSE_S = 1.0
@@ -194,14 +194,10 @@ class Captures:
         return snapshot
 
     def snapshot(self, row: CaptureRow) -> Snapshot:
-        """A row with its current counters and reconstructions."""
-        return self.summary(row).with_jobs(self._reconstructions.rows.of(row.id))
-
-    def summary(self, row: CaptureRow) -> CaptureSummary:
-        """A row with its current counters and the ids of its reconstructions, which are not read."""
+        """A row with its current counters and the ids of its newest reconstructions."""
         with self._lock:
             live = self._live.get(row.id)
-        return _summary(row, live, self._reconstructions.rows.ids_of(row.id))
+        return _snapshot(row, live, self._reconstructions.rows.jobs_of(row.id))
 
     def list(
         self,
@@ -333,9 +329,9 @@ class Captures:
                 self._notifier.log("error", f"the states of live captures are not up to date: {error}")
 
 
-def _summary(row: CaptureRow, live: LiveCapture | None, ids: tuple[str, ...]) -> CaptureSummary:
-    """A capture with the ids of its reconstructions; of a live one, its row is newer than `row`."""
+def _snapshot(row: CaptureRow, live: LiveCapture | None, jobs: CaptureJobs) -> Snapshot:
+    """A capture as it is now; of a live one, its row is newer than `row`."""
     row = row if live is None else live.row
     if live is None or row.state.over:
-        return CaptureSummary(row, row.counters, ids)
-    return CaptureSummary(row, live.counters(), ids, None if live.opened is None else live.opened.name)
+        return Snapshot(row, row.counters, jobs)
+    return Snapshot(row, live.counters(), jobs, None if live.opened is None else live.opened.name)

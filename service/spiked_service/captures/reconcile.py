@@ -70,7 +70,7 @@ def note_versions(folder: DataFolder, catalogue: Catalogue, reconstruction_id: s
     """
     published = versions(folder.reconstruction(reconstruction_id))
     kept = {one.version for one in published}
-    if kept == {one.version for one in catalogue.versions(reconstruction_id)}:
+    if kept == catalogue.version_numbers(reconstruction_id):
         return bool(kept)
     if not kept:
         with catalogue.transaction():

@@ -27,7 +27,7 @@ from spiked_service.store.rows import (
     Quality,
     ReconstructionRow,
 )
-from spiked_service.store.snapshot import CaptureSummary
+from spiked_service.store.snapshot import Snapshot
 
 _Check = tuple[Callable[[str], None], str]
 """A check and the id of its capture, reconstruction or upload."""
@@ -59,15 +59,19 @@ class Recovery:
         self._interrupted = {row.id: row for row in catalogue.captures.where("state NOT IN (?, ?)", over)}
 
     def run(self, closing: Callable[[], bool]) -> None:
-        """Run all checks. If the service closes, the next start repeats them."""
+        """Check what the queue depends on. If the service closes, the next start repeats it."""
         self._each([(self._recover_interrupted, one) for one in self._interrupted], closing)
         work: list[_Check] = []
         work += [(self._recover_capture, one) for one in self._orphans.captures]
         work += [(self._check_files, row.id) for row in self._catalogue.captures.where() if row.state.over]
         work += [(self._recover_reconstruction, one) for one in self._orphans.reconstructions]
-        work += [(self._check_reconstruction, one) for one in self._catalogue.ended_or_lost_reconstructions()]
+        work += [(self._set_job_aside, one) for one in self._catalogue.lost_reconstructions()]
         work += [(self._set_upload_aside, one) for one in self._orphans.uploads]
         self._each(work, closing)
+
+    def check_results(self, closing: Callable[[], bool]) -> None:
+        """Check the versions of all reconstructions that have ended: a millisecond each, while the queue runs."""
+        self._each([(self._check_versions, one) for one in self._catalogue.ended_reconstructions()], closing)
 
     def _each(self, work: Iterable[_Check], closing: Callable[[], bool]) -> None:
         for check, one in work:
@@ -93,7 +97,7 @@ class Recovery:
             verdict=verdict,
             ended_at=datetime.now(UTC),
         )
-        self._notifier.capture(CaptureSummary(row, row.counters, self._rows.ids_of(capture_id)))
+        self._notifier.capture(Snapshot(row, row.counters, self._rows.jobs_of(capture_id)))
 
     def _recover_capture(self, capture_id: str) -> None:
         path = self._folder.recording(capture_id)
@@ -160,15 +164,17 @@ class Recovery:
         message = f"the capture of reconstruction {reconstruction_id} is unknown: it was moved to {where}"
         self._notifier.log("error", message, None, reconstruction_id)
 
-    def _check_reconstruction(self, reconstruction_id: str) -> None:
-        """Check that its capture exists and the catalogue lists its versions."""
+    def _check_versions(self, reconstruction_id: str) -> None:
+        """Check that the catalogue lists the versions of an ended reconstruction."""
         row = self._catalogue.reconstructions.find(reconstruction_id)
-        if row is None:
+        if row is None or not row.state.over:  # it was restarted or removed meanwhile
             return
-        if self._catalogue.captures.find(row.capture_id) is not None:
-            if row.state.over and not note_versions(self._folder, self._catalogue, reconstruction_id) and row.version:
-                self._lose_result(row)
-            return
+        if not note_versions(self._folder, self._catalogue, reconstruction_id) and row.version:
+            self._lose_result(row)
+
+    def _set_job_aside(self, reconstruction_id: str) -> None:
+        """Move a reconstruction away whose capture is missing."""
+        row = self._catalogue.reconstructions.get(reconstruction_id)
         folder = self._folder.reconstruction(reconstruction_id)
         where = self._folder.set_aside(*(one for one in (folder,) if one.exists()))
         self._catalogue.reconstructions.remove(reconstruction_id)

@@ -13,6 +13,9 @@ from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import CaptureRow, JobState
 from spiked_service.store.snapshot import Snapshot
 
+_AT_ONCE = 256
+"""Reconstructions whose ids are read at once."""
+
 
 class Rows(Protocol):
     """The captures as they are now."""
@@ -43,11 +46,10 @@ class Removal:
 
     def remove(self, capture_id: str) -> Snapshot:
         """Mark a capture as deleted, until `restore` or `purge`. Raises UnknownIdError, BusyError."""
-        snapshot = self._ended(capture_id)
-        for row in snapshot.reconstructions:
-            self._catalogue.freeing(self._reconstructions.cancel, row.id)
-        at = snapshot.row.deleted_at or datetime.now(UTC)
-        return self._catalogue.freeing(self._rows.change, capture_id, deleted_at=at)
+        at = self._ended(capture_id).row.deleted_at or datetime.now(UTC)
+        removed = self._catalogue.freeing(self._rows.change, capture_id, deleted_at=at)
+        self._catalogue.freeing(self._reconstructions.cancel_all_of, capture_id)
+        return removed
 
     def restore(self, capture_id: str) -> Snapshot:
         """Undo `remove`. Raises UnknownIdError, BusyError."""
@@ -62,8 +64,9 @@ class Removal:
             self._check_purge(capture_id, still)
             self._going.add(capture_id)
         try:
-            for row in self._rows.get(capture_id).reconstructions:
-                self._catalogue.freeing(self._reconstructions.remove, row.id)
+            while ids := self._catalogue.job_ids(capture_id, _AT_ONCE):
+                for row_id in ids:
+                    self._catalogue.freeing(self._reconstructions.remove, row_id)
             self._folder.remove(self._folder.capture(capture_id))
             self._catalogue.freeing(self._catalogue.captures.remove, capture_id)
             self._rows.forget(capture_id)
@@ -81,7 +84,7 @@ class Removal:
     def _check_purge(self, capture_id: str, still: Callable[[CaptureRow], bool]) -> None:
         self._check_going(capture_id)
         now = self._ended(capture_id)
-        if any(row.state is JobState.RUNNING for row in now.reconstructions):
+        if self._catalogue.job_counts(capture_id)[JobState.RUNNING]:
             raise BusyError(f"a reconstruction of capture {capture_id} is running: cancel it first")
         if not still(now.row):
             raise BusyError(f"capture {capture_id} has been restored or kept")

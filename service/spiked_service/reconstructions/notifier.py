@@ -5,14 +5,14 @@ from typing import Protocol
 from spiked_service.events.payloads import PosePayload
 from spiked_service.results.published import Published
 from spiked_service.store.rows import ReconstructionRow
-from spiked_service.store.snapshot import CaptureSummary
+from spiked_service.store.snapshot import Snapshot
 from spiked_service.workers.messages import PreviewTaken
 
 
 class Notifier(Protocol):
     """Called from any thread, also while locks are held: implementations must not block or call back."""
 
-    def capture(self, snapshot: CaptureSummary) -> None:
+    def capture(self, snapshot: Snapshot) -> None:
         """A capture has changed, or its counters have."""
 
     def job(self, row: ReconstructionRow) -> None:

@@ -35,6 +35,10 @@ from spiked_service.workers.process import StandbyWorker
 
 _LOOK_S = 0.5
 """Interval at which the queue is checked while a retry is delayed."""
+_CANCELLED = 16
+"""Waiting jobs of a removed capture that are cancelled at a time; then ..."""
+_OTHERS_S = 0.001
+"""... others can take the lock."""
 
 
 class Reconstructions:
@@ -64,6 +68,8 @@ class Reconstructions:
         self._jobs: dict[str, JobRunner] = {}
         self._least_poses: dict[str, int] = {}
         """Poses of the published trajectory of a queued reconstruction, which a restart has to reach."""
+        self._removed: set[str] = set()
+        """Removed captures whose waiting jobs are being cancelled."""
         self._closing = False
         self._thread: threading.Thread | None = None
         requeue_interrupted(rows, adopted=executor is not None)
@@ -75,6 +81,7 @@ class Reconstructions:
                 return
             for row in [one for one in self.rows.interrupted() if one.id not in self._jobs]:
                 self._adopt(row)
+            self._removed |= set(self._catalogue.captures_to_clear())
             self._executor.clean_up()
             self._thread = threading.Thread(target=self._run_queue, name="queue", daemon=True)
             self._thread.start()
@@ -173,6 +180,26 @@ class Reconstructions:
                 row = self.rows.save(ended)
             return row
 
+    def cancel_all_of(self, capture_id: str) -> None:
+        """End the jobs of a removed capture: those that run and some that wait now, the others soon."""
+        with self._lock:
+            for job in [one for one in self._jobs.values() if one.row.capture_id == capture_id]:
+                job.cancel()
+            self._removed.add(capture_id)
+            self._cancel_some()
+            self._wake.notify_all()
+
+    def _cancel_some(self) -> None:
+        """Cancel waiting jobs of a removed capture, if there is one. Raises StoreError."""
+        for capture_id in list(self._removed)[:1]:
+            ids = self._catalogue.job_ids(capture_id, _CANCELLED, JobState.QUEUED)
+            capture = self._catalogue.captures.find(capture_id)
+            if not ids or (capture is not None and capture.deleted_at is None):
+                self._removed.discard(capture_id)
+            else:
+                for row_id in ids:
+                    self.cancel(row_id)
+
     def finish_early(self, reconstruction_id: str) -> None:
         """End the refinement of a running reconstruction; it counts as complete."""
         with self._lock:
@@ -237,20 +264,27 @@ class Reconstructions:
             job.kill_after(timeout_s)
         if thread is not None:
             thread.join()
+        self.rows.close()
 
     def _run_queue(self) -> None:
         while True:
             with self._lock:
                 if self._closing:
                     return
+                wait_s = _LOOK_S if self.policy.delays else None
                 try:
                     self._begin_next()
+                    self._cancel_some()
+                    wait_s = _OTHERS_S if self._removed else wait_s
                 except (StoreError, OSError) as error:
                     self._notifier.log("error", f"no reconstruction can be started: {error}")
-                self._wake.wait(_LOOK_S if self.policy.delays else None)
+                self._wake.wait(wait_s)
 
     def _begin_next(self) -> None:
-        for row in self.rows.queued():
+        if len(self._jobs) >= self.policy.limit:
+            return
+        passed = set(self._removed)
+        for row in self.rows.queued(passed):
             if len(self._jobs) >= self.policy.limit:
                 return
             if not self.policy.due(row.id):
@@ -258,10 +292,14 @@ class Reconstructions:
             capture = self._catalogue.captures.find(row.capture_id)
             recorded = capture is not None and capture.recording is not None and capture.recording.frames > 0
             ready = recorded or not row.task.reads_recording
-            if capture is None or (capture.state.over and not ready):
+            if capture is not None and capture.deleted_at is not None:
+                self._removed.add(capture.id)
+            elif capture is None or (capture.state.over and not ready):
                 self.rows.save(failed(row, row.reason or "the capture has no recording"))
             elif ready:
                 self._begin_queued(row, capture)
+            else:
+                passed.add(capture.id)
 
     def _begin_queued(self, row: ReconstructionRow, capture: CaptureRow) -> None:
         if not self.rows.has_checkpoint(row.id):

@@ -4,11 +4,12 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cached_property, lru_cache
 
 from spiked.recon.time_left import typical_work_s
 from spiked_service.reconstructions.queue_order import QueueOrder
 from spiked_service.store.catalogue import Catalogue
-from spiked_service.store.rows import CaptureRow, JobState, ReconstructionRow, Task
+from spiked_service.store.rows import JobState, ReconstructionRow, Task
 
 FRONT = 100
 """Jobs whose times are estimated one by one, and whose changes of place are published; the others have the mean."""
@@ -20,6 +21,9 @@ _CHANGE_S = 5.0
 """Changes of an estimate by less seconds, ..."""
 _CHANGE_SHARE = 0.2
 """... or by a smaller share of it, are not published."""
+
+_typical_work_s = lru_cache(1024)(typical_work_s)
+"""Jobs of a queue are alike, and computing it takes most of a millisecond."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +37,16 @@ class Front:
     each_s: float
     """Mean seconds from one completion to the next."""
 
+    @cached_property
+    def by_id(self) -> dict[str, ReconstructionRow]:
+        """The rows by id."""
+        return {row.id: row for row in self.rows}
+
     def placed(self, row: ReconstructionRow, place: int) -> ReconstructionRow:
         """A queued row with its place in the queue and the seconds to its completion, where known."""
-        known = next((one for one in self.rows if one.id == row.id), None)
+        known = self.by_id.get(row.id)
         if known is not None:
-            return replace(row, queue_place=known.queue_place, eta_s=known.eta_s)
+            return replace(row, queue_place=place, eta_s=known.eta_s)
         end_s = self.begins_s + self.each_s * max(1, place - len(self.rows))
         return replace(row, queue_place=place, eta_s=None if row.held or end_s == float("inf") else end_s)
 
@@ -49,6 +58,7 @@ class QueueEstimates:
         self._catalogue = catalogue
         self._order = order
         self._published: dict[str, tuple[int | None, float | None]] = {}
+        self._recordings: dict[str, tuple[int, int, int]] = {}
 
     def front(self, running: Sequence[ReconstructionRow], limit: int) -> Front:
         """The front of the queue; `running` are the rows with a worker; at most `limit` run at a time."""
@@ -73,11 +83,16 @@ class QueueEstimates:
         each_s = pace * statistics.mean(known) / limit if known else float("inf")
         return Front(found, min(free_s), each_s)
 
-    def changed(self, front: Front, told_id: str | None = None) -> list[ReconstructionRow]:
-        """Rows of the front whose place or time differs from what the last call returned, and those that have left it
-        and are still queued; the row of `told_id` in any case, if it is queued."""
+    def told(self, row: ReconstructionRow) -> None:
+        """Note that a row was published, with its place and time."""
+        self._published.pop(row.id, None)
+        if row.queue_place is not None and row.queue_place <= FRONT:
+            self._published[row.id] = (row.queue_place, row.eta_s)
+
+    def changed(self, front: Front) -> list[ReconstructionRow]:
+        """Rows of the front whose place or time differs from what was published, and those that have left it and are
+        still queued; they count as published now."""
         before, self._published, changed = self._published, {}, []
-        before.pop(told_id or "", None)
         for row in front.rows:
             place, eta_s = before.get(row.id, (None, None))
             if row.queue_place == place and _alike(row.eta_s, eta_s):
@@ -85,7 +100,7 @@ class QueueEstimates:
             else:
                 self._published[row.id] = (row.queue_place, row.eta_s)
                 changed.append(row)
-        behind = {one for one in (*before, told_id) if one is not None and one not in self._published}
+        behind = [one for one in before if one not in self._published]
         for row_id, place in self._order.places(behind).items():
             behind_row = self._catalogue.reconstructions.find(row_id)
             if behind_row is not None:
@@ -94,17 +109,21 @@ class QueueEstimates:
 
     def _recent(self) -> list[ReconstructionRow]:
         """Rows that were completed last."""
-        return self._catalogue.reconstructions.where(
-            "state = ? ORDER BY id DESC LIMIT ?", (str(JobState.COMPLETE), _RECENT)
-        )
+        return self._catalogue.reconstruction_page(_RECENT, state=JobState.COMPLETE).items
 
     def _efforts(self, rows: Sequence[ReconstructionRow]) -> dict[str, float]:
         """Seconds of work on a reference machine, by row, without those whose recording is not closed."""
-        ids = tuple({row.capture_id for row in rows})
-        marks = ", ".join("?" * len(ids))
-        captures = {one.id: one for one in self._catalogue.captures.where(f"id IN ({marks})", ids)}
-        found = {row.id: _effort(row, captures.get(row.capture_id)) for row in rows}
-        return {row_id: effort for row_id, effort in found.items() if effort}
+        asked = {row.capture_id for row in rows}
+        self._recordings = {key: known for key, known in self._recordings.items() if key in asked}
+        ids = tuple(asked - self._recordings.keys())
+        for one in self._catalogue.captures.where(f"id IN ({', '.join('?' * len(ids))})", ids) if ids else ():
+            if one.sensor is not None and one.recording is not None and one.recording.frames:
+                self._recordings[one.id] = (one.sensor.width, one.sensor.height, one.recording.frames)
+        return {
+            row.id: _effort(row, *self._recordings[row.capture_id])
+            for row in rows
+            if row.capture_id in self._recordings
+        }
 
 
 def _paces(rows: Sequence[ReconstructionRow], efforts: dict[str, float]) -> list[float]:
@@ -117,11 +136,8 @@ def _paces(rows: Sequence[ReconstructionRow], efforts: dict[str, float]) -> list
     return [pace for pace in found if pace < float("inf")]
 
 
-def _effort(row: ReconstructionRow, capture: CaptureRow | None) -> float | None:
-    """Seconds of work on a reference machine; None while the recording is not closed."""
-    if capture is None or capture.sensor is None or capture.recording is None or not capture.recording.frames:
-        return None
-    width, height, frames = capture.sensor.width, capture.sensor.height, capture.recording.frames
+def _effort(row: ReconstructionRow, width: int, height: int, frames: int) -> float:
+    """Seconds of work on a reference machine."""
     match row.task:
         case Task.MERGE:
             share = _MERGE_SHARE
@@ -129,7 +145,7 @@ def _effort(row: ReconstructionRow, capture: CaptureRow | None) -> float | None:
             share = _LOCALISATION_SHARE * (min(row.part.count, frames) / frames if row.part else 1)
         case _:
             share = 1.0
-    return share * typical_work_s(width, height, frames, row.options.steps)
+    return share * _typical_work_s(width, height, frames, row.options.steps)
 
 
 def _remaining_s(row: ReconstructionRow) -> float:

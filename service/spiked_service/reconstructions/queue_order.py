@@ -1,6 +1,6 @@
 """The order of the queue: places in it, parts of it, and moves, however long it is."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,6 +9,12 @@ from spiked_service.store.rows import ReconstructionRow
 
 _CHUNK = 16
 """Jobs that are read at once where most often the first one is wanted."""
+_DIGITS = (6, 8, 11, 13)
+"""Digits of turns for which `queue_blocks` counts: an id's time in steps of 4.7 h, 65 s, 0.26 s and 1 ms."""
+_ABOVE = "\x7f"
+"""Above all characters of a turn."""
+_NEAR = 256
+"""Jobs between two places that are counted one by one."""
 _USERS = 1000
 """Users who take turns; more share the last one."""
 _ROWS = "SELECT document FROM queue CROSS JOIN reconstructions USING (id)"
@@ -33,18 +39,26 @@ class QueueOrder:
 
     def __len__(self) -> int:
         """Number of queued jobs, held ones included."""
-        ((count,),) = self._catalogue.read("SELECT count(*) FROM queue")
+        query = "SELECT coalesce(sum(jobs), 0) FROM queue_blocks WHERE digits = ?"
+        ((count,),) = self._catalogue.read(query, (_DIGITS[0],))
         return int(count)
 
     def first(self, count: int) -> list[ReconstructionRow]:
         """The next `count` jobs, the first one first."""
         return self._rows(f"{_ROWS} {_IN_TURN}", (count,))
 
-    def released(self) -> Iterator[ReconstructionRow]:
-        """All that are not held, the next one first; read on demand, so what changes meanwhile is seen."""
+    def released(self, passed: Collection[str] = ()) -> Iterator[ReconstructionRow]:
+        """All that are not held, the next one first; read on demand, so what changes meanwhile is seen.
+
+        Those that read the recordings of captures that are `passed`, also meanwhile, are left out.
+        """
         condition, values = "NOT held", tuple[Any, ...]()
-        while rows := self._rows(f"{_ROWS} WHERE {condition} {_IN_TURN}", (*values, _CHUNK)):
-            yield from rows
+        while True:
+            others = f"recording NOT IN ({', '.join('?' * len(passed))})"
+            rows = self._rows(f"{_ROWS} WHERE {condition} AND {others} {_IN_TURN}", (*values, *passed, _CHUNK))
+            if not rows:
+                return
+            yield from (row for row in rows if row.capture_id not in passed or not row.task.reads_recording)
             condition, values = "NOT held AND (urgency, turn, id) > (?, ?, ?)", _values(turn_of(rows[-1]))
 
     def page(self, limit: int, cursor: str | None) -> Page[ReconstructionRow]:
@@ -59,24 +73,44 @@ class QueueOrder:
                 raise UnknownIdError(f"reconstruction {cursor}, after which the list goes on, is gone; list anew")
             condition, values = "(urgency, turn, id) > (?, ?, ?)", _values(turn_of(last))
         rows = self._rows(f"{_ROWS} WHERE {condition} {_IN_TURN}", (*values, limit + 1))
-        places = self.places(row.id for row in rows[:limit])
-        items = [replace(row, queue_place=places.get(row.id)) for row in rows[:limit]]
+        begin = self._place(turn_of(rows[0])) if rows else 0
+        items = [replace(row, queue_place=place) for place, row in enumerate(rows[:limit], begin)]
         return Page(items, rows[limit - 1].id if len(rows) > limit else None, len(self))
 
     def places(self, ids: Iterable[str]) -> dict[str, int]:
-        """Places of those that are queued, from 1; the table is passed once, however many there are."""
-        wanted = tuple(ids)
+        """Places of those that are queued, from 1."""
+        if not (wanted := tuple(ids)):
+            return {}
         marks = ", ".join("?" * len(wanted))
         found = self._catalogue.read(f"SELECT urgency, turn, id FROM queue WHERE id IN ({marks})", wanted)
         places, place, before = dict[str, int](), 0, Turn(-(2**62), "", "")
+        # Turns are compared alone, too: SQLite ends a search at an upper bound of one column only.
+        near = "SELECT 1 FROM queue WHERE urgency = ? AND turn BETWEEN ? AND ? AND (turn, id) > (?, ?)"
         for turn in sorted(Turn(*key) for key in found):
-            ((count,),) = self._catalogue.read(
-                "SELECT count(*) FROM queue WHERE (urgency, turn, id) > (?, ?, ?) AND (urgency, turn, id) <= (?, ?, ?)",
-                (*_values(before), *_values(turn)),
-            )
-            place, before = place + count, turn
+            between = (turn.urgency, before.turn, turn.turn, before.turn, before.id, turn.turn, turn.id, _NEAR)
+            count = _NEAR
+            if turn.urgency == before.urgency:
+                query = f"SELECT count(*) FROM ({near} AND (turn, id) <= (?, ?) LIMIT ?)"
+                ((count,),) = self._catalogue.read(query, between)
+            place, before = place + count if count < _NEAR else self._place(turn), turn
             places[turn.id] = place
         return places
+
+    def _place(self, turn: Turn) -> int:
+        """The place of a queued job: those before its block of turns, and those of the block up to it."""
+        query = "SELECT coalesce(sum(jobs), 0) FROM queue_blocks WHERE digits = ? AND"
+        place, block = 0, ""
+        for digits in _DIGITS:
+            low, block = block, turn.turn[:digits]
+            if digits == _DIGITS[0]:
+                before = self._catalogue.read(f"{query} (urgency, block) < (?, ?)", (digits, turn.urgency, block))
+            else:
+                inside = f"{query} urgency = ? AND block >= ? AND block < ?"
+                before = self._catalogue.read(inside, (digits, turn.urgency, low, block))
+            place += before[0][0]
+        query = "SELECT count(*) FROM queue WHERE urgency = ? AND turn BETWEEN ? AND ? AND (turn, id) <= (?, ?)"
+        ((count,),) = self._catalogue.read(query, (turn.urgency, block, turn.turn, turn.turn, turn.id))
+        return int(place + count)
 
     def moved(self, row: ReconstructionRow, place: int) -> ReconstructionRow:
         """The row as it is to be saved to have this place; beyond the end: the last one. No other row changes.
@@ -123,7 +157,19 @@ class QueueOrder:
         """The key of the job at a place; None outside of the queue."""
         if place < 1:
             return None
-        found = self._catalogue.read(f"SELECT urgency, turn, id FROM queue {_IN_TURN} OFFSET ?", (1, place - 1))
+        left, inside, values = place - 1, "", tuple[Any, ...]()
+        for digits in _DIGITS:
+            query = f"SELECT urgency, block, jobs FROM queue_blocks WHERE digits = ?{inside} ORDER BY urgency, block"
+            for urgency, block, jobs in self._catalogue.read(query, (digits, *values)):
+                if left < jobs:
+                    inside = " AND urgency = ? AND block BETWEEN ? AND ? AND substr(block, 1, ?) = ?"
+                    values = (urgency, block, f"{block}{_ABOVE}", digits, block)
+                    break
+                left -= jobs
+            else:
+                return None
+        query = "SELECT urgency, turn, id FROM queue WHERE urgency = ? AND turn >= ? ORDER BY turn, id LIMIT 1 OFFSET ?"
+        found = self._catalogue.read(query, (*values[:2], left))
         return Turn(*found[0]) if found else None
 
     def _rows(self, query: str, values: tuple[Any, ...]) -> list[ReconstructionRow]:

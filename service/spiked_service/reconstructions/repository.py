@@ -2,7 +2,7 @@
 
 import shutil
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Unpack
@@ -13,9 +13,8 @@ from spiked.render import Camera
 from spiked.sensor import Sensor
 from spiked_service.base.errors import BusyError
 from spiked_service.reconstructions.notifier import Notifier
-from spiked_service.reconstructions.queue_estimates import Front, QueueEstimates
-from spiked_service.reconstructions.queue_order import QueueOrder
 from spiked_service.reconstructions.queue_policy import QueuePolicy
+from spiked_service.reconstructions.queue_view import QueueView
 from spiked_service.results.pinned_map import pin
 from spiked_service.results.published import Published
 from spiked_service.results.scene_scale import forget_scale
@@ -24,6 +23,12 @@ from spiked_service.results.versions import Publisher, newest, version_row
 from spiked_service.store.catalogue import Catalogue, Page, StoreError
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import JobState, MapRef, ReconstructionEdit, ReconstructionRow, VersionRow
+from spiked_service.store.snapshot import CaptureJobs
+
+LISTED = 100
+"""Reconstructions that are listed with their capture, at most: the newest."""
+_ALL = 2**31
+"""No limit."""
 
 
 class ReconstructionRepository:
@@ -37,11 +42,10 @@ class ReconstructionRepository:
         self._folder = folder
         self._catalogue = catalogue
         self._notifier = notifier
-        self._policy = policy
-        self._order = QueueOrder(catalogue)
-        self._estimates = QueueEstimates(catalogue, self._order)
         self._lock = threading.RLock()
         self._running: dict[str, ReconstructionRow] = {}
+        self._view = QueueView(catalogue, notifier, policy, self._running, self._lock)
+        self._order = self._view.order
         self._unsaved: dict[str, ReconstructionRow] = {}
         self._texts: dict[str, tuple[str, str]] = {}
         """Name and notes that users have given meanwhile: workers save rows that do not have them yet."""
@@ -68,27 +72,32 @@ class ReconstructionRepository:
         page = self._order.page(limit, cursor)
         return Page(self._current(page.items), page.next_cursor, page.total)
 
-    def ids_of(self, capture_id: str) -> tuple[str, ...]:
-        """Ids of the reconstructions of a capture, oldest first."""
-        found = self._catalogue.read("SELECT id FROM reconstructions WHERE capture_id = ? ORDER BY id", (capture_id,))
-        return tuple(row_id for (row_id,) in found)
+    def jobs_of(self, capture_id: str) -> CaptureJobs:
+        """The newest reconstructions of a capture, and how many there are."""
+        ids = self._catalogue.job_ids(capture_id, LISTED + 1)
+        total = len(ids) if len(ids) <= LISTED else sum(self._catalogue.job_counts(capture_id).values())
+        return CaptureJobs(tuple(ids[LISTED - 1 :: -1]), total)
 
-    def of(self, capture_id: str) -> tuple[ReconstructionRow, ...]:
-        """Reconstructions of a capture, oldest first."""
-        return tuple(self._current(self._catalogue.reconstructions_of(capture_id)))
+    def shown_of(self, capture_ids: Sequence[str]) -> list[ReconstructionRow]:
+        """Of each capture the newest reconstruction with a version, else its newest that is no localisation, if any."""
+        ids = [self._catalogue.shown_job(one) for one in capture_ids]
+        rows = [self._catalogue.reconstructions.find(one) for one in ids if one is not None]
+        return self._current([row for row in rows if row is not None])
 
-    def queued(self) -> Iterator[ReconstructionRow]:
-        """Queued reconstructions that may begin, the next one first, without those that could not be saved."""
-        return (row for row in self._order.released() if row.id not in self._unsaved)
+    def queued(self, passed: Collection[str] = ()) -> Iterator[ReconstructionRow]:
+        """Queued reconstructions that may begin, the next one first, without those that could not be saved.
+
+        Those that read the recordings of captures that are `passed`, also meanwhile, are left out.
+        """
+        return (row for row in self._order.released(passed) if row.id not in self._unsaved)
 
     def interrupted(self) -> list[ReconstructionRow]:
         """Reconstructions that an earlier service left running."""
-        return self._catalogue.reconstructions.where("state = ?", (str(JobState.RUNNING),))
+        return self._catalogue.reconstruction_page(_ALL, state=JobState.RUNNING).items
 
     def counts(self) -> dict[JobState, int]:
         """Number of reconstructions by state."""
-        found = self._catalogue.read("SELECT state, count(*) FROM reconstructions GROUP BY state")
-        return dict.fromkeys(JobState, 0) | {JobState(state): count for state, count in found}
+        return self._catalogue.job_counts()
 
     def folder(self, reconstruction_id: str) -> Path:
         """Folder of its versions. Raises UnknownIdError."""
@@ -111,7 +120,7 @@ class ReconstructionRepository:
         with self._lock:
             row = self._order.fair(row)
             self._catalogue.reconstructions.put(row)
-            self._publish_queue(row.id)
+            self._view.tell(row, ran=False)
             return self._current([row])[0]
 
     def save(self, row: ReconstructionRow) -> ReconstructionRow:
@@ -138,12 +147,9 @@ class ReconstructionRepository:
 
     def _tell(self, row: ReconstructionRow) -> None:
         """Publish a row that was written, and what changed in the queue."""
+        ran = row.id in self._running
         self._set_running(row)
-        if row.state is JobState.QUEUED and row.id not in self._unsaved:
-            self._publish_queue(row.id)  # with its place
-        else:
-            self._notifier.job(row)
-            self._publish_queue()
+        self._view.tell(row, ran=ran)
 
     def publish_edit(self, reconstruction_id: str, version: int, edit: Callable[[Publisher], Published]) -> Published:
         """Publish another version of a reconstruction that has ended, made of its newest, `version`.
@@ -295,6 +301,11 @@ class ReconstructionRepository:
                 self._catalogue.reconstructions.remove(reconstruction_id)
             self._unsaved.pop(reconstruction_id, None)
             self._texts.pop(reconstruction_id, None)
+            self._view.forget(reconstruction_id)
+
+    def close(self) -> None:
+        """End the thread that tells of changed places."""
+        self._view.close()
 
     def _set_running(self, row: ReconstructionRow) -> None:
         if row.state is JobState.RUNNING:
@@ -305,25 +316,7 @@ class ReconstructionRepository:
     def _current(self, rows: Sequence[ReconstructionRow]) -> list[ReconstructionRow]:
         with self._lock:
             found = [self._running.get(row.id) or self._unsaved.get(row.id, row) for row in rows]
-            queued = [row.id for row in found if row.state is JobState.QUEUED and row.id not in self._unsaved]
-            if not queued:
-                return found
-            front, places = self._front(), self._order.places(queued)
-            return [front.placed(row, places[row.id]) if row.id in places else row for row in found]
-
-    def _front(self) -> Front:
-        """The front of the queue, with places and times."""
-        return self._estimates.front([*self._running.values()], self._policy.limit)
-
-    def _publish_queue(self, told_id: str | None = None) -> None:
-        """Publish changed places and times of the queue, and in any case the row of `told_id`, if it is queued."""
-        try:
-            changed = self._estimates.changed(self._front(), told_id)
-        except StoreError as error:
-            self._notifier.log("error", str(error))
-            return
-        for row in changed:
-            self._notifier.job(row)
+            return self._view.placed(found)
 
 
 def _stored(row: ReconstructionRow) -> ReconstructionRow:

@@ -29,8 +29,8 @@ SORT_KEYS = {
     CaptureSort.SIZE: "coalesce(json_extract(document, '$.recording.bytes'), 0)",
     CaptureSort.VERDICT: "CASE json_extract(document, '$.verdict.grade') "
     "WHEN 'good' THEN 3 WHEN 'degraded' THEN 2 WHEN 'bad' THEN 1 ELSE 0 END",
-    CaptureSort.RECONSTRUCTION: "coalesce((SELECT state FROM reconstructions WHERE capture_id = captures.id "
-    "ORDER BY reconstructions.id DESC LIMIT 1), '')",
+    CaptureSort.RECONSTRUCTION: "coalesce((SELECT state FROM jobs WHERE capture_id = captures.id "
+    "ORDER BY jobs.id DESC LIMIT 1), '')",
 }
 """SQL expressions, never null; captures that are alike in them are ordered by id."""
 

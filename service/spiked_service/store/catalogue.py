@@ -175,7 +175,7 @@ class Catalogue:
         Raises UnknownIdError for the cursor of a capture that was purged meanwhile.
         """
         where, values = matching(wanted)
-        ((total,),) = self.read(f"SELECT count(*) FROM captures WHERE {' AND '.join(where)}", tuple(values))
+        total = self._total(where, values, wanted)
         key, side, way = SORT_KEYS[sort], "<" if descending else ">", "DESC" if descending else "ASC"
         if cursor is not None:
             last = self.read(f"SELECT {key} FROM captures WHERE id = ?", (cursor,))
@@ -187,44 +187,80 @@ class Catalogue:
         rows = self.captures.where(ordered, (*values, limit + 1))
         return Page(rows[:limit], rows[limit - 1].id if len(rows) > limit else None, total)
 
+    def _total(self, where: list[str], values: list[Any], wanted: CaptureFilter) -> int:
+        """Number of captures that match; one of those that are kept, where these conditions are counted."""
+        state, grade, deleted = wanted.get("state"), wanted.get("grade"), bool(wanted.get("deleted"))
+        if len(where) == 1 + sum(one is not None for one in (state, grade)):
+            query = "SELECT coalesce(sum(captures), 0) FROM capture_counts WHERE deleted = ?1"
+            ((total,),) = self.read(
+                f"{query} AND state = coalesce(?2, state) AND grade = coalesce(?3, grade)",
+                (deleted, state and str(state), grade and str(grade)),
+            )
+        else:
+            ((total,),) = self.read(f"SELECT count(*) FROM captures WHERE {' AND '.join(where)}", tuple(values))
+        return int(total)
+
     def capture_counts(self) -> dict[str, int]:
         """Number of captures by state, without removed ones."""
-        found = self.read("SELECT state, count(*) FROM captures WHERE deleted_at IS NULL GROUP BY state")
+        found = self.read("SELECT state, sum(captures) FROM capture_counts WHERE NOT deleted GROUP BY state")
         return dict.fromkeys(map(str, CaptureState), 0) | dict(found)
 
     def grade_counts(self) -> dict[str, int]:
         """Number of captures by the grade of their recordings, without removed ones and those that have none."""
-        grade = "json_extract(document, '$.verdict.grade')"
-        graded = f"deleted_at IS NULL AND {grade} IS NOT NULL"
-        found = self.read(f"SELECT {grade}, count(*) FROM captures WHERE {graded} GROUP BY 1")
+        graded = "NOT deleted AND grade <> ''"
+        found = self.read(f"SELECT grade, sum(captures) FROM capture_counts WHERE {graded} GROUP BY grade")
         return dict.fromkeys(map(str, Grade), 0) | dict(found)
 
     def reconstruction_page(
         self, limit: int = 50, cursor: str | None = None, capture_id: str | None = None, state: JobState | None = None
     ) -> Page[ReconstructionRow]:
         """Reconstructions, newest first."""
-        where, values = list[str](), list[Any]()
-        if capture_id is not None:
-            where.append("capture_id = ?")
-            values.append(capture_id)
-        if state is not None:
-            where.append("state = ?")
-            values.append(str(state))
-        return self.reconstructions.page(where, values, limit, cursor)
-
-    def reconstructions_of(self, capture_id: str) -> list[ReconstructionRow]:
-        """Reconstructions of a capture, oldest first."""
-        return self.reconstructions.where("capture_id = ? ORDER BY id", (capture_id,))
-
-    def ended_or_lost_reconstructions(self) -> list[str]:
-        """Ids of the reconstructions that have ended, and of those whose capture is missing."""
-        over = tuple(str(state) for state in JobState if state.over)
+        wanted = {"capture_id = ?": capture_id, "state = ?": state and str(state), "id < ?": cursor}
+        given = {condition: value for condition, value in wanted.items() if value is not None}
+        where = " AND ".join(f"jobs.{condition}" for condition in given) or "1"
         found = self.read(
-            f"SELECT id FROM reconstructions WHERE state IN ({', '.join('?' * len(over))}) UNION "
-            "SELECT id FROM reconstructions WHERE capture_id NOT IN (SELECT id FROM captures)",
-            over,
+            f"SELECT document FROM jobs CROSS JOIN reconstructions USING (id) WHERE {where} "
+            "ORDER BY jobs.id DESC LIMIT ?",
+            (*given.values(), limit + 1),
         )
+        rows = [self.reconstructions.parse(document) for (document,) in found]
+        return Page(rows[:limit], rows[limit - 1].id if len(rows) > limit else None)
+
+    def job_counts(self, capture_id: str = "") -> dict[JobState, int]:
+        """Number of reconstructions by state, of a capture or of all."""
+        found = self.read("SELECT state, jobs FROM job_counts WHERE capture_id = ?", (capture_id,))
+        return dict.fromkeys(JobState, 0) | {JobState(state): count for state, count in found}
+
+    def job_ids(self, capture_id: str, limit: int, state: JobState | None = None) -> list[str]:
+        """Ids of the newest reconstructions of a capture, the newest first."""
+        where, values = ("", ()) if state is None else (" AND state = ?", (str(state),))
+        query = f"SELECT id FROM jobs WHERE capture_id = ?{where} ORDER BY id DESC LIMIT ?"
+        return [row_id for (row_id,) in self.read(query, (capture_id, *values, limit))]
+
+    def shown_job(self, capture_id: str) -> str | None:
+        """Id of the newest reconstruction of a capture that has a version, else of the newest that may get one."""
+        query = "SELECT id FROM jobs WHERE capture_id = ? AND worth > 0 ORDER BY worth DESC, id DESC LIMIT 1"
+        found = self.read(query, (capture_id,))
+        return found[0][0] if found else None
+
+    def captures_to_clear(self) -> list[str]:
+        """Ids of the removed captures with reconstructions that wait."""
+        removed = "SELECT id FROM captures WHERE deleted_at IS NOT NULL"
+        if not any(deleted for (deleted,) in self.read("SELECT deleted FROM capture_counts WHERE captures > 0")):
+            return []
+        waiting = "SELECT capture_id FROM job_counts WHERE state = ? AND jobs > 0"
+        return [row_id for (row_id,) in self.read(f"{removed} INTERSECT {waiting}", (str(JobState.QUEUED),))]
+
+    def ended_reconstructions(self) -> list[str]:
+        """Ids of the reconstructions that have ended."""
+        over = tuple(str(state) for state in JobState if state.over)
+        found = self.read(f"SELECT id FROM jobs WHERE state IN ({', '.join('?' * len(over))})", over)
         return [row_id for (row_id,) in found]
+
+    def lost_reconstructions(self) -> list[str]:
+        """Ids of the reconstructions whose capture is missing."""
+        counted = "SELECT capture_id FROM job_counts WHERE capture_id <> '' EXCEPT SELECT id FROM captures"
+        return [row_id for (row_id,) in self.read(f"SELECT id FROM jobs WHERE capture_id IN ({counted})")]
 
     def put_version(self, row: VersionRow, kept: set[int]) -> None:
         """Save a version and delete those that are not kept."""
@@ -248,6 +284,11 @@ class Catalogue:
             "SELECT document FROM versions WHERE reconstruction_id = ? ORDER BY version", (reconstruction_id,)
         )
         return [_VERSION.validate_json(document) for (document,) in found]
+
+    def version_numbers(self, reconstruction_id: str) -> set[int]:
+        """Numbers of the available versions of a reconstruction."""
+        found = self.read("SELECT version FROM versions WHERE reconstruction_id = ?", (reconstruction_id,))
+        return {number for (number,) in found}
 
     def forget_versions(self, reconstruction_id: str) -> None:
         """Delete the versions of a reconstruction."""
@@ -375,13 +416,6 @@ class Table(Generic[_Row]):
         """Rows that match an SQL condition, which may include ORDER BY."""
         found = self._catalogue.read(f"SELECT document FROM {self._name} WHERE {condition}", values)
         return [self._kind.validate_json(document) for (document,) in found]
-
-    def page(self, where: list[str], values: list[Any], limit: int, cursor: str | None) -> Page[_Row]:
-        """Rows that match all conditions and precede the cursor, newest first."""
-        if cursor is not None:
-            where, values = [*where, "id < ?"], [*values, cursor]
-        rows = self.where(f"{' AND '.join(where) or '1'} ORDER BY id DESC LIMIT ?", (*values, limit + 1))
-        return Page(rows[:limit], rows[limit - 1].id if len(rows) > limit else None)
 
 
 _VERSION = TypeAdapter(VersionRow)

@@ -56,13 +56,119 @@ MIGRATIONS = (
         ''
         FROM reconstructions WHERE state = 'queued';
     """,
+    """
+    DROP INDEX reconstructions_by_capture;
+    DROP INDEX reconstructions_by_state;
+    DROP INDEX reconstructions_by_state_and_age;
+    DROP TRIGGER queue_follows;
+    CREATE TABLE jobs (
+        capture_id TEXT NOT NULL, id TEXT NOT NULL UNIQUE, state TEXT NOT NULL, worth INTEGER NOT NULL,
+        PRIMARY KEY (capture_id, id)
+    ) WITHOUT ROWID;
+    CREATE INDEX jobs_by_state ON jobs (state, id);
+    CREATE INDEX jobs_of_capture_by_state ON jobs (capture_id, state, id);
+    CREATE INDEX jobs_by_worth ON jobs (capture_id, worth, id);
+    CREATE TABLE job_counts (
+        capture_id TEXT NOT NULL, state TEXT NOT NULL, jobs INTEGER NOT NULL, PRIMARY KEY (capture_id, state)
+    ) WITHOUT ROWID;
+    CREATE TRIGGER jobs_counted AFTER INSERT ON jobs BEGIN
+        INSERT INTO job_counts VALUES (NEW.capture_id, NEW.state, 1), ('', NEW.state, 1)
+            ON CONFLICT DO UPDATE SET jobs = jobs + 1;
+    END;
+    CREATE TRIGGER jobs_recounted AFTER UPDATE OF state ON jobs BEGIN
+        UPDATE job_counts SET jobs = jobs - 1 WHERE capture_id IN (OLD.capture_id, '') AND state = OLD.state;
+        INSERT INTO job_counts VALUES (NEW.capture_id, NEW.state, 1), ('', NEW.state, 1)
+            ON CONFLICT DO UPDATE SET jobs = jobs + 1;
+    END;
+    CREATE TRIGGER jobs_discounted AFTER DELETE ON jobs BEGIN
+        UPDATE job_counts SET jobs = jobs - 1 WHERE capture_id IN (OLD.capture_id, '') AND state = OLD.state;
+        DELETE FROM job_counts WHERE capture_id = OLD.capture_id AND jobs = 0;
+    END;
+    CREATE TRIGGER jobs_follow AFTER INSERT ON reconstructions BEGIN
+        INSERT INTO jobs SELECT json_extract(NEW.document, '$.capture_id'), NEW.id,
+            json_extract(NEW.document, '$.state'),
+            CASE WHEN json_extract(NEW.document, '$.task') = 'localise' THEN 0
+                WHEN json_extract(NEW.document, '$.version') > 0 THEN 2 ELSE 1 END
+            WHERE true ON CONFLICT (id) DO UPDATE SET state = excluded.state, worth = excluded.worth
+            WHERE state <> excluded.state OR worth <> excluded.worth;
+    END;
+    CREATE TRIGGER jobs_forget AFTER DELETE ON reconstructions BEGIN
+        DELETE FROM jobs WHERE id = OLD.id;
+    END;
+    INSERT INTO jobs SELECT json_extract(document, '$.capture_id'), id, json_extract(document, '$.state'),
+        CASE WHEN json_extract(document, '$.task') = 'localise' THEN 0
+            WHEN json_extract(document, '$.version') > 0 THEN 2 ELSE 1 END
+        FROM reconstructions;
+    ALTER TABLE queue ADD COLUMN recording TEXT NOT NULL DEFAULT '';
+    UPDATE queue SET recording = coalesce((SELECT json_extract(document, '$.capture_id') FROM reconstructions
+        WHERE reconstructions.id = queue.id AND coalesce(json_extract(document, '$.task'), '') <> 'merge'), '');
+    CREATE INDEX queue_released ON queue (urgency, turn, id, recording) WHERE NOT held;
+    CREATE TABLE queue_blocks (
+        digits INTEGER NOT NULL, urgency INTEGER NOT NULL, block TEXT NOT NULL, jobs INTEGER NOT NULL,
+        PRIMARY KEY (digits, urgency, block)
+    ) WITHOUT ROWID;
+    CREATE TRIGGER queue_counted AFTER INSERT ON queue BEGIN
+        INSERT INTO queue_blocks SELECT column1, NEW.urgency, substr(NEW.turn, 1, column1), 1
+            FROM (VALUES (6), (8), (11), (13)) WHERE true ON CONFLICT DO UPDATE SET jobs = jobs + 1;
+    END;
+    CREATE TRIGGER queue_discounted AFTER DELETE ON queue BEGIN
+        INSERT INTO queue_blocks SELECT column1, OLD.urgency, substr(OLD.turn, 1, column1), 0
+            FROM (VALUES (6), (8), (11), (13)) WHERE true ON CONFLICT DO UPDATE SET jobs = jobs - 1;
+        DELETE FROM queue_blocks WHERE jobs = 0
+            AND digits = 6 AND urgency = OLD.urgency AND block = substr(OLD.turn, 1, 6);
+        DELETE FROM queue_blocks WHERE jobs = 0
+            AND digits = 8 AND urgency = OLD.urgency AND block = substr(OLD.turn, 1, 8);
+        DELETE FROM queue_blocks WHERE jobs = 0
+            AND digits = 11 AND urgency = OLD.urgency AND block = substr(OLD.turn, 1, 11);
+        DELETE FROM queue_blocks WHERE jobs = 0
+            AND digits = 13 AND urgency = OLD.urgency AND block = substr(OLD.turn, 1, 13);
+    END;
+    INSERT INTO queue_blocks SELECT column1, urgency, substr(turn, 1, column1), count(*)
+        FROM queue JOIN (VALUES (6), (8), (11), (13)) GROUP BY 1, 2, 3;
+    CREATE TRIGGER queue_follows AFTER INSERT ON reconstructions BEGIN
+        DELETE FROM queue WHERE id = NEW.id;
+        INSERT INTO queue SELECT -coalesce(json_extract(NEW.document, '$.priority'), 0),
+            coalesce(nullif(json_extract(NEW.document, '$.turn'), ''), NEW.id), NEW.id,
+            coalesce(json_extract(NEW.document, '$.held'), 0), coalesce(json_extract(NEW.document, '$.user'), ''),
+            iif(json_extract(NEW.document, '$.task') = 'merge', '', json_extract(NEW.document, '$.capture_id'))
+            WHERE json_extract(NEW.document, '$.state') = 'queued';
+    END;
+    CREATE TABLE capture_counts (
+        deleted INTEGER NOT NULL, state TEXT NOT NULL, grade TEXT NOT NULL, captures INTEGER NOT NULL,
+        PRIMARY KEY (deleted, state, grade)
+    ) WITHOUT ROWID;
+    INSERT INTO capture_counts SELECT json_extract(document, '$.deleted_at') IS NOT NULL,
+        json_extract(document, '$.state'), coalesce(json_extract(document, '$.verdict.grade'), ''), count(*)
+        FROM captures GROUP BY 1, 2, 3;
+    CREATE TRIGGER captures_replaced BEFORE INSERT ON captures BEGIN
+        UPDATE capture_counts SET captures = captures - 1 WHERE (deleted, state, grade) IN
+            (SELECT json_extract(document, '$.deleted_at') IS NOT NULL, json_extract(document, '$.state'),
+                coalesce(json_extract(document, '$.verdict.grade'), '') FROM captures WHERE id = NEW.id);
+    END;
+    CREATE TRIGGER captures_counted AFTER INSERT ON captures BEGIN
+        INSERT INTO capture_counts VALUES (json_extract(NEW.document, '$.deleted_at') IS NOT NULL,
+            json_extract(NEW.document, '$.state'), coalesce(json_extract(NEW.document, '$.verdict.grade'), ''), 1)
+            ON CONFLICT DO UPDATE SET captures = captures + 1;
+    END;
+    CREATE TRIGGER captures_discounted AFTER DELETE ON captures BEGIN
+        UPDATE capture_counts SET captures = captures - 1 WHERE deleted = (OLD.deleted_at IS NOT NULL)
+            AND state = OLD.state AND grade = coalesce(json_extract(OLD.document, '$.verdict.grade'), '');
+    END;
+    """,
 )
 """Script n migrates a catalogue from schema n to n + 1; the schema is the file's user_version.
 
 A script that has been released is never changed. Every schema from the second on keeps the table `history`, so that a
 release that does not know a schema can name the one that wrote it. `tests/service/store/schemas` holds a catalogue of
-each former one. The table `queue` holds the order of the queued reconstructions, which are written by INSERT OR REPLACE
-only: real columns, because SQLite reads a row's document for a column that is made of it, index or not.
+each former one. Reconstructions and captures are written by INSERT OR REPLACE only, and triggers keep tables of real
+columns in step with them, because SQLite reads a row's document for a column that is made of it, index or not:
+
+* `queue`: the order of the queued reconstructions, and the captures whose recordings they read
+* `queue_blocks`: how many of them have the same first digits of their turns, which an id's time begins, so that a place
+  is the sum of few rows
+* `jobs`: states and captures of all reconstructions, and what they are worth as the scene of their capture: 0 for a
+  localisation, 1 without a version, 2 with one
+* `job_counts`: how many jobs there are, of each capture and of all (''); `capture_counts`: how many captures
 """
 
 

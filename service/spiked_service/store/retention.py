@@ -69,7 +69,7 @@ class Retention:
     def used_bytes(self) -> dict[str, int]:
         """Bytes on disk by capture, with its reconstructions."""
         used = {row.id: _size(self._folder.capture(row.id)) for row in self._catalogue.captures.where()}
-        for row_id, capture_id in self._catalogue.read("SELECT id, capture_id FROM reconstructions"):
+        for row_id, capture_id in self._catalogue.read("SELECT id, capture_id FROM jobs"):
             used[capture_id] = used.get(capture_id, 0) + _size(self._folder.reconstruction(row_id))
         return used
 

@@ -1,24 +1,33 @@
-"""A capture with its counters and reconstructions at one moment."""
+"""A capture with its counters and the ids of its reconstructions at one moment."""
 
 from dataclasses import dataclass
 
 from spiked_driver.source_kinds import is_camera
 
 from spiked.ring import DeviceState
-from spiked_service.store.rows import CaptureRow, CaptureState, Counters, ReconstructionRow
+from spiked_service.store.rows import CaptureRow, CaptureState, Counters
 
 _SILENT = (DeviceState.ABSENT, DeviceState.ARMED, DeviceState.LOST)
 
 
 @dataclass(frozen=True)
-class CaptureSummary:
+class CaptureJobs:
+    """The reconstructions of a capture, however many there are."""
+
+    ids: tuple[str, ...] = ()
+    """Of the newest ones, the oldest of these first."""
+    total: int = 0
+    """Number of all."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
     """A capture with its live counters and the ids of its reconstructions."""
 
     row: CaptureRow
     counters: Counters | None
     """Counters now or at the end."""
-    reconstruction_ids: tuple[str, ...]
-    """Oldest first."""
+    jobs: CaptureJobs
     ring: str | None = None
     """Name of the ring in shared memory, while it can be read."""
 
@@ -41,15 +50,3 @@ class CaptureSummary:
     def reason(self) -> str:
         """Why it failed, else what it waits for."""
         return self.row.reason or self.waits_for
-
-    def with_jobs(self, jobs: tuple[ReconstructionRow, ...]) -> "Snapshot":
-        """The same with its reconstructions, oldest first."""
-        return Snapshot(self.row, self.counters, tuple(job.id for job in jobs), self.ring, jobs)
-
-
-@dataclass(frozen=True)
-class Snapshot(CaptureSummary):
-    """A capture with its live counters and its reconstructions."""
-
-    reconstructions: tuple[ReconstructionRow, ...] = ()
-    """Oldest first."""

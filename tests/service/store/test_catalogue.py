@@ -142,7 +142,7 @@ def test_an_exception_in_a_transaction_undoes_all_of_it(catalogue: Catalogue) ->
         catalogue.reconstructions.put(job(row.id))
         raise RuntimeError
     assert catalogue.captures.find(row.id) is None
-    assert catalogue.reconstructions_of(row.id) == []
+    assert catalogue.reconstruction_page(capture_id=row.id).items == []
     with pytest.raises(UnknownIdError, match=row.id):
         catalogue.captures.set(row.id, name="x")
 

@@ -70,12 +70,12 @@ def test_old_ones_are_removed_then_gone_unless_kept_or_running(data_store: DataS
     data_store.retention.apply(NOW)
     assert there(data_store, old) == [True]
     data_store.catalogue.captures.set(old, deleted_at=NOW - timedelta(days=7))
-    jobs = data_store.catalogue.reconstructions_of(old)
+    jobs = data_store.catalogue.reconstruction_page(capture_id=old).items
     data_store.retention.apply(NOW)
     assert there(data_store, old, young, kept, running) == [False, True, True, True]
     assert not data_store.folder.capture(old).exists()
     assert not data_store.folder.reconstruction(jobs[0].id).exists()
-    assert data_store.catalogue.reconstructions_of(old) == []
+    assert data_store.catalogue.reconstruction_page(capture_id=old).items == []
 
 
 def test_beyond_a_size_removed_ones_go_first_then_the_oldest(data_store: DataStore) -> None:

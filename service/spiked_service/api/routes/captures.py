@@ -54,7 +54,7 @@ def capture_routes(captures: Captures, sources: Sources, route_class: type[APIRo
         """Captures, newest first unless another order is asked for. All pages are asked for with the same order."""
         wanted = CaptureFilter(query=q, state=state, deleted=deleted, group=group, tag=tag, grade=grade, keep=keep)
         page = captures.list(limit, cursor, sort, descending, **wanted)
-        items = [CaptureOut.of(captures.summary(row)) for row in page.items]
+        items = [CaptureOut.of(captures.snapshot(row)) for row in page.items]
         return CapturePage(items=items, next_cursor=page.next_cursor, total=page.total or 0)
 
     @router.get("/{capture_id:id}", responses=problems(404))

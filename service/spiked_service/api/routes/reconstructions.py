@@ -80,8 +80,22 @@ def reconstruction_routes(
         in_turn: Annotated[
             bool, Query(description="List the whole queue instead, the next to begin first, and count it.")
         ] = False,
+        shown_of: Annotated[
+            list[str] | None,
+            Query(
+                max_length=100,
+                description="List the reconstruction of each of these captures whose scene is shown instead: the newest "
+                "with a version, else the newest that may get one.",
+            ),
+        ] = None,
     ) -> ReconstructionPage:
         """Reconstructions, newest first, or the queue in its order."""
+        if shown_of is not None:
+            if in_turn or (capture_id, state, cursor) != (None, None, None):
+                raise ConfigurationError("shown_of lists what it names: leave out the other filters")
+            return ReconstructionPage(
+                items=[ReconstructionOut.of(row) for row in rows.shown_of(shown_of)], next_cursor=None
+            )
         if in_turn and (capture_id is not None or state not in (None, JobState.QUEUED)):
             raise ConfigurationError("in_turn lists the whole queue: leave out capture_id and state")
         page = rows.in_turn(limit, cursor) if in_turn else rows.page(limit, cursor, capture_id, state)

@@ -32,7 +32,7 @@ from spiked_service.api.schemas.base import (
 from spiked_service.results.rate_statistics import RateStatistics
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.rows import CaptureState, Counters, Grade, Origin, Quality, Recorded
-from spiked_service.store.snapshot import CaptureSummary
+from spiked_service.store.snapshot import Snapshot
 
 
 class ConsumerOut(Out):
@@ -359,6 +359,7 @@ class CaptureOut(Out):
                         "sha256": None,
                     },
                     "reconstruction_ids": ["01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e11"],
+                    "reconstruction_count": 1,
                     "counters": None,
                     "sensor": {
                         "width": 400,
@@ -394,7 +395,10 @@ class CaptureOut(Out):
     deleted_at: datetime | None = Field(description="Not null: removed; `:restore` brings it back.")
     frames_planned: int | None = Field(description="Length of the capture if it is known.")
     recording: RecordingOut | None
-    reconstruction_ids: list[str] = Field(description="Oldest first.")
+    reconstruction_ids: list[str] = Field(
+        description="The newest 100, the oldest of these first; `GET reconstructions?capture_id=` lists all."
+    )
+    reconstruction_count: int = Field(description="Number of all its reconstructions.")
     counters: CountersOut | None
     sensor: SensorOut | None = Field(description="Null until the source is open.")
     group: str | None = Field(None, description="Id of the group of captures that were started together.")
@@ -405,7 +409,7 @@ class CaptureOut(Out):
     )
 
     @classmethod
-    def of(cls, snapshot: CaptureSummary) -> "CaptureOut":
+    def of(cls, snapshot: Snapshot) -> "CaptureOut":
         """All that is known."""
         row = snapshot.row
         return cls(
@@ -426,7 +430,8 @@ class CaptureOut(Out):
             deleted_at=row.deleted_at,
             frames_planned=row.frames_planned,
             recording=RecordingOut.of(row.recording),
-            reconstruction_ids=list(snapshot.reconstruction_ids),
+            reconstruction_ids=list(snapshot.jobs.ids),
+            reconstruction_count=snapshot.jobs.total,
             counters=CountersOut.of(snapshot.counters),
             sensor=SensorOut.of(row.sensor),
             group=row.group,

@@ -16,6 +16,7 @@ from spiked_service.cli.fault_flags import Corrupt, Drop, Gap, Stall, UnplugAt, 
 from spiked_service.cli.recording_flags import parse_intrinsics
 from spiked_service.daemon import Daemon
 from spiked_service.operations.malloc import limit_arenas
+from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.settings.reload import ReloadableSettings
 from spiked_service.settings.settings import LogFormat, LogLevel, pass_on, setting
 from spiked_service.store.rows import CaptureState, Plan
@@ -103,12 +104,12 @@ def serve(
             k = parse_intrinsics(intrinsics) if intrinsics else None
             captures.start(Plan(unpaced(devices[0]), frames=frames, intrinsics=k))
         output.print(f"spiked listens at {daemon.address}", markup=False)
-        with _followed(captures) if follow else nullcontext():
+        with _followed(captures, daemon.services.reconstructions.rows) if follow else nullcontext():
             daemon.run()
 
 
 @contextmanager
-def _followed(captures: Captures) -> Iterator[None]:
+def _followed(captures: Captures, jobs: ReconstructionRepository) -> Iterator[None]:
     """Print the state of the newest capture when it changes."""
     over = threading.Event()
 
@@ -116,7 +117,7 @@ def _followed(captures: Captures) -> Iterator[None]:
         last = ""
         while not over.wait(_FOLLOW_S):
             for row in captures.list(limit=1).items:
-                line = _line(captures.snapshot(row))
+                line = _line(captures.snapshot(row), jobs)
                 if line != last:
                     output.print(line, markup=False)
                     last = line
@@ -130,12 +131,12 @@ def _followed(captures: Captures) -> Iterator[None]:
         thread.join()
 
 
-def _line(snapshot: Snapshot) -> str:
+def _line(snapshot: Snapshot, jobs: ReconstructionRepository) -> str:
     """State of a capture, in one line."""
     row = snapshot.row
-    if not snapshot.reconstructions or row.state is CaptureState.FAILED or snapshot.waits_for:
+    if not snapshot.jobs.ids or row.state is CaptureState.FAILED or snapshot.waits_for:
         return f"{row.state}  {snapshot.reason}".rstrip()
-    job = snapshot.reconstructions[-1]
+    job = jobs.get(snapshot.jobs.ids[-1])
     loss = "" if job.loss is None else f"  loss {job.loss:.1e}"
     left = f"  {100 * job.progress:.0f} % refined" if row.state is CaptureState.FINISHING else ""
     growth = f"{job.frames} frames  {job.poses} poses  {job.splats} splats"

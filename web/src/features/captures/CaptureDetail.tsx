@@ -61,7 +61,7 @@ function Detail({ capture }: { capture: Capture }): JSX.Element {
   const job = jobs.find((one) => one.id === at.reconstruction) ?? newestReconstruction(all, capture.id);
   const [otherId, setOtherId] = useState<string | null>(null);
   const other = jobs.find((one) => one.id === otherId && one.id !== job?.id) ?? null;
-  const nameOfJob = (one: Reconstruction): string => numberOf(one, jobs);
+  const nameOfJob = (one: Reconstruction): string => numberOf(one, jobs, capture.reconstruction_count);
   const [form, setForm] = useState<"rerun" | "map" | null>(null);
   const toggle = (wanted: "rerun" | "map"): void => setForm(form === wanted ? null : wanted);
 
@@ -101,6 +101,8 @@ function Detail({ capture }: { capture: Capture }): JSX.Element {
             onMap={() => toggle("map")}
             mapping={form === "map"}
             canRun={canRun}
+            total={Math.max(capture.reconstruction_count, jobs.length)}
+            onMore={(before) => void attempt(() => loadReconstructions(capture.id, before))}
           />
           {form === "rerun" && (
             <RerunPanel

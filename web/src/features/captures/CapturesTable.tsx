@@ -3,11 +3,11 @@
 import { type JSX, useEffect, useRef, useState } from "react";
 
 import { address } from "../../shared/api/calls";
-import type { Capture, CaptureSort } from "../../shared/api/types";
+import type { Capture, CaptureSort, Reconstruction } from "../../shared/api/types";
 import { lengthOf, nameOf, sourceOf } from "../../shared/state/capture";
 import { bytes, count, when } from "../../shared/state/format";
 import { adjust, go, useRoute } from "../../shared/state/route";
-import { loadReconstructions, newestReconstruction, useService } from "../../shared/state/store";
+import { useService } from "../../shared/state/store";
 import { ActionButton } from "../../shared/ui/access";
 import { Icon } from "../../shared/ui/icons";
 import { PageLink } from "../../shared/ui/PageLink";
@@ -18,6 +18,7 @@ import { removeWithUndo, restored } from "./remove";
 import { UnfinishedUploads } from "./UnfinishedUploads";
 import { UploadPanel } from "./UploadPanel";
 import { filterOf, named, type Order, orderOf, useListing } from "./useListing";
+import { useShownJobs } from "./useShownJobs";
 
 const COLUMNS: (Column & { sort?: CaptureSort })[] = [
   { name: "Select", hidden: true },
@@ -30,6 +31,8 @@ const COLUMNS: (Column & { sort?: CaptureSort })[] = [
   { name: "Reconstruction", sort: "reconstruction" },
   { name: "Actions", hidden: true },
 ];
+
+const NONE: Capture[] = [];
 
 export function CapturesTable(): JSX.Element {
   const at = useRoute();
@@ -44,7 +47,8 @@ export function CapturesTable(): JSX.Element {
   const deleted = filter === "deleted";
 
   const Bar = deleted ? DeletedBar : SelectionBar;
-  const shown = listed?.items ?? [];
+  const shown = listed?.items ?? NONE;
+  const jobOf = useShownJobs(shown);
   return (
     <div className="captures">
       <header className="head">
@@ -80,6 +84,7 @@ export function CapturesTable(): JSX.Element {
         <Bar
           key={filter}
           chosen={shown.filter((one) => selected.has(one.id)).map((one) => known[one.id] ?? one)}
+          jobOf={jobOf}
           onDone={() => {
             setSelected(new Set());
             again();
@@ -132,6 +137,7 @@ export function CapturesTable(): JSX.Element {
               <Row
                 key={one.id}
                 capture={known[one.id] ?? one}
+                job={jobOf(one.id)}
                 selected={selected.has(one.id)}
                 onSelect={(wanted) =>
                   setSelected((old) => new Set(wanted ? [...old, one.id] : [...old].filter((id) => id !== one.id)))
@@ -177,23 +183,21 @@ function MoreButton({ waits, onMore }: { waits: boolean; onMore: () => void }): 
 
 function Row({
   capture,
+  job,
   selected,
   onSelect,
   onRemoved,
   onRestored,
 }: {
   capture: Capture;
+  /** The one whose scene is shown; null where none is known. */
+  job: Reconstruction | null;
   selected: boolean;
   onSelect: (wanted: boolean) => void;
   onRemoved: () => void;
   onRestored: () => void;
 }): JSX.Element {
-  const job = useService((state) => newestReconstruction(state.reconstructions, capture.id));
-  const jobs = capture.reconstruction_ids.length;
-  const unknown = job === null && jobs > 0;
-  useEffect(() => {
-    if (unknown) loadReconstructions(capture.id).catch(() => undefined); // shown by the banner at the top
-  }, [unknown, capture.id]);
+  const jobs = capture.reconstruction_count;
   return (
     <tr>
       <td>

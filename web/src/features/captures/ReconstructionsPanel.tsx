@@ -8,12 +8,15 @@ import { attempt } from "../../shared/state/attempt";
 import { progressText } from "../../shared/state/capture";
 import { count, decibel, when } from "../../shared/state/format";
 import { adjust, go } from "../../shared/state/route";
+import { ENDED } from "../../shared/state/keptJobs";
 import { isEnded, removeReconstruction, storeReconstruction } from "../../shared/state/store";
 import { ActionButton } from "../../shared/ui/access";
 import { Icon } from "../../shared/ui/icons";
 import { Badge, Empty, JobBadge, JobReason, jobTone, Panel, Warnings } from "../../shared/ui/parts";
 import { Table } from "../../shared/ui/Table";
 
+/** Reconstructions that are listed at first, and more of at a time. */
+const ROWS = 100;
 const COLUMNS = [
   { name: "Show" },
   { name: "Compare" },
@@ -42,6 +45,8 @@ export function ReconstructionsPanel({
   onMap,
   mapping,
   canRun,
+  total,
+  onMore,
 }: {
   /** Newest first. */
   jobs: readonly Reconstruction[];
@@ -56,7 +61,18 @@ export function ReconstructionsPanel({
   onMap: () => void;
   mapping: boolean;
   canRun: boolean;
+  /** Number of all, of which `jobs` may be the newest. */
+  total: number;
+  /** Fetches those before the one with this id. */
+  onMore: (before: string) => void;
 }): JSX.Element {
+  const [rows, setRows] = useState(ROWS);
+  const listed = jobs.filter((one, at) => at < rows || one.id === job?.id || one.id === other?.id);
+  const more = (): void => {
+    const last = jobs.at(-1);
+    if (jobs.length < Math.min(rows + ROWS, total) && last !== undefined) onMore(last.id);
+    setRows(rows + ROWS);
+  };
   return (
     <Panel
       title="Reconstructions"
@@ -79,8 +95,26 @@ export function ReconstructionsPanel({
       {jobs.length === 0 ? (
         <Empty icon="scene" title="None yet" />
       ) : (
-        <Table label="Table of reconstructions" className="grid jobs" columns={COLUMNS}>
-          {jobs.map((one) => (
+        <Table
+          label="Table of reconstructions"
+          className="grid jobs"
+          columns={COLUMNS}
+          below={
+            total > listed.length && (
+              <p className="below">
+                <span className="dim" role="status">
+                  {count(listed.length)} of {count(total)}
+                </span>
+                {rows < ENDED && (
+                  <button type="button" className="more" onClick={more}>
+                    Show more
+                  </button>
+                )}
+              </p>
+            )
+          }
+        >
+          {listed.map((one) => (
             <Row
               key={one.id}
               job={one}

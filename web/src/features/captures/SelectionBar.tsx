@@ -3,16 +3,10 @@
 import { type JSX, useState } from "react";
 
 import * as calls from "../../shared/api/calls";
-import type { Capture } from "../../shared/api/types";
+import type { Capture, Reconstruction } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
 import { bytes } from "../../shared/state/format";
-import {
-  newestReconstruction,
-  removeFromStore,
-  storeCapture,
-  storeReconstruction,
-  useService,
-} from "../../shared/state/store";
+import { removeFromStore, storeCapture, storeReconstruction } from "../../shared/state/store";
 import { toast } from "../../shared/state/toasts";
 import { ActionButton } from "../../shared/ui/access";
 import type { Filter, Order } from "./useListing";
@@ -71,6 +65,8 @@ export function ListControls({
 
 interface Selection {
   chosen: readonly Capture[];
+  /** The reconstruction of a capture whose scene is shown. */
+  jobOf: (captureId: string) => Reconstruction | null;
   onDone: () => void;
   onNone: () => void;
 }
@@ -92,7 +88,7 @@ function useEach(
   return [busy, each];
 }
 
-export function SelectionBar({ chosen, onDone, onNone }: Selection): JSX.Element {
+export function SelectionBar({ chosen, jobOf, onDone, onNone }: Selection): JSX.Element {
   const [busy, each] = useEach(chosen, onDone);
   const remove = async (): Promise<void> => {
     const removed = await each(async (one) => {
@@ -109,9 +105,8 @@ export function SelectionBar({ chosen, onDone, onNone }: Selection): JSX.Element
     });
   };
   const recorded = chosen.filter((one) => one.recording !== null);
-  const jobs = useService((state) => state.reconstructions);
   const results = chosen.flatMap((one) => {
-    const job = newestReconstruction(jobs, one.id);
+    const job = jobOf(one.id);
     return job !== null && job.version > 0 ? [job.id] : [];
   });
   return (

@@ -1,13 +1,13 @@
 /** Running and queued reconstructions of all captures; that of the capture shown, while it is recorded, is elsewhere on the page. */
 
-import type { JSX } from "react";
+import { type JSX, memo } from "react";
 
 import * as calls from "../../shared/api/calls";
 import type { Reconstruction, ReconstructionChange } from "../../shared/api/types";
 import { attempt } from "../../shared/state/attempt";
 import { nameOf, progressText } from "../../shared/state/capture";
 import { count } from "../../shared/state/format";
-import { FRONT } from "../../shared/state/queueFront";
+import { FRONT } from "../../shared/state/keptJobs";
 import { activeJobs, storeReconstruction, useService } from "../../shared/state/store";
 import { ActionButton } from "../../shared/ui/access";
 import { NotifySwitch } from "./NotifySwitch";
@@ -33,7 +33,8 @@ export function Queue({ shown }: { shown: string | null }): JSX.Element | null {
   );
 }
 
-function Turn({ job }: { job: Reconstruction }): JSX.Element {
+/** Drawn anew only if its job has changed: a change of one place tells of many. */
+const Turn = memo(function Turn({ job }: { job: Reconstruction }): JSX.Element {
   const capture = useService((state) => state.captures[job.capture_id] ?? null);
   const name = job.name !== "" ? job.name : capture === null ? "an older capture" : nameOf(capture);
   const change = async (body: ReconstructionChange): Promise<boolean> =>
@@ -94,4 +95,4 @@ function Turn({ job }: { job: Reconstruction }): JSX.Element {
       </span>
     </li>
   );
-}
+});

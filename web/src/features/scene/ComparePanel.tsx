@@ -102,8 +102,9 @@ function Choice({
   const far = others.filter((one) => one.capture_id !== capture.id);
   const other = comparison?.job ?? null;
   const ofOther = useVersions(other?.id === job.id ? null : other);
-  // All of this capture are known, of others those that are complete.
-  const nameOfNear = (one: Reconstruction): string => `${numberOf(one, Object.values(all))}, ${calledOf(one)}`;
+  // The newest of this capture are known, of others those that are complete.
+  const nameOfNear = (one: Reconstruction): string =>
+    `${numberOf(one, Object.values(all), capture.reconstruction_count)}, ${calledOf(one)}`;
   const nameOfFar = (one: Reconstruction): string => {
     const from = captures[one.capture_id];
     return `${from === undefined ? "an older capture" : nameOf(from)}, ${calledOf(one)}`;

@@ -352,9 +352,11 @@ function namesOf(job: Reconstruction, pinned: Version | null, compared: Compared
   const first = version(job, pinned?.version ?? null);
   const second = version(compared.job, compared.version);
   if (compared.job === null || compared.job.id === job.id) return { first, second };
-  const all = Object.values(useService.getState().reconstructions);
-  const near = compared.job.capture_id === job.capture_id; // all of this capture are known
-  const name = (one: Reconstruction): string => `${near ? `${numberOf(one, all)}, ` : ""}${calledOf(one)}`;
+  const { reconstructions, captures } = useService.getState();
+  const near = compared.job.capture_id === job.capture_id; // the newest of this capture are known
+  const of = captures[job.capture_id]?.reconstruction_count ?? 0;
+  const name = (one: Reconstruction): string =>
+    `${near ? `${numberOf(one, Object.values(reconstructions), of)}, ` : ""}${calledOf(one)}`;
   return {
     first: `${name(job)}, ${first}`,
     second: `${name(compared.job)}, ${second}`,

@@ -179,9 +179,18 @@ export const point = (id: string, x: number, y: number, frame: number): Promise<
 
 export const reconstruction = (id: string): Promise<Reconstruction> =>
   answered(client.GET("/api/v1/reconstructions/{reconstruction_id}", ofReconstruction(id)));
-export const reconstructions = async (captureId: string): Promise<Reconstruction[]> =>
-  (await answered(client.GET("/api/v1/reconstructions", { params: { query: { capture_id: captureId, limit: 100 } } })))
-    .items;
+/** The newest ones of a capture, or those before the one with this id. */
+export const reconstructions = async (captureId: string, before: string | null = null): Promise<Reconstruction[]> =>
+  (
+    await answered(
+      client.GET("/api/v1/reconstructions", {
+        params: { query: { capture_id: captureId, limit: 100, cursor: before } },
+      }),
+    )
+  ).items;
+/** Of each of at most a hundred captures the one whose scene is shown. */
+export const shownOf = async (captureIds: string[]): Promise<Reconstruction[]> =>
+  (await answered(client.GET("/api/v1/reconstructions", { params: { query: { shown_of: captureIds } } }))).items;
 const queue = (limit: number): Promise<ReconstructionPage> =>
   answered(client.GET("/api/v1/reconstructions", { params: { query: { in_turn: true, limit } } }));
 /** Running reconstructions of all captures, the next ones of the queue, and the length of the queue. */

@@ -2129,6 +2129,7 @@ export interface components {
          *       "notes": "",
          *       "origin": "live",
          *       "reason": "",
+         *       "reconstruction_count": 1,
          *       "reconstruction_ids": [
          *         "01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e11"
          *       ],
@@ -2225,9 +2226,14 @@ export interface components {
             recording: components["schemas"]["RecordingOut"] | null;
             /**
              * Reconstruction Ids
-             * @description Oldest first.
+             * @description The newest 100, the oldest of these first; `GET reconstructions?capture_id=` lists all.
              */
             reconstruction_ids: string[];
+            /**
+             * Reconstruction Count
+             * @description Number of all its reconstructions.
+             */
+            reconstruction_count: number;
             counters: components["schemas"]["CountersOut"] | null;
             /** @description Null until the source is open. */
             sensor: components["schemas"]["SensorOut"] | null;
@@ -8680,6 +8686,8 @@ export interface operations {
                 state?: components["schemas"]["JobState"] | null;
                 /** @description List the whole queue instead, the next to begin first, and count it. */
                 in_turn?: boolean;
+                /** @description List the reconstruction of each of these captures whose scene is shown instead: the newest with a version, else the newest that may get one. */
+                shown_of?: string[] | null;
             };
             header?: never;
             path?: never;

@@ -12,11 +12,15 @@ const unnamed = (capture: Capture): string => `${sourceOf(capture)}, ${when(capt
 
 export const nameOf = (capture: Capture): string => (capture.name === "" ? unnamed(capture) : capture.name);
 
-/** The number of a reconstruction among those of its capture, the first one first. */
-export function numberOf(job: Reconstruction, all: Iterable<Reconstruction>): string {
-  let number = 1;
-  for (const one of all) if (one.capture_id === job.capture_id && one.id < job.id) number += 1;
-  return `#${number}`;
+/** The number of a reconstruction among those of its capture, the first one first; `all` has its newest `of` many. */
+export function numberOf(job: Reconstruction, all: Iterable<Reconstruction>, of: number): string {
+  let [known, newer] = [0, 0];
+  for (const one of all) {
+    if (one.capture_id !== job.capture_id) continue;
+    known += 1;
+    if (one.id > job.id) newer += 1;
+  }
+  return `#${Math.max(of, known) - newer}`;
 }
 
 /** The name of a reconstruction, else when it was begun. */

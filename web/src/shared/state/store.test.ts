@@ -4,6 +4,7 @@ import * as calls from "../api/calls";
 import type { Capture, Message, Reconstruction } from "../api/types";
 import { ApiError } from "../api/http";
 import { progressText } from "./capture";
+import { ENDED } from "./keptJobs";
 import * as notifying from "./notifying";
 import { poses } from "./poses";
 import { adjust } from "./route";
@@ -12,6 +13,7 @@ import {
   newestCapture,
   newestReconstruction,
   handleMessage,
+  handleMessages,
   loadCapture,
   refresh,
   storeCapture,
@@ -212,4 +214,31 @@ it("keeps the front of a long queue, and the few behind it that were told of las
   expect(useService.getState().queued).toBe(1);
   adjust({ capture: null });
   vi.restoreAllMocks();
+});
+
+it("keeps the last jobs that ended, and those of the shown capture, however many end", () => {
+  useService.setState({ reconstructions: {} });
+  for (let batch = 0; batch < 25; batch += 1)
+    handleMessages(
+      Array.from({ length: 200 }, (_, number) =>
+        message("job", { ...job(`e${String(200 * batch + number)}`, "many", 1), state: "complete", queue_place: null }),
+      ),
+    );
+  const kept = useService.getState().reconstructions;
+  expect(Object.keys(kept)).toHaveLength(ENDED);
+  expect(kept["e4999"]).toBeDefined();
+  expect(kept["e0"]).toBeUndefined();
+});
+
+it("stores messages about jobs that came together as one change", () => {
+  useService.setState({ reconstructions: {} });
+  let changes = 0;
+  const stop = useService.subscribe(() => (changes += 1));
+  const moved = Array.from({ length: 100 }, (_, at) =>
+    message("job", { ...job(`q${String(at)}`, "a", 0), state: "queued", queue_place: at + 1 }),
+  );
+  handleMessages(moved);
+  stop();
+  expect(changes).toBe(1);
+  expect(activeJobs(useService.getState().reconstructions)).toHaveLength(100);
 });

@@ -9,12 +9,14 @@ import type { Capture, Device, Message, Preview, Reconstruction, SceneEvent, Sys
 import { notifyOfEnd } from "./notifying";
 import { poses } from "./poses";
 import { route } from "./route";
-import { FRONT, isBehind, tooMany } from "./queueFront";
+import { FRONT, isBehind, isEnded, tooMany } from "./keptJobs";
 
 const NEWEST = 20;
 /** Polling interval of REST without a WebSocket. */
 const POLL_MS = 2000;
 const SYSTEM_MS = 10_000;
+/** Interval at which messages are stored while the page is hidden. */
+const HIDDEN_MS = 100;
 /** Captures whose live pictures are kept. */
 const PICTURED = 4;
 
@@ -30,7 +32,7 @@ export interface ServiceState {
   devices: Device[];
   /** Known captures by id; the table of all captures asks for its own pages. */
   captures: Record<string, Capture>;
-  /** Known reconstructions by id; of a long queue its front, and few behind it. */
+  /** Known reconstructions by id; of a long queue its front, and few behind it; the last ones that have ended. */
   reconstructions: Record<string, Reconstruction>;
   /** Length of the queue; while it is no longer than its front, the most that it was. */
   queued: number;
@@ -64,7 +66,7 @@ const { setState: set, getState: get } = useService;
 export const isFinished = (capture: Capture): boolean => capture.state === "complete" || capture.state === "failed";
 /** Whether the capture still takes frames; while it only refines, its device is free. */
 export const isAcquiring = (capture: Capture): boolean => ["starting", "waiting", "streaming"].includes(capture.state);
-export const isEnded = (job: Reconstruction): boolean => !["queued", "running"].includes(job.state);
+export { isEnded };
 
 /** Ids are UUIDs of version 7: the largest is the newest. */
 export function newestCapture(captures: Record<string, Capture>): Capture | null {
@@ -74,15 +76,27 @@ export function newestCapture(captures: Record<string, Capture>): Capture | null
   return newest;
 }
 
-/** The newest reconstruction of a capture; one with a scene goes before a later one that has none yet. */
-export function newestReconstruction(
-  jobs: Record<string, Reconstruction>,
-  captureId: string | null,
-): Reconstruction | null {
-  const own = Object.values(jobs)
-    .filter((job) => job.capture_id === captureId && job.task !== "localise")
-    .sort((a, b) => (a.id < b.id ? 1 : -1));
-  return own.find((job) => job.version > 0) ?? own[0] ?? null;
+type Jobs = Record<string, Reconstruction>;
+/** Many components ask this of the same jobs. */
+const newestKnown = new WeakMap<Jobs, Map<string, Reconstruction>>();
+
+/** The one whose scene is shown: one with a scene goes before a later one that has none yet. */
+export const shownOf = (one: Reconstruction, other: Reconstruction): Reconstruction =>
+  one.version > 0 === other.version > 0 ? (one.id > other.id ? one : other) : one.version > 0 ? one : other;
+
+/** The newest reconstruction of a capture that is known; one with a scene goes before a later one that has none yet. */
+export function newestReconstruction(jobs: Jobs, captureId: string | null): Reconstruction | null {
+  let newest = newestKnown.get(jobs);
+  if (newest === undefined) {
+    newest = new Map<string, Reconstruction>();
+    for (const job of Object.values(jobs)) {
+      if (job.task === "localise") continue;
+      const before = newest.get(job.capture_id);
+      newest.set(job.capture_id, before === undefined ? job : shownOf(before, job));
+    }
+    newestKnown.set(jobs, newest);
+  }
+  return captureId === null ? null : (newest.get(captureId) ?? null);
 }
 
 /** Running reconstructions, then queued ones in order. */
@@ -154,23 +168,31 @@ export function storeCapture(capture: Capture): void {
   }));
 }
 
-/** Without those behind the front of the queue that are too many; those of the capture in the address go last. */
-function withFewBehind(jobs: Record<string, Reconstruction>): Record<string, Reconstruction> {
-  const forgotten = tooMany(jobs, (job) => (heard.get(job.id) ?? 0) + (job.capture_id === route().capture ? clock : 0));
+/** Without those that are too many; those of the capture in the address go last, and those that it names never. */
+function withoutMany(jobs: Jobs): Jobs {
+  const { capture, reconstruction, against } = route();
+  const forgotten = tooMany(jobs, (job) =>
+    job.id === reconstruction || job.id === against
+      ? Infinity
+      : (heard.get(job.id) ?? 0) + (job.capture_id === capture ? clock : 0),
+  );
   if (forgotten.size === 0) return jobs;
   for (const id of forgotten) heard.delete(id);
   return Object.fromEntries(Object.entries(jobs).filter(([id]) => !forgotten.has(id)));
 }
 
 /** Store a reconstruction that a message, or the answer to a change, tells of. */
-export function storeReconstruction(job: Reconstruction): void {
-  hear(job.id);
-  const before = get().reconstructions[job.id];
+export const storeReconstruction = (job: Reconstruction): void => storeReconstructions([job]);
+
+function storeReconstructions(told: Reconstruction[]): void {
+  const before = get().reconstructions;
+  const newest = Object.fromEntries(told.map((job) => [job.id, job]));
+  for (const id of Object.keys(newest)) hear(id);
   set((state) => ({
-    reconstructions: withFewBehind({ ...state.reconstructions, [job.id]: job }),
-    queued: Math.max(state.queued, job.queue_place ?? 0),
+    reconstructions: withoutMany({ ...state.reconstructions, ...newest }),
+    queued: Math.max(state.queued, ...told.map((job) => job.queue_place ?? 0)),
   }));
-  notifyOfEnd(before, job);
+  for (const job of Object.values(newest)) notifyOfEnd(before[job.id], job);
 }
 
 const without = <T>(all: Record<string, T>, id: string): Record<string, T> =>
@@ -184,6 +206,21 @@ export function removeReconstruction(id: string): void {
 export function removeFromStore(id: string): void {
   hear(id);
   set((state) => ({ captures: without(state.captures, id) }));
+}
+
+/** Handle messages that came together; neighbours about jobs are one change, as places of a queue change. */
+export function handleMessages(messages: Message[]): void {
+  let jobs: Reconstruction[] = [];
+  for (const message of messages) {
+    if (message.topic === "job") {
+      jobs.push(message.data);
+      continue;
+    }
+    if (jobs.length > 0) storeReconstructions(jobs);
+    jobs = [];
+    handleMessage(message);
+  }
+  if (jobs.length > 0) storeReconstructions(jobs);
 }
 
 export function handleMessage(message: Message): void {
@@ -296,13 +333,13 @@ export async function loadCapture(id: string): Promise<void> {
 async function mergeReconstructions(ask: () => Promise<Reconstruction[]>): Promise<void> {
   const asked = ++clock;
   const jobs = await ask();
-  set((state) => ({ reconstructions: merged(state.reconstructions, jobs, asked, () => true) }));
+  set((state) => ({ reconstructions: withoutMany(merged(state.reconstructions, jobs, asked, () => true)) }));
 }
 
 export const loadReconstruction = (id: string): Promise<void> =>
   mergeReconstructions(async () => [await calls.reconstruction(id)]);
-export const loadReconstructions = (captureId: string): Promise<void> =>
-  mergeReconstructions(() => calls.reconstructions(captureId));
+export const loadReconstructions = (captureId: string, before: string | null = null): Promise<void> =>
+  mergeReconstructions(() => calls.reconstructions(captureId, before));
 /** The complete ones of all captures. */
 export const loadComplete = (): Promise<void> => mergeReconstructions(calls.complete);
 
@@ -323,10 +360,26 @@ export function signedIn(): void {
   if (!before) void refreshSystem(); // else following begins anew
 }
 
+/** Passes messages on together, once a frame; in a hidden page, which draws none, ten times a second. */
+function gathered(pass: (messages: Message[]) => void): (message: Message) => void {
+  let waiting: Message[] = [];
+  const flush = (): void => {
+    const messages = waiting;
+    waiting = [];
+    pass(messages);
+  };
+  return (message) => {
+    waiting.push(message);
+    if (waiting.length > 1) return;
+    if (document.hidden) setTimeout(flush, HIDDEN_MS);
+    else requestAnimationFrame(flush);
+  };
+}
+
 /** Start following the service; returns a function that stops it. */
 export function follow(): () => void {
   const events = new Events({
-    onMessage: handleMessage,
+    onMessage: gathered(handleMessages),
     onLink: (link) => {
       const before = get().link.state;
       set({ link });

@@ -84,8 +84,8 @@ def reconstruction_routes(
             list[str] | None,
             Query(
                 max_length=100,
-                description="List the reconstruction of each of these captures whose scene is shown instead: the newest "
-                "with a version, else the newest that may get one.",
+                description="List of each of these captures the reconstruction whose scene is shown: the newest with a "
+                "version, else the newest that may get one.",
             ),
         ] = None,
     ) -> ReconstructionPage:

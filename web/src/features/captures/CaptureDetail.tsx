@@ -1,6 +1,7 @@
 /** One capture: recording, notes, reconstructions, plots, downloads. */
 
 import { type JSX, useState } from "react";
+import { useShallow } from "zustand/react/shallow";
 
 import * as calls from "../../shared/api/calls";
 import type { Capture, CaptureChange, Reconstruction } from "../../shared/api/types";
@@ -54,11 +55,16 @@ export function CaptureDetail({ id }: { id: string }): JSX.Element {
 
 function Detail({ capture }: { capture: Capture }): JSX.Element {
   const at = useRoute();
-  const all = useService((state) => state.reconstructions);
-  const jobs = Object.values(all)
-    .filter((job) => job.capture_id === capture.id)
-    .sort((a, b) => (a.id < b.id ? 1 : -1));
-  const job = jobs.find((one) => one.id === at.reconstruction) ?? newestReconstruction(all, capture.id);
+  // Jobs of other captures change all the time: the page is drawn anew only for its own.
+  const jobs = useService(
+    useShallow(({ reconstructions }) =>
+      Object.values(reconstructions)
+        .filter((job) => job.capture_id === capture.id)
+        .sort((a, b) => (a.id < b.id ? 1 : -1)),
+    ),
+  );
+  const newest = useService((state) => newestReconstruction(state.reconstructions, capture.id));
+  const job = jobs.find((one) => one.id === at.reconstruction) ?? newest;
   const [otherId, setOtherId] = useState<string | null>(null);
   const other = jobs.find((one) => one.id === otherId && one.id !== job?.id) ?? null;
   const nameOfJob = (one: Reconstruction): string => numberOf(one, jobs, capture.reconstruction_count);

@@ -8686,7 +8686,7 @@ export interface operations {
                 state?: components["schemas"]["JobState"] | null;
                 /** @description List the whole queue instead, the next to begin first, and count it. */
                 in_turn?: boolean;
-                /** @description List the reconstruction of each of these captures whose scene is shown instead: the newest with a version, else the newest that may get one. */
+                /** @description List of each of these captures the reconstruction whose scene is shown: the newest with a version, else the newest that may get one. */
                 shown_of?: string[] | null;
             };
             header?: never;

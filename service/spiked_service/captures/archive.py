@@ -88,9 +88,9 @@ class DataStore:
     def _clean(self) -> None:
         """Recover interrupted recordings, start the queue, then apply retention every `_CLEAN_S`."""
         self._guarded(lambda: self._recovery.run(self._over.is_set))
-        self._recovered = True
         self._guarded(self.reconstructions.start)
         self._guarded(lambda: self._recovery.check_results(self._over.is_set))
+        self._recovered = True
         while not self._over.wait(_CLEAN_S):
             self._guarded(self.captures.retry_saving)
             self._guarded(self.reconstructions.rows.retry_saving)

@@ -33,6 +33,11 @@ def failed(row: ReconstructionRow, reason: str) -> ReconstructionRow:
     return replace(row, state=JobState.FAILED, reason=reason, ended_at=datetime.now(UTC), eta_s=None, attempt="")
 
 
+def cancelled(row: ReconstructionRow) -> ReconstructionRow:
+    """The row of a job that is cancelled while it waits."""
+    return replace(row, state=JobState.CANCELLED, reason="", eta_s=None, ended_at=datetime.now(UTC))
+
+
 def after_crash(
     row: ReconstructionRow,
     trouble: str,

@@ -11,11 +11,12 @@ from spiked_service.base.ids import new_id
 from spiked_service.reconstructions.admission import check
 from spiked_service.reconstructions.executor import Executor, LocalExecutor
 from spiked_service.reconstructions.given import Given
-from spiked_service.reconstructions.interruption import after_crash, failed, requeue_interrupted
+from spiked_service.reconstructions.interruption import after_crash, cancelled, failed, requeue_interrupted
 from spiked_service.reconstructions.job_commands import command_of, live_command, live_row
 from spiked_service.reconstructions.job_runner import JobRunner, begun_anew
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.queue_policy import QueuePolicy
+from spiked_service.reconstructions.ready_jobs import ReadyJobs
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.catalogue import Catalogue, StoreError
@@ -35,10 +36,8 @@ from spiked_service.workers.process import StandbyWorker
 
 _LOOK_S = 0.5
 """Interval at which the queue is checked while a retry is delayed."""
-_CANCELLED = 16
-"""Waiting jobs of a removed capture that are cancelled at a time; then ..."""
 _OTHERS_S = 0.001
-"""... others can take the lock."""
+"""Time for others to take the lock while many jobs are cancelled."""
 
 
 class Reconstructions:
@@ -68,8 +67,7 @@ class Reconstructions:
         self._jobs: dict[str, JobRunner] = {}
         self._least_poses: dict[str, int] = {}
         """Poses of the published trajectory of a queued reconstruction, which a restart has to reach."""
-        self._removed: set[str] = set()
-        """Removed captures whose waiting jobs are being cancelled."""
+        self._ready = ReadyJobs(catalogue, rows, policy, self.cancel)
         self._closing = False
         self._thread: threading.Thread | None = None
         requeue_interrupted(rows, adopted=executor is not None)
@@ -81,7 +79,7 @@ class Reconstructions:
                 return
             for row in [one for one in self.rows.interrupted() if one.id not in self._jobs]:
                 self._adopt(row)
-            self._removed |= set(self._catalogue.captures_to_clear())
+            self._ready.find_removed()
             self._executor.clean_up()
             self._thread = threading.Thread(target=self._run_queue, name="queue", daemon=True)
             self._thread.start()
@@ -175,9 +173,8 @@ class Reconstructions:
             row = self.rows.get(reconstruction_id)
             if row.state is JobState.QUEUED:
                 self.policy.reset_retries(row.id)
-                ended = replace(row, state=JobState.CANCELLED, reason="", eta_s=None, ended_at=datetime.now(UTC))
                 self.rows.drop_checkpoint(row.id)
-                row = self.rows.save(ended)
+                row = self.rows.save(cancelled(row))
             return row
 
     def cancel_all_of(self, capture_id: str) -> None:
@@ -185,20 +182,8 @@ class Reconstructions:
         with self._lock:
             for job in [one for one in self._jobs.values() if one.row.capture_id == capture_id]:
                 job.cancel()
-            self._removed.add(capture_id)
-            self._cancel_some()
+            self._ready.remove(capture_id)
             self._wake.notify_all()
-
-    def _cancel_some(self) -> None:
-        """Cancel waiting jobs of a removed capture, if there is one. Raises StoreError."""
-        for capture_id in list(self._removed)[:1]:
-            ids = self._catalogue.job_ids(capture_id, _CANCELLED, JobState.QUEUED)
-            capture = self._catalogue.captures.find(capture_id)
-            if not ids or (capture is not None and capture.deleted_at is None):
-                self._removed.discard(capture_id)
-            else:
-                for row_id in ids:
-                    self.cancel(row_id)
 
     def finish_early(self, reconstruction_id: str) -> None:
         """End the refinement of a running reconstruction; it counts as complete."""
@@ -274,42 +259,22 @@ class Reconstructions:
                 wait_s = _LOOK_S if self.policy.delays else None
                 try:
                     self._begin_next()
-                    self._cancel_some()
-                    wait_s = _OTHERS_S if self._removed else wait_s
+                    wait_s = _OTHERS_S if self._ready.cancel_some() else wait_s
                 except (StoreError, OSError) as error:
                     self._notifier.log("error", f"no reconstruction can be started: {error}")
                 self._wake.wait(wait_s)
 
     def _begin_next(self) -> None:
-        if len(self._jobs) >= self.policy.limit:
-            return
-        passed = set(self._removed)
-        for row in self.rows.queued(passed):
-            if len(self._jobs) >= self.policy.limit:
-                return
-            if not self.policy.due(row.id):
-                continue
-            capture = self._catalogue.captures.find(row.capture_id)
-            recorded = capture is not None and capture.recording is not None and capture.recording.frames > 0
-            ready = recorded or not row.task.reads_recording
-            if capture is not None and capture.deleted_at is not None:
-                self._removed.add(capture.id)
-            elif capture is None or (capture.state.over and not ready):
-                self.rows.save(failed(row, row.reason or "the capture has no recording"))
-            elif ready:
-                self._begin_queued(row, capture)
-            else:
-                passed.add(capture.id)
+        ready = iter(self._ready)
+        while len(self._jobs) < self.policy.limit and (found := next(ready, None)) is not None:
+            self._begin_queued(*found)
 
     def _begin_queued(self, row: ReconstructionRow, capture: CaptureRow) -> None:
         if not self.rows.has_checkpoint(row.id):
             self.rows.forget_scale(row)
         command = command_of(row, capture, self._folder, self._least_poses.pop(row.id, 0))
-        now = datetime.now(UTC)
-        begun = replace(
-            row, state=JobState.RUNNING, stage=Stage.WAITING, started_at=now, ended_at=None, attempts=row.attempts + 1
-        )
-        self._begin(begun, command)
+        begun = replace(row, state=JobState.RUNNING, stage=Stage.WAITING, ended_at=None, attempts=row.attempts + 1)
+        self._begin(replace(begun, started_at=datetime.now(UTC)), command)
 
     def _begin(
         self,

@@ -50,7 +50,6 @@ def reconstruction_routes(
     reconstructions: Reconstructions, sources: Sources, profiles: CameraProfiles, route_class: type[APIRoute]
 ) -> APIRouter:
     """Routes below `reconstructions`."""
-    rows = reconstructions.rows
     router = APIRouter(prefix="/reconstructions", tags=["reconstructions"], route_class=route_class)
 
     @router.post("", status_code=HTTPStatus.ACCEPTED, responses=problems(404, 409, 507))
@@ -70,6 +69,26 @@ def reconstruction_routes(
             user=user_of(request),
         )
         return accepted(row, request, response)
+
+    _add_reading_routes(router, reconstructions.rows)
+
+    @router.patch("/{reconstruction_id:id}", responses=problems(404, 409, 507))
+    def change_reconstruction(reconstruction_id: str, body: ReconstructionChange) -> ReconstructionOut:
+        """Change its name or notes, hold it in the queue, or move it there.
+
+        One that runs returns to the queue within a second when it is held, and goes on from its checkpoint later.
+        """
+        row = reconstructions.change(
+            reconstruction_id, name=body.name, notes=body.notes, held=body.held, queue_place=body.queue_place
+        )
+        return ReconstructionOut.of(row)
+
+    _add_end_routes(router, reconstructions)
+    return router
+
+
+def _add_reading_routes(router: APIRouter, rows: ReconstructionRepository) -> None:
+    """Routes that list reconstructions and give one."""
 
     @router.get("", responses=problems(404))
     def list_reconstructions(
@@ -106,20 +125,6 @@ def reconstruction_routes(
     def get_reconstruction(reconstruction_id: str) -> ReconstructionOut:
         """State and progress of a reconstruction."""
         return ReconstructionOut.of(rows.get(reconstruction_id))
-
-    @router.patch("/{reconstruction_id:id}", responses=problems(404, 409, 507))
-    def change_reconstruction(reconstruction_id: str, body: ReconstructionChange) -> ReconstructionOut:
-        """Change its name or notes, hold it in the queue, or move it there.
-
-        One that runs returns to the queue within a second when it is held, and goes on from its checkpoint later.
-        """
-        row = reconstructions.change(
-            reconstruction_id, name=body.name, notes=body.notes, held=body.held, queue_place=body.queue_place
-        )
-        return ReconstructionOut.of(row)
-
-    _add_end_routes(router, reconstructions)
-    return router
 
 
 def calibration_of(device_id: str, sources: Sources, profiles: CameraProfiles) -> Path:

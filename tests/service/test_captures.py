@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -24,7 +25,7 @@ from spiked_service.results.versions import pose_file, versions
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.catalogue import StoreError, UnknownIdError
 from spiked_service.store.disk_space import DiskFullError
-from spiked_service.store.rows import CaptureState, ConsumerCounters, Grade, JobState, Plan, ReconstructionRow, Stage
+from spiked_service.store.rows import CaptureState, ConsumerCounters, Grade, JobState, Plan, Stage
 from spiked_service.workers.backoff import Backoff
 from spiked_service.workers.messages import Role
 from spiked_service.workers.process import StandbyWorker
@@ -223,13 +224,13 @@ def test_states_are_updated_again_after_the_catalogue_could_not_be_read(
     capture_id = data_store.captures.start(recorded_only(f"replay:{tmp_path / 'noise.dat'}?repeat=10000")).id
     read, ticks = data_store.catalogue.job_ids, 0
 
-    def fails_once(capture_id: str) -> list[ReconstructionRow]:
+    def fails_once(*asked: Any) -> list[str]:
         nonlocal ticks
         if threading.current_thread().name == "counters":
             ticks += 1
             if ticks == 1:
                 raise StoreError("the catalogue cannot be read: disk I/O error")
-        return read(capture_id)
+        return read(*asked)
 
     monkeypatch.setattr(data_store.catalogue, "job_ids", fails_once)
     until(lambda: ticks > 2, "the thread that updates the states continues")

@@ -309,6 +309,16 @@ def test_a_timeline_and_a_log(service: Any, job: str) -> None:
     assert service.http.get(f"reconstructions/{job}/log").status_code == 200
 
 
+def test_what_is_shown_of_captures_is_listed_at_once(service: Any, done: CaptureOut, job: str) -> None:
+    asked = {"shown_of": [done.id, "01928f5c-7e2a-7c3d-8a41-0f6d2b9c5e10"]}
+    found = service.http.get("reconstructions", params=asked).json()["items"]
+    newest = max(one.id for one in service.client.reconstructions(capture_id=done.id) if one.version)
+    assert [one["id"] for one in found] == [newest]
+    assert service.http.get("reconstructions", params={**asked, "state": "failed"}).status_code == 422
+    capture = service.client.capture(done.id)
+    assert capture.reconstruction_count == len(capture.reconstruction_ids) > 0
+
+
 def test_a_recording_is_reconstructed_again_with_other_options(service: Any, done: CaptureOut) -> None:
     client = service.client
     started = client.start_reconstruction(done.id, options=ReconstructionOptions(steps=5, seed=3), priority=2)

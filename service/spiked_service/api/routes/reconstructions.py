@@ -112,9 +112,8 @@ def _add_reading_routes(router: APIRouter, rows: ReconstructionRepository) -> No
         if shown_of is not None:
             if in_turn or (capture_id, state, cursor) != (None, None, None):
                 raise ConfigurationError("shown_of lists what it names: leave out the other filters")
-            return ReconstructionPage(
-                items=[ReconstructionOut.of(row) for row in rows.shown_of(shown_of)], next_cursor=None
-            )
+            shown = [ReconstructionOut.of(row) for row in rows.shown_of(shown_of)]
+            return ReconstructionPage(items=shown, next_cursor=None, total=None)
         if in_turn and (capture_id is not None or state not in (None, JobState.QUEUED)):
             raise ConfigurationError("in_turn lists the whole queue: leave out capture_id and state")
         page = rows.in_turn(limit, cursor) if in_turn else rows.page(limit, cursor, capture_id, state)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from spiked_service.api.bus_notifier import BusNotifier
+from spiked_service.api.idempotency import IdempotencyKeys
 from spiked_service.daemon import open_data_store
 from spiked_service.events.bus import Bus, Topic
 from spiked_service.reconstructions.queue_order import QueueOrder
@@ -181,6 +182,13 @@ def test_no_request_scans_a_table_or_sorts(house: Callable[[int], House], monkey
         or ("LIMIT" not in query and any(line.startswith("SCAN") and line not in few for line in plan))
     }
     assert slow == {}
+
+
+def test_old_idempotency_keys_are_found_by_an_index(house: Callable[[int], House]) -> None:
+    one = house(1)
+    IdempotencyKeys(one.catalogue)
+    plan = one.catalogue.read("EXPLAIN QUERY PLAN DELETE FROM idempotency WHERE at < ''")
+    assert "idempotency_by_age" in str(plan)
 
 
 def test_a_capture_with_many_jobs_lists_the_newest(house: Callable[[int], House]) -> None:

@@ -11,8 +11,8 @@ from spiked.distortion import Distortion, LensModel
 from spiked.evaluate import score_trajectory
 from spiked.pose import exp_so3
 from spiked.recon import Options, Reconstructor
-from spiked.recon.mapping.pruning import Pruning
 from spiked.recon.mapping.frame_warp import FrameWarp
+from spiked.recon.mapping.pruning import Pruning
 from spiked.recon.odometry.bundle_adjustment import Bundle
 from spiked.recon.odometry.initialisation import Views, bootstrap
 from spiked.recon.odometry.normal_equations import FreeOptics, PoseBlocks

@@ -18,6 +18,8 @@ from faulty_proxy import FaultyProxy
 BUCKET = "spiked-storm"
 STALL_S = 90.0
 """Longer than any of the limits of the object store."""
+LISTED_S = 60.0
+"""Time for a listing, which may fail meanwhile."""
 KEY = "S3RVER"
 """Key and secret of s3rver, which has no others; moto takes any."""
 
@@ -56,7 +58,15 @@ class Store:
         import s3fs
 
         files = s3fs.S3FileSystem(endpoint_url=f"http://127.0.0.1:{self.port}", use_listings_cache=False)
-        objects = [one for one in files.find(self.uri) if "/recordings/" not in one]
+        until_s = time.monotonic() + LISTED_S
+        while True:
+            try:
+                objects = [one for one in files.find(self.uri) if "/recordings/" not in one]
+                break
+            except OSError:  # s3rver fails if something is removed at the same time
+                if time.monotonic() > until_s:
+                    raise
+                time.sleep(1)
         uploads = None
         with suppress(OSError):  # s3rver has no such request
             uploads = len(files.list_multipart_uploads(BUCKET))

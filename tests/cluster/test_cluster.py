@@ -72,7 +72,7 @@ class Lab:
         settings |= {} if self._uri is None else {"executor_store": self._uri}
         flags = [part for name, value in settings.items() for part in ("--set", f"{name}={value}")]
         source = f"replay:{self._moving}?pace=0"
-        self.one = self._daemon("--port", str(self._port), "--device", source, "--no-capture", *flags)
+        self.one = self._daemon("--port", str(self._port), "--device", source, "--no-capture", "--no-zmq", *flags)
 
     def get(self, path: str) -> Any:
         return self.one.http.get(path).raise_for_status().json()

@@ -111,6 +111,11 @@ def test_of_a_recording_only_what_was_truncated_is_read_again(
     assert proxy.requests - before == 3 + proxy.happened[Fault.TRUNCATE_ANSWER]
 
 
+def test_an_empty_object_is_read_as_any(store: ObjectStore, proxy: FaultyProxy) -> None:
+    store.put("empty", b"")
+    assert store.get("empty") == b"" and store.get("none") is None
+
+
 def test_an_operation_that_is_wanted_no_more_ends(store: ObjectStore, proxy: FaultyProxy) -> None:
     class WantedNoMore(Exception):
         pass

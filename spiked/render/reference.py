@@ -18,9 +18,9 @@ from spiked.distortion import Distortion, LensModel
 from spiked.render.camera import Camera
 from spiked.scene import Scene
 
-DILATION_PX2 = 0.3
 LENS_DILATION_PX2 = 0.05
-"""Part of the dilation that is added in the picture of a lens; the rest is bent with the picture."""
+"""Part of the dilation that is added in the picture of a lens, px^2; the rest is bent with the picture."""
+DILATION_PX2 = 0.3
 """Added to the diagonal of a projected covariance, px^2. This and the next three are the values of the code of 3D
 Gaussian splatting (Kerbl et al. 2023)."""
 ALPHA_CAP = 0.99

@@ -14,6 +14,7 @@ import hashlib
 import json
 import os
 import random
+import re
 import socket
 import subprocess
 import sys
@@ -21,6 +22,7 @@ import tempfile
 import time
 from collections import Counter
 from contextlib import ExitStack, suppress
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -261,6 +263,21 @@ def outcome(service: Service, jobs: list[str], scratch: Path, store: Store | Non
     }
 
 
+def use(service: Service, jobs: list[str]) -> dict[str, float]:
+    """How long a worker works for a job, and the share of the time of two nodes that workers work.
+
+    From the end of the fourth job on, as nodes, agents and their imports begin before.
+    """
+    ends = sorted(service.ask("GET", f"/reconstructions/{job}")["ended_at"] for job in jobs)
+    logs = [service.http.get(f"/reconstructions/{job}/log").text for job in jobs]
+    worked_s = [float(found) for log in logs for found in re.findall(r"worked for ([\d.]+) s", log)]
+    if len(worked_s) < len(jobs) or len(jobs) < 5:
+        return {}  # jobs of this machine, or attempts that did not come to an end
+    node_s = 2 * (datetime.fromisoformat(ends[-1]) - datetime.fromisoformat(ends[3])).total_seconds()
+    mean_s = sum(worked_s) / len(worked_s)
+    return {"worker_s": round(mean_s, 3), "use": round(mean_s * (len(jobs) - 4) / node_s, 3)}
+
+
 def left_in(folder: Path) -> dict[str, int | None]:
     """What is there of a folder that is the store."""
     return {"left_in_store": sum(one.is_file() for one in folder.rglob("*"))}
@@ -341,6 +358,7 @@ def main() -> None:
             "store": asked.store or "folder",
             "jobs": asked.jobs,
             **outcome(service, jobs, scratch, store),
+            **(use(service, jobs) if nodes and not killed else {}),
             "faults": dict(store.proxy.happened) if store else {},
             "requests": store.proxy.requests if store else 0,
             "kills": dict(killed),

@@ -42,7 +42,7 @@ def test_a_copied_link_shows_the_same_view_later(
         for one in (link, bar):
             other = visit(one, viewport=viewport, touch=touch)
             until(lambda: shown_version(other) > 0, "the scene of the link")  # noqa: B023
-            until(lambda: psnr_db(picture(other), seen) > 30, "the same view", 20)  # noqa: B023
+            until(lambda: psnr_db(picture(other), seen) > 30, "the same view")  # noqa: B023
             assert not other.get_by_role("checkbox", name="Grid").is_checked()
             assert other.get_by_role("radio", name="Speed").is_checked()
         page.get_by_text("This capture has no reconstruction").wait_for()  # the page that follows shows the newest

@@ -211,7 +211,7 @@ def copy_newest(path: Path, to: Path) -> bool:
         except FileNotFoundError:
             return False
         try:
-            arrays = _header(state, path)["arrays"]
+            arrays = _header(state, path)[0]["arrays"]
             name, left = f"{_ARRAYS}{arrays['number']}", arrays["bytes"]
             with (path / name).open("rb") as source, (to / name).open("wb") as target:
                 while left and (piece := source.read(min(left, _PIECE_BYTES))):
@@ -224,8 +224,8 @@ def copy_newest(path: Path, to: Path) -> bool:
         return True
 
 
-def _header(content: bytes, path: Path) -> dict[str, Any]:
-    """The header of a state of this format. Raises CheckpointError."""
+def _header(content: bytes, path: Path) -> tuple[dict[str, Any], int]:
+    """The header of a state of this format, and where its payload begins. Raises CheckpointError."""
     begin = len(_MAGIC) + _LENGTH_BYTES
     end = begin + int.from_bytes(content[len(_MAGIC) : begin], "little")
     try:
@@ -235,7 +235,7 @@ def _header(content: bytes, path: Path) -> dict[str, Any]:
         raise CheckpointError(f"{path}: its checkpoint is damaged: its header cannot be read") from error
     if layout != FORMAT:
         raise CheckpointError(f"{path}: its checkpoint has format {layout}, and this program reads {FORMAT}")
-    return header
+    return header, end
 
 
 def read(path: Path) -> State:
@@ -251,8 +251,7 @@ def read(path: Path) -> State:
         raise CheckpointError(f"{path}: its checkpoint is damaged: it does not begin as one")
     if _blake(content[:-_DIGEST_BYTES]).digest() != content[-_DIGEST_BYTES:]:
         raise CheckpointError(f"{path}: its checkpoint is damaged: its digest does not fit its {len(content)} bytes")
-    end = begin + int.from_bytes(content[len(_MAGIC) : begin], "little")
-    header = _header(content, path)
+    header, end = _header(content, path)
     arrays = header["arrays"]
     name = path / f"{_ARRAYS}{arrays['number']}"
     try:

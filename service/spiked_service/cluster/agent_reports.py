@@ -3,12 +3,12 @@
 import threading
 import time
 from contextlib import suppress
-from types import TracebackType
 
 import httpx
 from pydantic import TypeAdapter
 
 from spiked.errors import SpikedError
+from spiked_service.cluster.background import Background
 from spiked_service.cluster.messages import (
     AttemptWork,
     Begin,
@@ -105,10 +105,11 @@ class ServiceClient:
         self._http.close()
 
 
-class AgentReports:
+class AgentReports(Background):
     """Reports events in order and renews the lease. A context manager; `add` and `order` are for any thread."""
 
     def __init__(self, service: ServiceClient, agent: str, work: AttemptWork) -> None:
+        super().__init__("reports")
         self._service = service
         self._agent = agent
         self._work = work
@@ -119,23 +120,11 @@ class AgentReports:
         self._unsent: Report | None = None
         self._sequence = 0
         self._renewed_s = time.monotonic()
-        self._over = threading.Event()
         self._refused: RefusedError | None = None
         self.kept: list[WorkerEvent] = []
         """Events that the outcome depends on."""
         self.order = Order.GO_ON
         """What the service wants."""
-        self._thread = threading.Thread(target=self._run, name="reports", daemon=True)
-
-    def __enter__(self) -> "AgentReports":
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._over.set()
-        self._thread.join()
 
     @property
     def lost(self) -> bool:

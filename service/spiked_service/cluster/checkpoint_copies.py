@@ -4,15 +4,14 @@ A copy has a folder with its number below that of the attempt; a list of its fil
 """
 
 import shutil
-import threading
 import time
 from pathlib import Path
-from types import TracebackType
 
 from pydantic import ValidationError
 
 from spiked.errors import CheckpointError, SpikedError
 from spiked.recon.checkpoint_file import CHECKPOINT, copy_newest, files_of
+from spiked_service.cluster.background import Background
 from spiked_service.cluster.messages import CheckpointCopy
 from spiked_service.cluster.object_store import ObjectStore, stored_file
 
@@ -26,27 +25,16 @@ _LIST = "checkpoint.json"
 """Says which copy is the newest."""
 
 
-class CheckpointCopies:
+class CheckpointCopies(Background):
     """Stores copies while it is entered. One that cannot be stored is left out: the worker goes on."""
 
     def __init__(self, job: Path, part: Path, store: ObjectStore) -> None:
         """`job` is the folder of the job, `part` one for the copy that is being stored, `store` that of the attempt."""
+        super().__init__("checkpoints")
         self._checkpoint = job / CHECKPOINT
         self._part = part
         self._store = store
         self._stored = CheckpointCopy(number=0, files=[])
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="checkpoints", daemon=True)
-
-    def __enter__(self) -> "CheckpointCopies":
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._over.set()
-        self._thread.join()
 
     def last(self) -> CheckpointCopy | None:
         """The checkpoint of a worker that has ended, stored; None if there is none any more, as after its last step.

@@ -157,8 +157,10 @@ def test_jobs_of_a_killed_service_go_on(tmp_path: Path, end: str) -> None:
 
 
 def test_a_job_that_ended_or_waits_has_no_time_left_of_its_run(tmp_path: Path) -> None:
-    left = ReconstructionRow(new_id(), new_id(), False, JobState.RUNNING, datetime.now(UTC), eta_s=99.0)
-    assert queued_again(left, "").eta_s is None
+    source = f"replay:{moving_recording(tmp_path / 'video.dat')}"
     with kept(tmp_path / "data") as data_store:
+        capture = over(data_store, data_store.captures.start(Plan(source, reconstruct=False)).id)
+        left = ReconstructionRow(new_id(), capture.id, False, JobState.RUNNING, datetime.now(UTC), eta_s=99.0)
+        assert queued_again(left, "").eta_s is None
         assert data_store.reconstructions.rows.save(replace(left, state=JobState.FAILED)).eta_s is None
         assert data_store.catalogue.reconstructions.get(left.id).eta_s is None

@@ -68,6 +68,7 @@ class _Server:
             _close(files)
             self._tell({"refused": error.strerror})
             return False
+        os.setpgid(pid, 0)  # by both: its group is there whoever runs first
         if pid:
             _close(files)
             descriptor = os.pidfd_open(pid)
@@ -75,7 +76,6 @@ class _Server:
             self._selector.register(descriptor, selectors.EVENT_READ)
             self._tell({"forked": pid})
             return False
-        os.setpgid(0, 0)
         end_with(server)
         self._selector.close()
         self._asking.close()

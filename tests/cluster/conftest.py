@@ -1,14 +1,19 @@
-"""An S3 server of this machine, and a recording."""
+"""An S3 server of this machine, a recording, and a service whose jobs run elsewhere."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
+import psutil
 import pytest
 
 from spiked.recording import RecordingWriter
 from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
+
+from .lab import LEASE_S, Lab
 
 
 @pytest.fixture(scope="session")
@@ -51,3 +56,25 @@ def bucket() -> Iterator[str]:
         yield "s3://spiked-test"
         s3fs.S3FileSystem.clear_instance_cache()
     server.stop()
+
+
+@pytest.fixture
+def elsewhere() -> dict[str, Any]:
+    """Further arguments of the lab: where its agents are."""
+    return {}
+
+
+@pytest.fixture
+def lab(
+    request: pytest.FixtureRequest,
+    daemon: Callable[..., Any],
+    moving: Path,
+    scratch: Path,
+    elsewhere: dict[str, Any],
+) -> Iterator[Lab]:
+    """A lab; its parameter is the lease in seconds."""
+    one = Lab(daemon, moving, scratch, getattr(request, "param", LEASE_S), **elsewhere)
+    yield one
+    for process in one.agents():
+        with suppress(psutil.Error):
+            process.kill()

@@ -2,10 +2,8 @@
 
 import json
 import os
-import shutil
-import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,8 @@ import httpx
 import psutil
 import pytest
 from faulty_proxy import FaultyProxy
+from namespace_machine import Machine
+from ports import free_port
 from spiked_service.cluster.cluster import Cluster
 from spiked_service.cluster.engine import EngineOptions
 from spiked_service.cluster.object_store import ObjectStore
@@ -21,102 +21,41 @@ from spiked_service.cluster.remote_worker import Terms
 from spiked_service.results.versions import newest, versions
 from waiting import until
 
-from .test_cluster import LOCALLY, SHORT_LEASE_S, Lab, complete, free_port
+from .lab import LOCALLY, SHORT_LEASE_S, Lab, complete
 
 pytest.importorskip("submitit")
 
 LONG_LEASE_S = 30.0
 MANY_STEPS = {"steps": 3000}
-ELSEWHERE = """
-import ctypes, os, sys
-
-if "submitit.core._submit" in sys.orig_argv:
-    with open(os.environ["TEST_NAMESPACE"]) as namespace:
-        if ctypes.CDLL(None, use_errno=True).setns(namespace.fileno(), 0x40000000):
-            raise OSError(ctypes.get_errno(), "setns")
-    os.environ["AWS_ENDPOINT_URL"] = os.environ["TEST_STORE"]
-"""
-"""Put into `sitecustomize.py`, which every Python imports first: agents, and what they start, are in the namespace."""
-
-
-def ip(*words: str) -> None:
-    subprocess.run(["ip", *words], check=True, capture_output=True)
-
-
-class Cable:
-    """Two ends: one on this machine, one in a namespace. It can be pulled out."""
-
-    def __init__(self, name: str, namespace: str, network: str) -> None:
-        self.name, self.here = name, f"{network}.1"
-        ip("link", "add", name, "type", "veth", "peer", "name", f"{name}b", "netns", namespace)
-        ip("addr", "add", f"{self.here}/24", "dev", name)
-        ip("-n", namespace, "addr", "add", f"{network}.2/24", "dev", f"{name}b")
-        ip("-n", namespace, "link", "set", f"{name}b", "up")
-        self.plug_in()
-
-    def plug_in(self) -> None:
-        ip("link", "set", self.name, "up")
-
-    def pull_out(self) -> None:
-        ip("link", "set", self.name, "down")
-
-
-class Machine:
-    """A namespace with a cable to the service and one to the store."""
-
-    def __init__(self) -> None:
-        self.name = f"spiked-{os.getpid()}"
-        ip("netns", "add", self.name)
-        ip("-n", self.name, "link", "set", "lo", "up")
-        network = f"10.{64 + os.getpid() // 128 % 64}.{os.getpid() % 128 * 2}"
-        self.to_service = Cable(f"sps{os.getpid()}", self.name, network)
-        self.to_store = Cable(
-            f"spt{os.getpid()}", self.name, f"{network[: network.rindex('.')]}.{os.getpid() % 128 * 2 + 1}"
-        )
-
-    def close(self) -> None:
-        for cable in (self.to_service, self.to_store):
-            ip("link", "del", cable.name)
-        ip("netns", "del", self.name)
 
 
 @pytest.fixture
 def machine(scratch: Path) -> Iterator[Machine]:
-    if os.geteuid() != 0 or shutil.which("ip") is None:
+    if not Machine.possible():
         pytest.skip("needs root and iproute2, to make a network namespace")
-    one = Machine()
-    yield one
-    for process in psutil.process_iter():
-        with suppress(psutil.Error):
-            if process.environ().get("SPIKED_SCRATCH") == str(scratch):
-                process.kill()
-    one.close()
+    with Machine() as one:
+        yield one
+        for process in psutil.process_iter():
+            with suppress(psutil.Error):
+                if process.environ().get("SPIKED_SCRATCH") == str(scratch):
+                    process.kill()
 
 
 @pytest.fixture
-def lab(
-    request: pytest.FixtureRequest,
-    daemon: Callable[..., Any],
-    moving: Path,
-    scratch: Path,
-    bucket: str,
-    machine: Machine,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> Iterator[Lab]:
-    """A lab whose agents are in the namespace; its parameter is the lease in seconds."""
+def elsewhere(
+    bucket: str, machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[dict[str, Any]]:
+    """The agents of the lab are in the namespace."""
     port, store_port = free_port(), int(os.environ["AWS_ENDPOINT_URL"].rpartition(":")[2])
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "elsewhere" / "sitecustomize.py").write_text(ELSEWHERE)
     with (
         FaultyProxy(port, host=machine.to_service.here) as service,
         FaultyProxy(store_port, host=machine.to_store.here) as store,
     ):
-        monkeypatch.setenv("PYTHONPATH", str(tmp_path / "elsewhere"))
-        monkeypatch.setenv("TEST_NAMESPACE", f"/run/netns/{machine.name}")
-        monkeypatch.setenv("TEST_STORE", store.url)
+        for name, value in machine.for_agents(tmp_path).items():
+            monkeypatch.setenv(name, value)
+        monkeypatch.setenv("AWS_ENDPOINT_URL", store.url)
         engine = LOCALLY | {"executor_url": service.url}
-        yield Lab(daemon, moving, scratch, request.param, f"{bucket}/{machine.name}", engine, port)
+        yield {"store": f"{bucket}/{machine.name}", "engine": engine, "port": port}
 
 
 def published(lab: Lab, job: str, after: int = 0) -> int:

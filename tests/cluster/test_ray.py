@@ -10,9 +10,10 @@ from typing import Any
 
 import psutil
 import pytest
+from ports import free_port
 from waiting import until
 
-from .test_cluster import LONG, SHORT, Lab, complete, free_port
+from .lab import LONG, SHORT, Lab, complete
 
 pytest.importorskip("ray", reason="needs Ray")
 

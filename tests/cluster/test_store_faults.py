@@ -22,7 +22,7 @@ from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.workers.messages import NotBegun, ReconstructionCommand, WorkerEvent
 from waiting import until
 
-from .test_cluster import LEASE_S, SHORT, Lab
+from .lab import LEASE_S, SHORT, Lab
 
 PART_BYTES = 5 << 20
 TRIES = 3

@@ -2,11 +2,13 @@
 
 Starts a service with an executor (and for Ray a head and two nodes on this machine), queues so many small jobs, and at
 random moments kills a worker, an agent, a node of Ray, the engine's process or the service, which are started again.
-`--store s3-moto` and `--store s3-s3rver` start a server of S3; with `--store-faults 0.05` one of twenty requests to it
-is stalled, refused or truncated. Then it looks whether every job is complete, whether the files of every version are
-there that is listed, and what is left in the store. All jobs are alike, and so are their results, which are compared by
-hash. Prints one JSON object; the exit status is 1 if a job is lost or half. With `local` and no kills it is the figure
-to compare with.
+`--store s3-moto` and `--store s3-swift` start a server of S3; with `--store-faults 0.05` one of twenty requests to it
+is stalled, refused or truncated. With `--partitions`, as root, the second node, or all agents of submitit, are in a
+network namespace, whose cables to the service and to the store are pulled out for times shorter and longer than the
+lease; these are not counted as kills. Then it looks whether every job is complete, whether the files of every version
+are there that is listed, and what is left in the store. All jobs are alike, and so are their results, which are
+compared by hash. Prints one JSON object; the exit status is 1 if a job is lost or half. With `local` and no kills it is
+the figure to compare with.
 """
 
 import argparse
@@ -15,20 +17,26 @@ import json
 import os
 import random
 import re
-import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import httpx
 import psutil
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+from cluster_nodes import Partitions, RayNodes
 from cluster_stores import SERVERS, Store, s3_store
+from faulty_proxy import FaultyProxy
+from namespace_machine import Machine
+from ports import free_port
 from spiked_service.results.versions import versions
 
 from spiked.recording import RecordingWriter
@@ -39,9 +47,6 @@ LEASE_S = 10
 START_S = 120.0
 SWEPT_S = 60.0
 """Time after the last job for what is left to be swept: what still stalls must have failed, too."""
-MARK = "SPIKED_MEASURED_NODES"
-"""Variable of the environment of the processes of Ray that this run has started: others run Ray here, too."""
-RAY = str(Path(sys.executable).with_name("ray"))
 
 
 def recording(path: Path) -> None:
@@ -52,78 +57,12 @@ def recording(path: Path) -> None:
         writer.append(camera.next_frames(400))
 
 
-def free_port() -> int:
-    """A port that nobody listens on."""
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
-
-
-class RayNodes:
-    """A head without cores, and two nodes with one core each, all on this machine."""
-
-    def __init__(self) -> None:
-        self.port = free_port()
-        self._run("--head", f"--port={self.port}", "--num-cpus=0", "--include-dashboard=false")
-        self._nodes = [self._node(), self._node()]
-
-    @property
-    def address(self) -> str:
-        """Of the head."""
-        return f"127.0.0.1:{self.port}"
-
-    def kill(self, random_: random.Random) -> None:
-        """Kill a node with all that runs on it, and start another."""
-        number = random_.randrange(2)
-        for node in self._nodes[number]:
-            with suppress(psutil.Error):
-                for process in [*node.children(recursive=True), node]:
-                    with suppress(psutil.Error):
-                        process.kill()
-        self._nodes[number] = self._node()
-
-    def close(self) -> None:
-        """End all nodes of this run, with what runs on them."""
-        while found := self._processes():
-            for process in found:
-                with suppress(psutil.Error):
-                    process.kill()
-            psutil.wait_procs(found, timeout=10)
-
-    def _node(self) -> list[psutil.Process]:
-        """Start a node. Return its raylet, and its log monitor, which would outlive it and slow down the others."""
-        before = {one.pid for one in self._processes()}
-        self._run(f"--address={self.address}", "--num-cpus=1")
-        return [one for one in self._processes() if one.pid not in before and _is_of_a_node(one)]
-
-    def _processes(self) -> list[psutil.Process]:
-        """All that this run has started of Ray, and what that has started: some overwrite their environment."""
-        found: dict[int, psutil.Process] = {}
-        for process in psutil.process_iter():
-            with suppress(psutil.Error):
-                if process.environ().get(MARK) == self.address and process.status() != psutil.STATUS_ZOMBIE:
-                    found |= {one.pid: one for one in [process, *process.children(recursive=True)]}
-        return list(found.values())
-
-    def _run(self, *words: str) -> None:
-        environment = os.environ | {MARK: self.address}
-        command = [RAY, "start", "--disable-usage-stats", *words]
-        subprocess.run(command, check=True, capture_output=True, env=environment)
-
-
-def _is_of_a_node(process: psutil.Process) -> bool:
-    with suppress(psutil.Error):
-        return process.name() == "raylet" or any(part.endswith("log_monitor.py") for part in process.cmdline())
-    return False
-
-
 class Service:
     """`spiked serve`, which is started again where it was."""
 
-    def __init__(self, folder: Path, settings: dict[str, str]) -> None:
+    def __init__(self, folder: Path, port: int, settings: dict[str, str]) -> None:
         self.data = folder / "data"
         self._folder = folder
-        self._port = free_port()
         flags = [part for name, value in settings.items() for part in ("--set", f"{name}={value}")]
         source = f"replay:{folder / 'small.dat'}?pace=0"
         self._command = [
@@ -134,11 +73,11 @@ class Service:
             "--no-capture",
             "--no-zmq",
             "--port",
-            str(self._port),
+            str(port),
         ]
         self._command += ["--device", source, "--data", str(self.data), "--runtime", str(folder / "runtime")]
         self._command += [*flags, "--set", f"source_folders={folder}", "--set", "log_level=warning"]
-        self.http = httpx.Client(base_url=f"http://127.0.0.1:{self._port}/api/v1", timeout=60)
+        self.http = httpx.Client(base_url=f"http://127.0.0.1:{port}/api/v1", timeout=60)
         self.source = source
         self.start()
 
@@ -178,6 +117,17 @@ class Service:
         self.process.wait(30)
 
 
+@dataclass(frozen=True)
+class Lab:
+    """What runs."""
+
+    service: Service
+    scratch: Path
+    store: Store | None
+    nodes: RayNodes | None
+    partitions: Partitions | None
+
+
 def processes(scratch: Path, *words: str) -> list[psutil.Process]:
     """Processes of attempts whose command has one of these words."""
     found = []
@@ -189,23 +139,27 @@ def processes(scratch: Path, *words: str) -> list[psutil.Process]:
     return found
 
 
-def kill(kind: str, service: Service, nodes: RayNodes | None, scratch: Path, random_: random.Random) -> bool:
-    """Kill something of a kind. Return whether there was one."""
+def kill(kind: str, lab: Lab, random_: random.Random) -> bool:
+    """Kill something of a kind, or cut it off. Return whether there was one."""
+    if kind == "partition":
+        assert lab.partitions is not None
+        return lab.partitions.cut(random_)
     if kind == "service":
+        service = lab.service
         service.process.kill()
         service.process.wait()
         service.start()
         return True
     if kind == "node":
-        assert nodes is not None
-        nodes.kill(random_)
+        assert lab.nodes is not None
+        lab.nodes.kill(random_)
         return True
     words = {
         "worker": ("spiked_service.workers reconstruction",),
         "agent": ("submitit.core._submit", "ray::_Agent"),
         "engine": ("spiked_service.cluster.engines",),
     }[kind]
-    found = processes(scratch, *words)
+    found = processes(lab.scratch, *words)
     if not found:
         return False
     with suppress(psutil.Error):
@@ -244,8 +198,9 @@ def contents(service: Service, jobs: list[str]) -> list[int]:
     return sorted(found.values(), reverse=True)
 
 
-def outcome(service: Service, jobs: list[str], scratch: Path, store: Store | None) -> dict[str, Any]:
+def outcome(lab: Lab, jobs: list[str]) -> dict[str, Any]:
     """What has become of the jobs, and what is left of their attempts."""
+    service, scratch, store = lab.service, lab.scratch, lab.store
     rows = [service.ask("GET", f"/reconstructions/{job}") for job in jobs]
     complete = [row for row in rows if row["state"] == "complete"]
     newest = {row["id"]: versions(service.data / "reconstructions" / row["id"])[-1:] for row in complete}
@@ -293,75 +248,103 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--at-once", type=int, default=4, help="jobs that are handed to the engine at a time")
     parser.add_argument("--store", choices=list(SERVERS), help="a server of S3 to start; a folder if not given")
     parser.add_argument("--store-faults", type=float, default=0.0, help="share of requests to S3 that fail")
+    parser.add_argument("--partitions", action="store_true", help="cut a machine off, too")
     parser.add_argument("--seed", type=int, default=0)
     return parser.parse_args()
 
 
-def storm(
-    asked: argparse.Namespace, service: Service, nodes: RayNodes | None, scratch: Path, random_: random.Random
-) -> Counter[str]:
+def storm(asked: argparse.Namespace, lab: Lab, random_: random.Random) -> Counter[str]:
     """Kill until all jobs are over. Return how often what was killed."""
-    kinds = ["worker", "worker", "agent", "agent", "engine", "service"] + (["node"] if nodes else [])
+    kinds = ["worker", "worker", "agent", "agent", "engine", "service"]
+    kinds += (["node"] if lab.nodes else []) + (["partition"] if lab.partitions else [])
     killed: Counter[str] = Counter()
     while True:
-        counts = service.counts()
+        counts = lab.service.counts()
         if counts["queued"] + counts["running"] == 0:
             return killed
-        if killed.total() < asked.kills:
+        if killed.total() - killed["partition"] < asked.kills:
             time.sleep(random_.expovariate(1 / asked.every))
             kind = random_.choice(kinds)
-            if kill(kind, service, nodes, scratch, random_):
+            if kill(kind, lab, random_):
                 killed[kind] += 1
         else:
             time.sleep(2)
+        if lab.nodes:
+            lab.nodes.mend()
         print(dict(counts), dict(killed), file=sys.stderr, flush=True)
+
+
+def started(asked: argparse.Namespace, folder: Path, ends: ExitStack) -> Lab:
+    """Start the store, the nodes and the service."""
+    scratch, port = folder / "scratch", free_port()
+    scratch.mkdir()
+    os.environ["SPIKED_SCRATCH"] = str(scratch)
+    settings = {
+        "executor": asked.executor,
+        "reconstruction_workers": str(asked.at_once),
+        "executor_lease_s": str(LEASE_S),
+        "executor_address": "local",
+    }
+    machine = ends.enter_context(Machine()) if asked.partitions else None
+    store = None
+    if asked.store:
+        host = "127.0.0.1" if machine is None else machine.to_store.here
+        store = s3_store(asked.store, folder, free_port(), host, ends)
+        settings["executor_store"] = store.uri
+    nodes = None
+    if asked.executor == "ray":
+        nodes = RayNodes(machine)
+        ends.callback(nodes.close)
+        settings["executor_address"] = nodes.address
+    partitions = None
+    if machine is not None:
+        (folder / "python").mkdir()
+        os.environ |= machine.for_agents(folder / "python")
+        settings["executor_url"] = ends.enter_context(FaultyProxy(port, host=machine.to_service.here)).url
+        partitions = Partitions(machine, LEASE_S)
+        ends.callback(partitions.close)
+    service = Service(folder, port, settings)
+    ends.callback(service.close)
+    return Lab(service, scratch, store, nodes, partitions)
+
+
+def submitted(service: Service, jobs: int) -> list[str]:
+    """Record a capture and queue so many jobs of it. Return their ids."""
+    capture = service.ask("POST", "/captures", json={"device": service.source, "reconstruct": False})["id"]
+    while service.ask("GET", f"/captures/{capture}")["state"] != "complete":
+        time.sleep(0.1)
+    body = {"capture_id": capture, "options": {"steps": 0, "threads": 1}}
+    return [service.ask("POST", "/reconstructions", json=body)["id"] for _ in range(jobs)]
 
 
 def main() -> None:
     """Entry point."""
     asked = arguments()
-    random_ = random.Random(asked.seed)
     with ExitStack() as ends:
         folder = Path(ends.enter_context(tempfile.TemporaryDirectory(prefix="spiked-cluster-")))
-        scratch = folder / "scratch"
-        scratch.mkdir()
-        os.environ["SPIKED_SCRATCH"] = str(scratch)
         recording(folder / "small.dat")
-        store = s3_store(asked.store, folder, free_port(), ends) if asked.store else None
-        nodes = RayNodes() if asked.executor == "ray" else None
-        if nodes is not None:
-            ends.callback(nodes.close)
-        settings = {
-            "executor": asked.executor,
-            "reconstruction_workers": str(asked.at_once),
-            "executor_lease_s": str(LEASE_S),
-        }
-        settings |= {"executor_address": "local" if nodes is None else nodes.address}
-        settings |= {"executor_store": store.uri} if store else {}
-        service = Service(folder, settings)
-        ends.callback(service.close)
-        capture = service.ask("POST", "/captures", json={"device": service.source, "reconstruct": False})["id"]
-        while service.ask("GET", f"/captures/{capture}")["state"] != "complete":
-            time.sleep(0.1)
-        body = {"capture_id": capture, "options": {"steps": 0, "threads": 1}}
-        jobs = [service.ask("POST", "/reconstructions", json=body)["id"] for _ in range(asked.jobs)]
-        if store is not None:
-            store.proxy.share = asked.store_faults
+        lab = started(asked, folder, ends)
+        jobs = submitted(lab.service, asked.jobs)
+        if lab.store is not None:
+            lab.store.proxy.share = asked.store_faults
         begun_s = time.monotonic()
-        killed = storm(asked, service, nodes, scratch, random_)
+        killed = storm(asked, lab, random.Random(asked.seed))
         wall_s = time.monotonic() - begun_s
-        if store is not None:
-            store.proxy.share = 0.0
+        if lab.partitions is not None:
+            lab.partitions.close()
+        if lab.store is not None:
+            lab.store.proxy.share = 0.0
         time.sleep(SWEPT_S if asked.executor != "local" else 0)
         report = {
             "executor": asked.executor,
             "store": asked.store or "folder",
             "jobs": asked.jobs,
-            **outcome(service, jobs, scratch, store),
-            **(use(service, jobs) if nodes and not killed else {}),
-            "faults": dict(store.proxy.happened) if store else {},
-            "requests": store.proxy.requests if store else 0,
+            **outcome(lab, jobs),
+            **(use(lab.service, jobs) if lab.nodes and not killed else {}),
+            "faults": dict(lab.store.proxy.happened) if lab.store else {},
+            "requests": lab.store.proxy.requests if lab.store else 0,
             "kills": dict(killed),
+            "partitions": dict(lab.partitions.happened) if lab.partitions else {},
             "wall_s": round(wall_s, 1),
             "s_a_job": round(wall_s / asked.jobs, 3),
         }

@@ -10,7 +10,7 @@ from spiked.pose import Array
 from spiked.recon.mapping.trainer import MapTrainer
 from spiked.recon.merging.joining import Joint, join
 from spiked.recon.merging.known_map import KnownMap, brightened
-from spiked.recon.merging.merger import FIRST_RATE, HEADROOM, Merged, merged
+from spiked.recon.merging.merger import FIRST_RATE, HEADROOM, Merged, merge, merged
 from spiked.recon.merging.path_warp import PathWarp
 from spiked.recon.reconstructor import Reconstructor
 from spiked.spline import Path
@@ -53,14 +53,17 @@ def extend(
 ) -> Merged:
     """One map of a known one and of a finished reconstruction, in the known map's frame of reference and radiance.
 
-    The splats are trained on the recording's views, and on renders of the known map, which keep what it shows. The
-    recording that it was made from is not needed. `reconstructor` is not changed. `progress` gets the share of the
-    training that is done; when `cancelled` returns true, the training ends early.
+    The splats are trained on the recording's views, or on renders of them where the recording is grey and the map is
+    in colour, and on renders of the known map, which keep what it shows. The recording that it was made from is not
+    needed. `reconstructor` is not changed. `progress` gets the share of the training that is done; when `cancelled`
+    returns true, the training ends early.
     Raises NotOnePlaceError, and SceneError for a map that is empty or has no texture.
     """
     options = reconstructor.options
     alone = replace(reconstructor.scene(), white=reconstructor.white)
     second = KnownMap(alone, reconstructor.trajectory(), reconstructor.camera)
+    if known.scene.colours.shape[1] > alone.colours.shape[1]:
+        return merge(known, second, seed=options.seed, threads=options.threads, progress=progress, cancelled=cancelled)
     joint = join(known, second, options.threads)
     kept = joint.kept()
     trainer, path = _trainer(joint, reconstructor)

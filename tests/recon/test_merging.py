@@ -11,7 +11,7 @@ from spiked.pose import exp_so3, log_so3, rotation_of
 from spiked.recon import KnownMap, NotOnePlaceError, merge
 from spiked.recon.mapping.replay import Replay
 from spiked.recon.merging.joining import Joint, join
-from spiked.recon.merging.known_map import inverse, moved_scene
+from spiked.recon.merging.known_map import coloured, inverse, moved_scene
 from spiked.recon.merging.path_warp import PathWarp
 from spiked.render import Camera, rasteriser_for
 from spiked.scene import Scene
@@ -25,6 +25,8 @@ LEFT, RIGHT = (0.0, 0.5), (0.45, 0.95)
 ELSEWHERE = Similarity(0.7, exp_so3(np.array([0.3, -0.8, 1.9])), np.array([4.0, -1.0, 2.5]))
 """From the first map's frame of reference to the second's."""
 DIMMER = 0.8
+TINT = 1.4, 1.0, 0.6
+"""Factors of red, green and blue with a mean of 1 over the sites of a mosaic."""
 NEAR_M = 0.02
 """The splats are as large as the pixels, 8 mm at the depth of the table."""
 
@@ -108,17 +110,35 @@ def test_two_places_that_look_alike_are_not_told_apart(right: KnownMap) -> None:
         join(right, both)
 
 
-def test_a_grey_map_can_be_joined_with_a_coloured_one(left: KnownMap) -> None:
-    coloured = left.coloured().scene
-    assert coloured.colours.shape == (len(left.scene), 3)
-    assert (coloured.colours == left.scene.colours).all() and coloured.white == left.scene.white
+def tinted(made: KnownMap) -> KnownMap:
+    """The map in colours that a grey camera does not tell from those of the map."""
+    scene = coloured(made.scene)
+    return replace(made, scene=replace(scene, colours=scene.colours * np.array(TINT, np.float32)))
+
+
+def test_a_grey_map_says_nothing_of_colours(left: KnownMap) -> None:
+    assert coloured(left.scene).colours.shape == (len(left.scene), 3)
+    path, rasteriser = left.trajectory, rasteriser_for(CAMERA)
+    seen = Replay.of(rasteriser, left.scene, path.rotations[9], path.centres[9])
+    assert seen.error(tinted(left).scene, 0.35) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("grey_first", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_map_in_colour_keeps_its_colours_beside_a_grey_one(left: KnownMap, grey_first: bool) -> None:
+    maps = (left, tinted(left)) if grey_first else (tinted(left), left)
+    made = merge(*maps)
+    assert min(made.psnr_db) > 32
+    path = left.trajectory
+    image = Replay.of(rasteriser_for(CAMERA), made.scene, path.rotations[20], path.centres[20]).values
+    red, green, blue = np.median(image, (0, 1))
+    assert (red / green, blue / green) == pytest.approx((TINT[0] / TINT[1], TINT[2] / TINT[1]), rel=0.05)
 
 
 def test_colours_by_direction_stay_with_a_map_that_is_joined(left: KnownMap) -> None:
     harmonics = np.zeros((len(left.scene), 3, 1), np.float32)
     harmonics[:, 2] = 0.1
     seen = replace(left, scene=replace(left.scene, harmonics=harmonics))
-    assert (seen.coloured().scene.seen_from(np.zeros(3)).colours == seen.scene.seen_from(np.zeros(3)).colours).all()
+    assert (coloured(seen.scene).seen_from(np.zeros(3)).colours == seen.scene.seen_from(np.zeros(3)).colours).all()
 
     turn = Similarity(1.0, exp_so3(np.array([0.3, 0.2, 0.1])), np.zeros(3))
     warp = PathWarp(np.array([1.0, 3.0]), [Similarity(1.0, np.eye(3), np.zeros(3)), turn])

@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from typer.testing import CliRunner
 
 from spiked.errors import SceneError, SpikedError
 from spiked.recording import RecordingWriter
+from spiked.scene import Scene
 
 from ..room_map import SENSOR, room_map, visitor
 
@@ -57,6 +59,19 @@ def test_a_map_is_extended_by_another_recording(place: Path, tmp_path: Path) -> 
     assert np.linalg.norm(made.trajectory.centres - centres, axis=1).max() < 0.03, "in the map's frame and unit"
     report = json.loads((tmp_path / "both" / "report.json").read_text())["extended"]
     assert report["joined"] and min(report["psnr_db"]) > 27
+
+
+@pytest.mark.slow
+def test_a_map_in_colour_is_extended_by_a_grey_recording(place: Path, tmp_path: Path) -> None:
+    shutil.copytree(place / "map", tmp_path / "map")
+    scene = Scene.read_ply(place / "map" / "scene.ply")
+    tint = np.array([1.4, 1.0, 0.6], np.float32)
+    replace(scene, colours=scene.colours * tint).write_ply(tmp_path / "map" / "scene.ply", 0.35)
+    done = run(place / "again.dat", "--map", tmp_path / "map", "-o", tmp_path / "both", "--steps", "100")
+    assert done.exit_code == 0, done.output
+    colours = Scene.read_ply(tmp_path / "both" / "scene.ply").colours
+    red, green, blue = np.median(colours, 0)
+    assert (red / green, blue / green) == pytest.approx((1.4, 0.6), rel=0.05)
 
 
 KILLED = """

@@ -171,8 +171,9 @@ class Mapper:
         """One gradient step towards what another map shows."""
         background = float(self._rng.uniform(0, self.options.background)) * self.white
         image = replay.render(self.descent.model, background)
-        slope = self.rate_loss(image.values, replay.target(image.values), self.white)[1]
-        self._descend(replay.rasteriser, slope, decay, replay.centre)
+        shown = replay.comparable(image.values)
+        slope = self.rate_loss(shown, replay.target(shown), self.white)[1]
+        self._descend(replay.rasteriser, replay.slope(slope, image.values), decay, replay.centre)
 
     def _descend(self, rasteriser: AnyRasteriser, slope: Image, decay: float, centre: Array) -> None:
         """A step along the gradient of an image that was seen from `centre`."""
@@ -260,9 +261,12 @@ class Mapper:
 
     def densify_replay(self, replay: Replay) -> None:
         """Add splats where the map differs most from what another map shows."""
-        shown = replay.render(self.scene).values
+        image = replay.render(self.scene).values
+        shown = replay.comparable(image)
         error = replay.target(shown).values - shown
-        self._replace(error, replay.values, replay.depth, replay.rotation, replay.centre)
+        # What a grey map lacks of the brightness is added to each colour.
+        seen = replay.values if shown.ndim == image.ndim else np.maximum(image + error[..., None], 0)
+        self._replace(error, seen, replay.depth, replay.rotation, replay.centre)
 
     def _replace(self, error: Image, seen: Image, depth: Image, rotation: Array, centre: Array) -> None:
         """Remove dead splats and add others where `error` is large, of the colours and depths of images [H, W]."""

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.pose import Array
+from spiked.recon.frontend.windowing import SITE_SHARES, grey
 from spiked.recon.mapping.pyramid import Target
 from spiked.render import AnyRasteriser, RenderedImage
 from spiked.render.splats import AnySplats
@@ -26,7 +27,7 @@ class Replay:
     rotation: Array
     centre: Array
     values: Image
-    """[H, W] or [H, W, 3], radiance."""
+    """[H, W] of a grey map or [H, W, 3], radiance."""
     depth: Image
     opacity: Image
     """[H, W]"""
@@ -54,14 +55,22 @@ class Replay:
         """Another scene from the same pose."""
         return self.rasteriser.forward(scene, self.rotation[None], self.centre[None], background=background)
 
+    def comparable(self, image: Image) -> Image:
+        """An image [H, W] or [H, W, 3] without the colours that this map does not know."""
+        return grey(image) if self.values.ndim == 2 else image
+
+    def slope(self, slope: Image, image: Image) -> Image:
+        """The gradient by an image, from that by what is `comparable` of it."""
+        return slope if slope.ndim == image.ndim else np.ascontiguousarray(slope[..., None] * SITE_SHARES)
+
     def target(self, shown: Image) -> Target:
-        """The target for `shown`, which counts as right where this map has no surface."""
+        """The target for what is comparable of an image, which is right where this map has no surface."""
         known = self.known if shown.ndim == 2 else self.known[..., None]
         values = np.where(known > 0, self.values, shown)
         return Target(values, np.zeros_like(values), None)
 
     def error(self, scene: Scene, white: float) -> float:
         """Mean squared error of another scene where this map has surfaces, in units of white squared."""
-        apart = (self.render(scene).values - self.values) / white
+        apart = (self.comparable(self.render(scene).values) - self.values) / white
         known = self.known > 0
         return float(np.mean(apart[known] ** 2)) if known.any() else 0.0

@@ -13,7 +13,7 @@ from spiked.recon.localisation.map_index import NOMINAL_WIDTH_PX, MapIndex, trav
 from spiked.recon.localisation.map_views import MapRenderer
 from spiked.recon.mapping.replay import Replay
 from spiked.recon.merging.coverage import Agreement, Shown, compare, fineness
-from spiked.recon.merging.known_map import KnownMap
+from spiked.recon.merging.known_map import KnownMap, coloured
 from spiked.recon.merging.registration import MapPlace, NotOnePlaceError, Registration, register
 from spiked.recon.odometry.sparse_map import Pose
 from spiked.recon.statistics import evenly, median
@@ -29,7 +29,8 @@ PLACES, PLACES_PIXELS = (12, 160), 2e7
 FINENESS_VIEWS = 50
 """Views, at most, by which it is known which surfaces a map shows."""
 FINER = 1.25
-"""The second map's splats replace the first map's where it shows the surface at so many times as many pixels."""
+"""The second map's splats replace the first map's where it shows the surface at so many times as many pixels; at the
+inverse of it if it has colours, and the first is grey."""
 ALIKE, DIFFERENT = 0.5, 0.25
 """Correlation of details of both maps in a view above which they agree there, and below which they differ."""
 EXACT = 0.9
@@ -75,13 +76,17 @@ class Joint:
         return ~self._finer_in_second(first), self._finer_in_second(second)
 
     def splats(self, kept: tuple[NDArray[np.bool_], NDArray[np.bool_]]) -> Scene:
-        """One scene of the splats that are kept of each map."""
-        return self.first.scene.select(kept[0]).join(self.second.scene.select(kept[1]))
+        """One scene of the splats that are kept of each map, in colour if one of them is."""
+        first, second = self.first.scene.select(kept[0]), self.second.scene.select(kept[1])
+        if first.colours.shape[1] != second.colours.shape[1]:
+            first, second = coloured(first), coloured(second)
+        return first.join(second)
 
     def _finer_in_second(self, points: Array) -> NDArray[np.bool_]:
         """Which points [n, 3] are to be shown by the second map."""
         first, second = (fineness(some(views), points).max(1) for views in (self.first_views, self.second_views))
-        return np.asarray(second > FINER * first)
+        only_second_has_colours = self.first.scene.colours.shape[1] < self.second.scene.colours.shape[1]
+        return np.asarray(second > (1 / FINER if only_second_has_colours else FINER) * first)
 
     def replays(self, kept: tuple[NDArray[np.bool_], NDArray[np.bool_]]) -> list[Replay]:
         """What both maps show along their ways; the second where the first does not show it otherwise."""
@@ -113,8 +118,6 @@ def join(first: KnownMap, second: KnownMap, threads: int | None = None) -> Joint
     """
     if len(second.scene) == 0 or len(second.trajectory) == 0:
         raise SceneError("the second map is empty: reconstruct a recording first")
-    if first.scene.colours.shape[1] != second.scene.colours.shape[1]:
-        first, second = first.coloured(), second.coloured()
     seen_by = replace(second, camera=common_camera(first.camera, second.camera))
     index = MapIndex(first.scene, first.trajectory, seen_by.camera, threads)
     own = places(seen_by, threads)

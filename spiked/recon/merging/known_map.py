@@ -42,14 +42,14 @@ class KnownMap:
         scene = moved_scene(self.scene, similarity, brightness)
         return replace(self, scene=scene, trajectory=moved_path(self.trajectory, similarity))
 
-    def coloured(self) -> "KnownMap":
-        """The map with three colours: grey surfaces have them alike."""
-        scene = self.scene
-        colours = np.ascontiguousarray(np.broadcast_to(scene.colours, (len(scene), 3)))
-        harmonics = scene.harmonics
-        if harmonics is not None:
-            harmonics = np.ascontiguousarray(np.broadcast_to(harmonics, (*harmonics.shape[:2], 3)))
-        return replace(self, scene=replace(scene, colours=colours, harmonics=harmonics))
+
+def coloured(scene: Scene) -> Scene:
+    """A scene with three colours: grey surfaces have them alike."""
+    colours = np.ascontiguousarray(np.broadcast_to(scene.colours, (len(scene), 3)))
+    harmonics = scene.harmonics
+    if harmonics is not None:
+        harmonics = np.ascontiguousarray(np.broadcast_to(harmonics, (*harmonics.shape[:2], 3)))
+    return replace(scene, colours=colours, harmonics=harmonics)
 
 
 def brightened(scene: Scene, brightness: float) -> Scene:

@@ -156,6 +156,17 @@ def test_jobs_of_a_killed_service_go_on(tmp_path: Path, end: str) -> None:
         assert not data_store.folder.checkpoint(job.id).exists()
 
 
+def test_restarts_of_the_service_are_no_attempts(tmp_path: Path) -> None:
+    data, source = tmp_path / "data", f"replay:{moving_recording(tmp_path / 'moving.dat')}?pace=0"
+    with kept(data) as data_store:
+        capture = over(data_store, data_store.captures.start(Plan(source, reconstruct=False)).id)
+        job = data_store.reconstructions.submit(capture.id, LONG)
+    for _ in range(2):
+        with kept(data) as data_store:
+            until(lambda: data_store.reconstructions.rows.get(job.id).state is JobState.RUNNING, "it runs")
+            assert data_store.reconstructions.rows.get(job.id).attempts == 1
+
+
 def test_a_job_that_ended_or_waits_has_no_time_left_of_its_run(tmp_path: Path) -> None:
     source = f"replay:{moving_recording(tmp_path / 'video.dat')}"
     with kept(tmp_path / "data") as data_store:

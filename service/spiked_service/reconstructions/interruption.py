@@ -20,7 +20,7 @@ def requeue_interrupted(rows: ReconstructionRepository, adopted: bool) -> None:
             continue
         if row.attempts >= QueuePolicy.MOST_ATTEMPTS:
             reason = (
-                f"failed after {row.attempts} attempts, the last of which was interrupted by the end of the service"
+                f"failed after {row.attempts} attempts, the last of which was interrupted by the death of the service"
             )
             rows.drop_checkpoint(row.id)
             rows.save(failed(row, reason))

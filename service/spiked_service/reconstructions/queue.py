@@ -166,8 +166,7 @@ class Reconstructions:
     def cancel(self, reconstruction_id: str) -> ReconstructionRow:
         """End a queued or running reconstruction; published versions are kept. Does nothing to one that has ended."""
         with self._lock:
-            job = self._jobs.get(reconstruction_id)
-            if job is not None:
+            if (job := self._jobs.get(reconstruction_id)) is not None:
                 job.cancel()
                 return job.row
             row = self.rows.get(reconstruction_id)
@@ -188,8 +187,7 @@ class Reconstructions:
     def finish_early(self, reconstruction_id: str) -> None:
         """End the refinement of a running reconstruction; it counts as complete."""
         with self._lock:
-            job = self._jobs.get(reconstruction_id)
-            if job is not None:
+            if (job := self._jobs.get(reconstruction_id)) is not None:
                 job.finish_early()
 
     def restart(self, reconstruction_id: str, options: ReconstructionOptions | None = None) -> ReconstructionRow:
@@ -329,6 +327,8 @@ class Reconstructions:
             # A job that is interrupted by the end of the service stays "running": the next start queues it again.
             if not self._closing or (trouble is None and row.stage is Stage.DONE):
                 row = self.rows.save(self._outcome(job, trouble))
+            elif not row.live and not row.attempt:
+                row = self.rows.save(replace(row, attempts=row.attempts - 1))  # it has nothing to do with this end
             self._wake.notify_all()
         if on_end is not None:
             on_end(row)

@@ -27,7 +27,7 @@ class QueuePolicy:
     """
 
     MOST_ATTEMPTS = 6
-    """Attempts after which a reconstruction that was interrupted by the end of the service has failed."""
+    """Attempts after which a reconstruction that was interrupted by the death of the service has failed."""
 
     def __init__(self, limit: int = 1, delays_s: tuple[float, ...] = _DELAYS_S) -> None:
         self.limit = limit

@@ -1,9 +1,11 @@
 """A catalogue that was lost, damaged or replaced by an older one: the data folder keeps its captures."""
 
 import shutil
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -347,8 +349,12 @@ def test_only_a_whole_catalogue_is_restored(data: Path, tmp_path: Path) -> None:
     before = catalogue.read_bytes()
     (tmp_path / "half.sqlite").write_bytes(before[: len(before) // 2])
     (tmp_path / "garbage.sqlite").write_bytes(b"garbage" * 1000)
+    (tmp_path / "empty.sqlite").touch()
+    (tmp_path / "folder.sqlite").mkdir()
+    with closing(sqlite3.connect(tmp_path / "foreign.sqlite")) as other:
+        other.execute("CREATE TABLE pages (address)")
     folder = DataFolder(data)
-    for file in ("half.sqlite", "garbage.sqlite", "missing.sqlite"):
+    for file in ("half.sqlite", "garbage.sqlite", "missing.sqlite", "empty.sqlite", "folder.sqlite", "foreign.sqlite"):
         with pytest.raises(StoreError, match=file):
             restore(folder, tmp_path / file)
     with pytest.raises(StoreError, match="there is no backup"):

@@ -2,12 +2,14 @@
 
 import os
 import sqlite3
+from contextlib import closing, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import quote
 
 from spiked_service.store.catalogue import Catalogue, DamagedError, StoreError
 from spiked_service.store.folder import DataFolder
+from spiked_service.store.migrations import schema_of
 
 
 def back_up(catalogue: Path, target: Path | None = None) -> Path:
@@ -37,7 +39,7 @@ def back_up(catalogue: Path, target: Path | None = None) -> Path:
         part.replace(target)
     except (OSError, sqlite3.Error) as error:
         part.unlink(missing_ok=True)
-        raise StoreError(f"{catalogue} cannot be copied to {target}: {error}") from error
+        raise StoreError(f"{catalogue} cannot be copied to {target}: {_why(error)}") from error
     return target
 
 
@@ -54,15 +56,27 @@ def restore(folder: DataFolder, backup: Path | None = None) -> tuple[Path, Path 
     part = folder.catalogue.with_name(folder.catalogue.name + ".part")
     try:
         part.write_bytes(backup.read_bytes())
+        _check_origin(part, backup)
         _check(part, backup)
         _sync(part)
         before = folder.set_catalogue_aside("before-restore") if folder.catalogue.exists() else None
         part.replace(folder.catalogue)
     except (OSError, sqlite3.Error) as error:
-        raise StoreError(f"{backup} cannot be restored: {error}") from error
+        raise StoreError(f"{backup} cannot be restored: {_why(error)}") from error
     finally:
         part.unlink(missing_ok=True)
     return backup, before
+
+
+def _check_origin(path: Path, shown: Path) -> None:
+    """Raises StoreError for an empty file and the database of another program, of which a catalogue could be made."""
+    with suppress(sqlite3.DatabaseError), closing(sqlite3.connect(path)) as connection:  # damage is for `_check`
+        if schema_of(connection) == 0:
+            raise StoreError(f"{shown} is no catalogue of spiked: name a file that `spiked backup` has written")
+
+
+def _why(error: OSError | sqlite3.Error) -> str:
+    return error.strerror or str(error) if isinstance(error, OSError) else str(error)
 
 
 def _check(path: Path, shown: Path) -> None:

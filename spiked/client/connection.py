@@ -83,7 +83,7 @@ class Connection:
             except httpx.TransportError as error:
                 if last or isinstance(error, httpx.ConnectError | httpx.ReadTimeout):
                     raise ServiceUnreachableError(
-                        f"no answer from {self._http.base_url}: {error}; look whether `spiked serve` runs there"
+                        f"no answer from {self._http.base_url}: {error}; {_what_to_do(error)}"
                     ) from error
             else:
                 if answer.status_code not in _AGAIN or last:
@@ -102,6 +102,12 @@ class Connection:
                 yield _checked(answer)
         except httpx.TransportError as error:
             raise ServiceUnreachableError(f"the stream {path} broke off: {error}; ask again") from error
+
+
+def _what_to_do(error: httpx.TransportError) -> str:
+    if "CERTIFICATE_VERIFY_FAILED" in str(error):
+        return "set SSL_CERT_FILE to the file of its certificate, and use a name that this holds"
+    return "look whether `spiked serve` runs there"
 
 
 def _checked(answer: httpx.Response) -> httpx.Response:

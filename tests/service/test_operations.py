@@ -21,6 +21,7 @@ from spiked_service.operations.systemd import SystemdNotifier
 from spiked_service.settings.reload import ReloadableSettings
 from waiting import until
 
+from spiked.client import ServiceUnreachableError, Spiked
 from spiked.errors import ConfigurationError
 
 DEADLINE_S = 20.0
@@ -216,8 +217,8 @@ def test_tls_with_a_certificate_that_is_changed_while_serving(daemon: Callable[.
     assert one.address.startswith("https://")
     answer = httpx.get(f"{one.address}healthz", verify=ssl.create_default_context(cafile=str(first)))
     assert answer.status_code == 200
-    with pytest.raises(httpx.ConnectError, match="certificate"):
-        httpx.get(f"{one.address}healthz")
+    with Spiked(one.address) as client, pytest.raises(ServiceUnreachableError, match="set SSL_CERT_FILE"):
+        client.system()
 
     file.write_text(f"tls_certificate = '{second}'\ntls_key = '{key1}'")  # do not belong together
     trusts_first = httpx.Client(verify=ssl.create_default_context(cafile=str(first)))

@@ -22,7 +22,7 @@ SITE = PREFIX / "lib/python3.11/site-packages"
 ARCHITECTURES = {"x86_64": "amd64", "aarch64": "arm64"}
 DEPENDS = "python3.11, libusb-1.0-0, adduser"
 _LAUNCHER = """#!/opt/spiked/bin/python3.11 -P
-from spiked_service.cli.main import main
+from spiked_service.cli.program import main
 
 main()
 """

@@ -5,6 +5,6 @@ import sys
 if not sys.flags.safe_path:
     del sys.path[0]  # the current folder, which `python -m` adds
 
-from spiked_service.cli.main import main
+from spiked_service.cli.program import main
 
 main()

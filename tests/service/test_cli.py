@@ -58,6 +58,12 @@ def test_no_module_is_imported_from_the_current_folder(tmp_path: Path) -> None:
     assert done.stdout.startswith("spiked")
 
 
+def test_a_full_disk_behind_the_output_ends_a_command_with_one_line() -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command("version"), stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (2, "error: the output cannot be written: the disk is full\n")
+
+
 def test_info_says_what_a_recording_holds(room: Path) -> None:
     done = run("info", room / "room.dat")
     assert done.returncode == 0

@@ -46,6 +46,35 @@ def test_a_command_outlives_its_terminal_with_nohup(tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".spiked-*"))
 
 
+INTERRUPTED = """
+import os, signal, sys
+from spiked_service.cli.program import main
+
+class CtrlC:
+    def find_spec(self, name, path=None, target=None):
+        if name == MODULE:
+            os.kill(os.getpid(), signal.SIGINT)
+
+MODULE = sys.argv.pop()
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.meta_path.insert(0, CtrlC())
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "code"),
+    [
+        pytest.param("typer", -signal.SIGINT, id="of the program"),
+        pytest.param("numpy.linalg", 130, id="of the command"),
+    ],
+)
+def test_ctrl_c_during_an_import_ends_a_command_without_a_traceback(module: str, code: int, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", INTERRUPTED, "verify", "recording.dat", module]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.strip()) == (code, "")
+
+
 READER = """
 import os, signal, sys, threading
 from spiked_service.base.signals import cleaning_up, read_line

@@ -13,6 +13,8 @@ from typing import Any
 import typer
 import typer.core
 
+from spiked_service.base.signals import holding
+
 PANELS = {
     "Live": ("serve", "record", "devices", "submit", "jobs", "health", "backup", "restore", "config", "token"),
     "Files": ("info", "verify", "cut", "convert", "offset", "simulate", "calibrate", "noise-report"),
@@ -49,7 +51,8 @@ def _panel(name: str) -> str:
 
 def _loaded(name: str) -> Any:
     module, attribute = _module(name)
-    found = getattr(import_module(module), attribute)
+    with holding():  # packages in compiled code make an ImportError of Ctrl-C
+        found = getattr(import_module(module), attribute)
     one = typer.Typer(rich_markup_mode="markdown", pretty_exceptions_enable=False)
     if isinstance(found, typer.Typer):
         one.add_typer(found, name=name, rich_help_panel=_panel(name))

@@ -1,5 +1,6 @@
 """The program `spiked`: runs commands, prints errors as one line and exits with code 2."""
 
+import errno
 import os
 import sys
 from typing import Annotated
@@ -46,4 +47,9 @@ def main() -> None:
             app()
     except SpikedError as error:
         report_error(error)
+        sys.exit(2)
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        report_error(SpikedError(f"{error.filename or 'the output'} cannot be written: the disk is full"))
         sys.exit(2)

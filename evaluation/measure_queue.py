@@ -122,7 +122,8 @@ def served(data: Path, figures: dict[str, float]) -> Iterator[tuple[httpx.Client
             )
             for worker in process.children(recursive=True):
                 worker.send_signal(signal.SIGSTOP)
-            time.sleep(2)  # for what the service does after its start
+            while "recovery" in http.get(str(http.base_url).replace("api/v1/", "readyz")).text:
+                time.sleep(0.5)  # the service looks at the files of all jobs after its start
             figures["memory after the start, MB"] = process.memory_info().rss / 1e6
             yield http, process
             figures["memory at the end, MB"] = process.memory_info().rss / 1e6
@@ -280,10 +281,31 @@ def run(jobs: int, captures: int, rounds: int, *, serve: bool) -> tuple[dict[str
                 ("POST captures/LARGE:purge, once", lambda: http.post(f"captures/{filled.captures[0]}:purge")),
             ):
                 found[name] = measured(process, 1, ask)
-                figures[f"after {name}: seconds until the queue is still"] = _still_s(http)
+                if "purge" not in name:
+                    figures[f"after {name}: seconds until the queue is still"] = _still_s(http)
+            found |= while_purged(http, process, filled, few, figures)
             if serve:
                 input(f"{http.base_url} until Enter ")
     return found, figures
+
+
+def while_purged(
+    http: httpx.Client, process: psutil.Process, filled: Filled, rounds: int, figures: dict[str, float]
+) -> dict[str, Measured]:
+    """Requests while a thread deletes the capture with half of the jobs, and how long that takes."""
+    begun, other = time.monotonic(), {"capture_id": filled.captures[1]}
+    asked: dict[str, Callable[[], httpx.Response]] = {
+        "GET captures?limit=100": lambda: http.get("captures?limit=100"),
+        "GET reconstructions?in_turn=true&limit=100": lambda: http.get("reconstructions?in_turn=true&limit=100"),
+        "POST reconstructions": lambda: http.post("reconstructions", json=other),
+    }
+    found = {f"{name}, during the purge": measured(process, rounds, ask) for name, ask in asked.items()}
+    figures["seconds of the purge during these requests"] = time.monotonic() - begun
+    data = Path(process.cmdline()[process.cmdline().index("--data") + 1])
+    while any((data / "captures").glob(".*.removed")):
+        time.sleep(0.1)
+    figures["seconds until all of it is deleted"] = time.monotonic() - begun
+    return found
 
 
 def _still_s(http: httpx.Client) -> float:

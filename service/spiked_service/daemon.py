@@ -34,6 +34,7 @@ from spiked_service.base.signals import handling
 from spiked_service.base.version import installed_version
 from spiked_service.captures.archive import DataStore
 from spiked_service.captures.captures import Captures
+from spiked_service.captures.purging import resume_purges
 from spiked_service.captures.reconcile import open_catalogue, reconcile
 from spiked_service.captures.recovery import Recovery
 from spiked_service.captures.uploads import Uploads
@@ -152,6 +153,7 @@ def open_data_store(data: Path | None, notifier: Notifier, executor: Executor | 
         folder.sweep()
         clean_stale()
         catalogue = open_catalogue(folder, notifier.log)
+        resume_purges(folder, catalogue)
         orphans = reconcile(folder, catalogue, notifier.log)
     except BaseException:
         folder.close()

@@ -515,6 +515,7 @@ def test_a_disk_that_is_filled_during_a_capture_accounts_for_every_frame(
         filler.unlink()
         assert data_store.check_disk()[0] is not CheckStatus.FAILED
         data_store.captures.removal.purge(row.id)
+        until(lambda: data_store.folder.purged() == set(), "its space is free")
         again = over(data_store, data_store.captures.start(recorded_only(source, frames=100)).id).row
         assert again.verdict is not None and again.state is CaptureState.COMPLETE
 

@@ -52,36 +52,18 @@ def stored(data_store: DataStore, *jobs: JobState, **more: Any) -> CaptureRow:
     return row
 
 
-def test_what_is_being_deleted_cannot_be_restored(data_store: DataStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    row = stored(data_store, deleted_at=NOW)
-    remove = data_store.folder.remove
-    refused: list[str] = []
-
-    def slow(path: Path) -> None:
-        for attempt in (data_store.captures.removal.restore, data_store.captures.removal.purge):
-            with pytest.raises(BusyError) as error:
-                attempt(row.id)
-            refused.append(str(error.value))
-        remove(path)
-
-    monkeypatch.setattr(data_store.folder, "remove", slow)
-    data_store.captures.removal.purge(row.id)
-    assert len(refused) == 2 and all("is being deleted for good" in reason for reason in refused)
-    assert data_store.catalogue.captures.find(row.id) is None
-
-
 def test_retention_spares_what_was_kept_or_restored_meanwhile(
     data_store: DataStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first, restored, wanted = (stored(data_store, deleted_at=at) for at in (NOW, NOW, None))
-    remove = data_store.folder.remove
+    begin = data_store.captures.purging.begin
 
-    def slow(path: Path) -> None:
-        data_store.captures.removal.restore(restored.id)
-        data_store.captures.update(wanted.id, keep=True)
-        remove(path)
+    def slow(capture_id: str) -> None:
+        begin(capture_id)
+        data_store.catalogue.captures.set(restored.id, deleted_at=None)
+        data_store.catalogue.captures.set(wanted.id, keep=True)
 
-    monkeypatch.setattr(data_store.folder, "remove", slow)
+    monkeypatch.setattr(data_store.captures.purging, "begin", slow)
     data_store.retention.policy = Policy(bytes=0)
     data_store.retention.apply(NOW)
     there = [data_store.catalogue.captures.find(one.id) is not None for one in (first, restored, wanted)]

@@ -82,12 +82,14 @@ class DataStore:
         self._over.set()
         self.captures.close()
         self._cleaner.join()
+        self.captures.purging.close()
         self.catalogue.close()
         self.folder.close()
 
     def _clean(self) -> None:
         """Recover interrupted recordings, start the queue, then apply retention every `_CLEAN_S`."""
         self._guarded(lambda: self._recovery.run(self._over.is_set))
+        self.captures.purging.start()
         self._guarded(self.reconstructions.start)
         self._guarded(lambda: self._recovery.check_results(self._over.is_set))
         self._recovered = True

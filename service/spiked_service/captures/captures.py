@@ -13,6 +13,7 @@ from spiked_service.base.ids import new_id
 from spiked_service.captures.armed_device import ArmedDevice
 from spiked_service.captures.live_capture import LiveCapture
 from spiked_service.captures.new_captures import NewCaptures, check_free, group_devices
+from spiked_service.captures.purging import Purging
 from spiked_service.captures.recent import Recent
 from spiked_service.captures.removal import Removal
 from spiked_service.captures.ring_counts import RingCount
@@ -58,7 +59,8 @@ class Captures:
         self._live: dict[str, LiveCapture] = {}
         self._armed: dict[str, ArmedDevice] = {}
         self._recent = Recent()
-        self.removal = Removal(folder, catalogue, reconstructions, self)
+        self.purging = Purging(folder, catalogue, reconstructions.rows, notifier)
+        self.removal = Removal(catalogue, reconstructions, self.purging, self)
         self._closing = threading.Event()
         self._ticker = threading.Thread(target=self._tick, name="counters", daemon=True)
         self._ticker.start()
@@ -139,7 +141,7 @@ class Captures:
         rows = self._catalogue.capture_page(MOST_GROUPED, group=group_id).items
         if not rows:
             raise UnknownIdError(f"there is no group {group_id} of captures")
-        return [self.snapshot(row) for row in sorted(rows, key=lambda row: row.id)]
+        return self.snapshots(sorted(rows, key=lambda row: row.id))
 
     def _begin(self, plan: Plan, size: int | None, group: str | None = None) -> LiveCapture:
         capture = self._new.create(plan, size, group)
@@ -195,9 +197,14 @@ class Captures:
 
     def snapshot(self, row: CaptureRow) -> Snapshot:
         """A row with its current counters and the ids of its newest reconstructions."""
+        return self.snapshots([row])[0]
+
+    def snapshots(self, rows: Sequence[CaptureRow]) -> Sequence[Snapshot]:
+        """Each as `snapshot` returns it."""
+        jobs = self._reconstructions.rows.jobs_of_each([row.id for row in rows])
         with self._lock:
-            live = self._live.get(row.id)
-        return _snapshot(row, live, self._reconstructions.rows.jobs_of(row.id))
+            live = [self._live.get(row.id) for row in rows]
+        return [_snapshot(*each) for each in zip(rows, live, jobs, strict=True)]
 
     def list(
         self,
@@ -244,13 +251,13 @@ class Captures:
         return self.change(capture_id, **{key: value for key, value in edit.items() if value is not None})
 
     def change(self, capture_id: str, **fields: object) -> Snapshot:
-        """Change fields of the row, and publish it. Raises UnknownIdError, StoreError, and BusyError during a purge."""
+        """Change fields of the row, and publish it. Raises UnknownIdError, StoreError."""
         with self._lock:
             live = self._live.get(capture_id)
         if live is not None:  # without the lock, because the capture calls back and takes it
             live.edit(**fields)
         else:
-            with self.removal.no_purge(capture_id):
+            with self.removal.no_purge():
                 self._catalogue.captures.set(capture_id, **fields)
         return self.publish(capture_id)
 

@@ -120,19 +120,9 @@ class Reconstructions:
         Raises UnknownIdError, BusyError for a map that is not finished, StoreError, and ConfigurationError for a
         capture without a recording, what is no map, another camera whose lens is not known, poses that are no path.
         """
-        row = ReconstructionRow(
-            new_id(),
-            capture_id,
-            False,
-            JobState.QUEUED,
-            datetime.now(UTC),
-            options=options or ReconstructionOptions(),
-            priority=priority,
-            task=task,
-            maps=tuple(MapRef(map_id) for map_id in map_ids),
-            part=part,
-            user=user,
-        )
+        made = (new_id(), capture_id, False, JobState.QUEUED, datetime.now(UTC), options or ReconstructionOptions())
+        maps = tuple(MapRef(map_id) for map_id in map_ids)
+        row = ReconstructionRow(*made, priority, task=task, maps=maps, part=part, user=user)
         try:
             # Before the lock: a path of a minute is a large file, and captures that begin and end wait for the lock.
             row = (given or Given()).put(row, self._folder, self.rows, self._catalogue.captures.get(capture_id))
@@ -219,6 +209,14 @@ class Reconstructions:
             if row.state is JobState.RUNNING:
                 raise BusyError(f"reconstruction {row.id} is running: cancel it first")
             self.rows.remove(row.id)
+
+    def while_idle(self, capture_id: str, work: Callable[[], None]) -> None:
+        """Do work while no job of a capture begins. Raises BusyError if one of them runs, or is edited."""
+        with self._lock:
+            if self._catalogue.job_counts(capture_id)[JobState.RUNNING]:
+                raise BusyError(f"a reconstruction of capture {capture_id} is running: cancel it first")
+            self.rows.check_none_edited(capture_id)
+            work()
 
     def wake_queue(self) -> None:
         """Check the queue: the recording of a capture has been closed, or will not exist, or rows have been saved."""

@@ -2,14 +2,14 @@
 
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property, lru_cache
 
 from spiked.recon.time_left import typical_work_s
 from spiked_service.reconstructions.queue_order import QueueOrder
 from spiked_service.store.catalogue import Catalogue
-from spiked_service.store.rows import JobState, ReconstructionRow, Task
+from spiked_service.store.rows import JobState, ReconstructionRow, Task, placed
 
 FRONT = 100
 """Jobs whose times are estimated one by one, and whose changes of place are published; the others have the mean."""
@@ -46,9 +46,9 @@ class Front:
         """A queued row with its place in the queue and the seconds to its completion, where known."""
         known = self.by_id.get(row.id)
         if known is not None:
-            return replace(row, queue_place=place, eta_s=known.eta_s)
+            return placed(row, place, known.eta_s)
         end_s = self.begins_s + self.each_s * max(1, place - len(self.rows))
-        return replace(row, queue_place=place, eta_s=None if row.held or end_s == float("inf") else end_s)
+        return placed(row, place, None if row.held or end_s == float("inf") else end_s)
 
 
 class QueueEstimates:
@@ -74,11 +74,11 @@ class QueueEstimates:
         found = []
         for place, row in enumerate(rows, 1):
             if row.held:
-                found.append(replace(row, queue_place=place, eta_s=None))
+                found.append(placed(row, place, None))
                 continue
             free_s.sort()
             end_s = free_s[0] = free_s[0] + pace * efforts.get(row.id, float("inf"))
-            found.append(replace(row, queue_place=place, eta_s=end_s if end_s < float("inf") else None))
+            found.append(placed(row, place, end_s if end_s < float("inf") else None))
         known = [efforts[row.id] for row in rows if row.id in efforts]
         each_s = pace * statistics.mean(known) / limit if known else float("inf")
         return Front(found, min(free_s), each_s)

@@ -4,8 +4,8 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-from spiked_service.store.catalogue import Catalogue, Page, UnknownIdError
-from spiked_service.store.rows import ReconstructionRow
+from spiked_service.store.catalogue import NOT_PURGED, Catalogue, Page, UnknownIdError
+from spiked_service.store.rows import JobState, ReconstructionRow, placed
 
 _CHUNK = 16
 """Jobs that are read at once where most often the first one is wanted."""
@@ -17,7 +17,11 @@ _NEAR = 256
 """Jobs between two places that are counted one by one."""
 _USERS = 1000
 """Users who take turns; more share the last one."""
-_ROWS = "SELECT document FROM queue CROSS JOIN reconstructions USING (id)"
+_ROWS = (
+    "SELECT document FROM queue CROSS JOIN reconstructions USING (id) WHERE "
+    "recording NOT IN (SELECT capture_id FROM purges) "
+    f"AND (recording <> '' OR reconstructions.{NOT_PURGED})"  # a merge reads none
+)
 _IN_TURN = "ORDER BY urgency, turn, id LIMIT ?"
 
 
@@ -40,7 +44,11 @@ class QueueOrder:
     def __len__(self) -> int:
         """Number of queued jobs, held ones included."""
         query = "SELECT coalesce(sum(jobs), 0) FROM queue_blocks WHERE digits = ?"
-        ((count,),) = self._catalogue.read(query, (_DIGITS[0],))
+        gone = (
+            "SELECT coalesce(sum(jobs), 0) FROM purges CROSS JOIN job_counts USING (capture_id) "
+            "WHERE job_counts.state = ?"
+        )
+        ((count,),) = self._catalogue.read(f"SELECT ({query}) - ({gone})", (_DIGITS[0], str(JobState.QUEUED)))
         return int(count)
 
     def first(self, count: int) -> list[ReconstructionRow]:
@@ -55,7 +63,7 @@ class QueueOrder:
         condition, values = "NOT held", tuple[Any, ...]()
         while True:
             others = f"recording NOT IN ({', '.join('?' * len(passed))})"
-            rows = self._rows(f"{_ROWS} WHERE {condition} AND {others} {_IN_TURN}", (*values, *passed, _CHUNK))
+            rows = self._rows(f"{_ROWS} AND {condition} AND {others} {_IN_TURN}", (*values, *passed, _CHUNK))
             if not rows:
                 return
             yield from (row for row in rows if row.capture_id not in passed or not row.task.reads_recording)
@@ -72,9 +80,9 @@ class QueueOrder:
             if last is None:
                 raise UnknownIdError(f"reconstruction {cursor}, after which the list goes on, is gone; list anew")
             condition, values = "(urgency, turn, id) > (?, ?, ?)", _values(turn_of(last))
-        rows = self._rows(f"{_ROWS} WHERE {condition} {_IN_TURN}", (*values, limit + 1))
+        rows = self._rows(f"{_ROWS} AND {condition} {_IN_TURN}", (*values, limit + 1))
         begin = self._place(turn_of(rows[0])) if rows else 0
-        items = [replace(row, queue_place=place) for place, row in enumerate(rows[:limit], begin)]
+        items = [placed(row, place, row.eta_s) for place, row in enumerate(rows[:limit], begin)]
         return Page(items, rows[limit - 1].id if len(rows) > limit else None, len(self))
 
     def places(self, ids: Iterable[str]) -> dict[str, int]:

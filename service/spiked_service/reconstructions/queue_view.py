@@ -45,13 +45,18 @@ class QueueView:
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
 
-    def placed(self, rows: Sequence[ReconstructionRow]) -> list[ReconstructionRow]:
-        """Rows with place and time where they are queued, the others as they are. Raises StoreError."""
+    def placed(
+        self, rows: Sequence[ReconstructionRow], places: Mapping[str, int] | None = None
+    ) -> list[ReconstructionRow]:
+        """Rows with place and time where they are queued, the others as they are; `places` if they are known.
+
+        Raises StoreError.
+        """
         queued = [row.id for row in rows if row.state is JobState.QUEUED]
         if not queued:
             return list(rows)
         with self._lock:
-            front, places = self._estimated(), self.order.places(queued)
+            front, places = self._estimated(), self.order.places(queued) if places is None else places
             return [front.placed(row, places[row.id]) if row.id in places else row for row in rows]
 
     def tell(self, row: ReconstructionRow, *, ran: bool) -> None:

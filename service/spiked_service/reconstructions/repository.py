@@ -2,7 +2,7 @@
 
 import shutil
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Unpack
@@ -27,6 +27,7 @@ from spiked_service.store.snapshot import CaptureJobs
 
 LISTED = 100
 """Reconstructions that are listed with their capture, at most: the newest."""
+_Rows = Sequence[ReconstructionRow]
 _ALL = 2**31
 """No limit."""
 
@@ -70,13 +71,16 @@ class ReconstructionRepository:
     def in_turn(self, limit: int = 50, cursor: str | None = None) -> Page[ReconstructionRow]:
         """A page of the queue, the next one first, with its length. Raises UnknownIdError; see `QueueOrder.page`."""
         page = self._order.page(limit, cursor)
-        return Page(self._current(page.items), page.next_cursor, page.total)
+        places = {row.id: row.queue_place or 0 for row in page.items}
+        return Page(self._current(page.items, places), page.next_cursor, page.total)
 
     def jobs_of(self, capture_id: str) -> CaptureJobs:
         """The newest reconstructions of a capture, and how many there are."""
-        ids = self._catalogue.job_ids(capture_id, LISTED + 1)
-        total = len(ids) if len(ids) <= LISTED else sum(self._catalogue.job_counts(capture_id).values())
-        return CaptureJobs(tuple(ids[LISTED - 1 :: -1]), total)
+        return self.jobs_of_each([capture_id])[0]
+
+    def jobs_of_each(self, capture_ids: Sequence[str]) -> list[CaptureJobs]:
+        """Of each capture the newest reconstructions, and how many there are."""
+        return [CaptureJobs(ids[::-1], total) for ids, total in self._catalogue.newest_jobs(capture_ids, LISTED)]
 
     def shown_of(self, capture_ids: Sequence[str]) -> list[ReconstructionRow]:
         """Of each capture the newest reconstruction with a version, else its newest that is no localisation, if any."""
@@ -295,13 +299,24 @@ class ReconstructionRepository:
         """Delete a reconstruction with its versions and files. Raises BusyError while it is edited."""
         with self._lock:
             self.check_not_edited(reconstruction_id)
-            self._folder.remove(self._folder.reconstruction(reconstruction_id))
-            with self._catalogue.transaction():
-                self._catalogue.forget_versions(reconstruction_id)
-                self._catalogue.reconstructions.remove(reconstruction_id)
-            self._unsaved.pop(reconstruction_id, None)
-            self._texts.pop(reconstruction_id, None)
-            self._view.forget(reconstruction_id)
+            self.clear([reconstruction_id])
+
+    def clear(self, ids: Sequence[str]) -> None:
+        """Delete reconstructions: files first, so that a kill leaves none without a row. Raises StoreError."""
+        for one in ids:
+            self._folder.remove(self._folder.reconstruction(one))
+        with self._lock:
+            self._catalogue.freeing(self._catalogue.remove_jobs, ids)
+            for one in ids:
+                self._unsaved.pop(one, None)
+                self._texts.pop(one, None)
+                self._view.forget(one)
+
+    def check_none_edited(self, capture_id: str) -> None:
+        """Raises BusyError while a reconstruction of a capture is edited."""
+        with self._lock:
+            for one in (edited for edited in self._edited if self.get(edited).capture_id == capture_id):
+                self.check_not_edited(one)
 
     def close(self) -> None:
         """End the thread that tells of changed places."""
@@ -313,10 +328,10 @@ class ReconstructionRepository:
         else:
             self._running.pop(row.id, None)
 
-    def _current(self, rows: Sequence[ReconstructionRow]) -> list[ReconstructionRow]:
+    def _current(self, rows: _Rows, places: Mapping[str, int] | None = None) -> list[ReconstructionRow]:
         with self._lock:
             found = [self._running.get(row.id) or self._unsaved.get(row.id, row) for row in rows]
-            return self._view.placed(found)
+            return self._view.placed(found, places)
 
 
 def _stored(row: ReconstructionRow) -> ReconstructionRow:

@@ -1,5 +1,6 @@
 """Which captures are listed, and in what order, in SQL."""
 
+import json
 from enum import StrEnum
 from typing import Any, TypedDict
 
@@ -22,17 +23,13 @@ class CaptureSort(StrEnum):
 
 SORT_KEYS = {
     CaptureSort.STARTED: "id",
-    CaptureSort.NAME: "lower(coalesce(nullif(json_extract(document, '$.name'), ''), "
-    "json_extract(document, '$.plan.source')))",
-    CaptureSort.LENGTH: "coalesce(json_extract(document, '$.recording.frames') * 1.0 / "
-    "json_extract(document, '$.sensor.frame_rate_hz'), 0)",
-    CaptureSort.SIZE: "coalesce(json_extract(document, '$.recording.bytes'), 0)",
-    CaptureSort.VERDICT: "CASE json_extract(document, '$.verdict.grade') "
-    "WHEN 'good' THEN 3 WHEN 'degraded' THEN 2 WHEN 'bad' THEN 1 ELSE 0 END",
-    CaptureSort.RECONSTRUCTION: "coalesce((SELECT state FROM jobs WHERE capture_id = captures.id "
-    "ORDER BY jobs.id DESC LIMIT 1), '')",
+    CaptureSort.NAME: "name",
+    CaptureSort.LENGTH: "length",
+    CaptureSort.SIZE: "bytes",
+    CaptureSort.VERDICT: "verdict",
+    CaptureSort.RECONSTRUCTION: "job",
 }
-"""SQL expressions, never null; captures that are alike in them are ordered by id."""
+"""Columns of `capture_list`, each with an index; captures that are alike in them are ordered by id."""
 
 
 class CaptureFilter(TypedDict, total=False):
@@ -50,26 +47,15 @@ class CaptureFilter(TypedDict, total=False):
 
 
 def matching(wanted: CaptureFilter) -> tuple[list[str], list[Any]]:
-    """SQL conditions for a list of captures, and their values."""
-    state, group, tag, query = (wanted.get(key) for key in ("state", "group", "tag", "query"))
-    where, values = ["deleted_at IS NOT NULL" if wanted.get("deleted") else "deleted_at IS NULL"], list[Any]()
-    if state is not None:
-        where.append("state = ?")
-        values.append(str(state))
-    if group is not None:
-        where.append("json_extract(document, '$.group') = ?")
-        values.append(group)
-    if tag is not None:
-        where.append("EXISTS (SELECT 1 FROM json_each(document, '$.tags') WHERE value = ?)")
-        values.append(tag)
-    if (grade := wanted.get("grade")) is not None:
-        where.append("json_extract(document, '$.verdict.grade') = ?")
-        values.append(str(grade))
-    if (keep := wanted.get("keep")) is not None:
-        where.append("coalesce(json_extract(document, '$.keep'), 0) = ?")
-        values.append(int(keep))
-    if query:
-        fields = ("$.name", "$.notes", "$.plan.source", "$.tags", "$.metadata")
-        where.append("(" + " OR ".join(f"instr(lower(json_extract(document, '{f}')), ?)" for f in fields) + ")")
-        values += [str(query).lower()] * len(fields)
-    return where, values
+    """SQL conditions on `capture_list` for a list of captures, and their values."""
+    conditions: dict[str, Any] = {"capture_list.deleted = ?": int(bool(wanted.get("deleted")))}
+    for key, column in (("state", "state"), ("grade", "grade"), ("group", "group_id"), ("keep", "keep")):
+        if (value := wanted.get(key)) is not None:
+            conditions[f"capture_list.{column} = ?"] = int(value) if isinstance(value, bool) else str(value)
+    if (tag := wanted.get("tag")) is not None:
+        # As JSON has it within a list: quotes of a tag are escaped, so that none contains another in its quotes.
+        conditions["instr(capture_list.tags, ?)"] = json.dumps(tag, ensure_ascii=False)
+    if query := wanted.get("query"):
+        text = "SELECT text FROM capture_texts WHERE capture_texts.id = capture_list.id"
+        conditions[f"instr(({text}), ?)"] = str(query).lower()
+    return list(conditions), list(conditions.values())

@@ -1,8 +1,9 @@
 """The catalogue: one SQLite file in WAL mode, one writer at a time, readers that never wait for it."""
 
+import json
 import sqlite3
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +26,18 @@ from spiked_service.store.rows import (
     UploadRow,
     VersionRow,
 )
+from spiked_service.store.written_rows import WrittenRows
 
+NOT_PURGED = "capture_id NOT IN (SELECT capture_id FROM purges)"
+"""SQL condition of rows of jobs: those of captures that were purged are gone for whoever reads."""
+_THERE = "value NOT IN (SELECT capture_id FROM purges)"
+_NEWEST_JOBS = (
+    f"SELECT value, iif({_THERE}, (SELECT group_concat(id) FROM "
+    "(SELECT id FROM jobs WHERE capture_id = value ORDER BY id DESC LIMIT ?)), NULL), "
+    f"iif({_THERE}, (SELECT coalesce(sum(jobs), 0) FROM job_counts WHERE capture_id = value), 0) "
+    "FROM json_each(?)"
+)
+"""One row for each capture of a list: a row for each of so many ids would take most of the time."""
 _WAIT_S = 5.0
 """Longest wait for another process that writes the catalogue, seconds."""
 _CopyOf = Callable[[str], Path]
@@ -86,6 +98,7 @@ class Catalogue:
         self._writing = threading.RLock()
         self.copies = RowCopies()
         """Of the rows that the open transaction changes."""
+        self.written = WrittenRows()
         with _as_store_error(path):
             self._writer = _connect(path)
         try:
@@ -102,7 +115,7 @@ class Catalogue:
         self._reserve = None if folder is None else DiskReserve(path.with_name(f"{path.name}-reserve"))
         self.keep_reserve()
         self.captures = Table(self, "captures", CaptureRow, beside[0])
-        self.reconstructions = Table(self, "reconstructions", ReconstructionRow, beside[1])
+        self.reconstructions = Table(self, "reconstructions", ReconstructionRow, beside[1], NOT_PURGED)
         self.uploads = Table(self, "uploads", UploadRow, beside[2])
 
     def damage(self) -> str | None:
@@ -175,16 +188,23 @@ class Catalogue:
         Raises UnknownIdError for the cursor of a capture that was purged meanwhile.
         """
         where, values = matching(wanted)
-        total = self._total(where, values, wanted)
+        counted = [*where], [*values]
         key, side, way = SORT_KEYS[sort], "<" if descending else ">", "DESC" if descending else "ASC"
         if cursor is not None:
-            last = self.read(f"SELECT {key} FROM captures WHERE id = ?", (cursor,))
+            last = self.read(f"SELECT {key} FROM capture_list WHERE id = ?", (cursor,))
             if not last and sort is not CaptureSort.STARTED:
                 raise UnknownIdError(f"capture {cursor}, after which the list goes on, is gone; list anew")
-            where.append(f"({key}, id) {side} (?, ?)")
+            where.append(f"(capture_list.{key}, capture_list.id) {side} (?, ?)")
             values += [last[0][0] if last else cursor, cursor]
-        ordered = f"{' AND '.join(where)} ORDER BY {key} {way}, id {way} LIMIT ?"
-        rows = self.captures.where(ordered, (*values, limit + 1))
+        found = self.read(
+            f"SELECT document FROM capture_list CROSS JOIN captures USING (id) WHERE {' AND '.join(where)} "
+            f"ORDER BY capture_list.{key} {way}, capture_list.id {way} LIMIT ?",
+            (*values, limit + 1),
+        )
+        rows = [self.captures.parse(document) for (document,) in found]
+        if cursor is None and len(rows) <= limit:
+            return Page(rows, None, len(rows))
+        total = self._total(*counted, wanted)
         return Page(rows[:limit], rows[limit - 1].id if len(rows) > limit else None, total)
 
     def _total(self, where: list[str], values: list[Any], wanted: CaptureFilter) -> int:
@@ -197,7 +217,7 @@ class Catalogue:
                 (deleted, state and str(state), grade and str(grade)),
             )
         else:
-            ((total,),) = self.read(f"SELECT count(*) FROM captures WHERE {' AND '.join(where)}", tuple(values))
+            ((total,),) = self.read(f"SELECT count(*) FROM capture_list WHERE {' AND '.join(where)}", tuple(values))
         return int(total)
 
     def capture_counts(self) -> dict[str, int]:
@@ -217,7 +237,7 @@ class Catalogue:
         """Reconstructions, newest first."""
         wanted = {"capture_id = ?": capture_id, "state = ?": state and str(state), "id < ?": cursor}
         given = {condition: value for condition, value in wanted.items() if value is not None}
-        where = " AND ".join(f"jobs.{condition}" for condition in given) or "1"
+        where = " AND ".join(f"jobs.{condition}" for condition in (NOT_PURGED, *given))
         found = self.read(
             f"SELECT document FROM jobs CROSS JOIN reconstructions USING (id) WHERE {where} "
             "ORDER BY jobs.id DESC LIMIT ?",
@@ -228,18 +248,30 @@ class Catalogue:
 
     def job_counts(self, capture_id: str = "") -> dict[JobState, int]:
         """Number of reconstructions by state, of a capture or of all."""
-        found = self.read("SELECT state, jobs FROM job_counts WHERE capture_id = ?", (capture_id,))
-        return dict.fromkeys(JobState, 0) | {JobState(state): count for state, count in found}
+        found = self.read(f"SELECT state, jobs FROM job_counts WHERE capture_id = ? AND {NOT_PURGED}", (capture_id,))
+        counts = dict.fromkeys(JobState, 0) | {JobState(state): count for state, count in found}
+        if not capture_id:
+            gone = "SELECT state, sum(jobs) FROM purges CROSS JOIN job_counts USING (capture_id) GROUP BY state"
+            for state, count in self.read(gone):
+                counts[JobState(state)] -= count
+        return counts
 
     def job_ids(self, capture_id: str, limit: int, state: JobState | None = None) -> list[str]:
         """Ids of the newest reconstructions of a capture, the newest first."""
         where, values = ("", ()) if state is None else (" AND state = ?", (str(state),))
-        query = f"SELECT id FROM jobs WHERE capture_id = ?{where} ORDER BY id DESC LIMIT ?"
+        query = f"SELECT id FROM jobs WHERE capture_id = ? AND {NOT_PURGED}{where} ORDER BY id DESC LIMIT ?"
         return [row_id for (row_id,) in self.read(query, (capture_id, *values, limit))]
+
+    def newest_jobs(self, capture_ids: Sequence[str], limit: int) -> list[tuple[tuple[str, ...], int]]:
+        """Of each capture the ids of its newest reconstructions, the newest first, and how many there are."""
+        found = self.read(_NEWEST_JOBS, (limit, json.dumps(capture_ids)))
+        known = {one: (tuple(ids.split(",")) if ids else (), count) for one, ids, count in found}
+        return [known[one] for one in capture_ids]
 
     def shown_job(self, capture_id: str) -> str | None:
         """Id of the newest reconstruction of a capture that has a version, else of the newest that may get one."""
-        query = "SELECT id FROM jobs WHERE capture_id = ? AND worth > 0 ORDER BY worth DESC, id DESC LIMIT 1"
+        wanted = f"capture_id = ? AND {NOT_PURGED} AND worth > 0"
+        query = f"SELECT id FROM jobs WHERE {wanted} ORDER BY worth DESC, id DESC LIMIT 1"
         found = self.read(query, (capture_id,))
         return found[0][0] if found else None
 
@@ -254,13 +286,14 @@ class Catalogue:
     def ended_reconstructions(self) -> list[str]:
         """Ids of the reconstructions that have ended."""
         over = tuple(str(state) for state in JobState if state.over)
-        found = self.read(f"SELECT id FROM jobs WHERE state IN ({', '.join('?' * len(over))})", over)
+        found = self.read(f"SELECT id FROM jobs WHERE state IN ({', '.join('?' * len(over))}) AND {NOT_PURGED}", over)
         return [row_id for (row_id,) in found]
 
     def lost_reconstructions(self) -> list[str]:
         """Ids of the reconstructions whose capture is missing."""
-        counted = "SELECT capture_id FROM job_counts WHERE capture_id <> '' EXCEPT SELECT id FROM captures"
-        return [row_id for (row_id,) in self.read(f"SELECT id FROM jobs WHERE capture_id IN ({counted})")]
+        counted = f"SELECT capture_id FROM job_counts WHERE capture_id <> '' AND {NOT_PURGED}"
+        lost = f"capture_id IN ({counted} EXCEPT SELECT id FROM captures)"
+        return [row_id for (row_id,) in self.read(f"SELECT id FROM jobs WHERE {lost}")]
 
     def put_version(self, row: VersionRow, kept: set[int]) -> None:
         """Save a version and delete those that are not kept."""
@@ -294,6 +327,14 @@ class Catalogue:
         """Delete the versions of a reconstruction."""
         with self.transaction() as connection:
             connection.execute("DELETE FROM versions WHERE reconstruction_id = ?", (reconstruction_id,))
+
+    def remove_jobs(self, ids: Sequence[str]) -> None:
+        """Delete reconstructions with their versions, in one transaction."""
+        marks = ", ".join("?" * len(ids))
+        with self.transaction() as connection:
+            self.written.note(*ids)
+            connection.execute(f"DELETE FROM versions WHERE reconstruction_id IN ({marks})", tuple(ids))
+            connection.execute(f"DELETE FROM reconstructions WHERE id IN ({marks})", tuple(ids))
 
     @contextmanager
     def _reader(self) -> Iterator[sqlite3.Connection]:
@@ -342,12 +383,17 @@ class Catalogue:
 class Table(Generic[_Row]):
     """A table of rows by id."""
 
-    def __init__(self, catalogue: Catalogue, name: str, kind: type[_Row], beside: _CopyOf | None = None) -> None:
-        """`beside` returns the path of the copy of a row, which is written if its folder exists."""
+    def __init__(
+        self, catalogue: Catalogue, name: str, kind: type[_Row], beside: _CopyOf | None = None, there: str = "1"
+    ) -> None:
+        """`beside` returns the path of the copy of a row, which is written if its folder exists; `there` is an SQL
+        condition: other rows are not found by their ids.
+        """
         self._catalogue = catalogue
         self._name = name
         self._kind: TypeAdapter[_Row] = TypeAdapter(kind)
         self._beside = beside
+        self._of_id = f"SELECT document FROM {name} WHERE id = ? AND {there}"
 
     @property
     def kind(self) -> str:
@@ -358,6 +404,7 @@ class Table(Generic[_Row]):
         """Insert a row, or replace the one with its id."""
         document = self._kind.dump_json(row)
         with self._catalogue.transaction() as connection:
+            self._catalogue.written.note(row.id)
             connection.execute(
                 f"INSERT OR REPLACE INTO {self._name} (id, document) VALUES (?, ?)", (row.id, document.decode())
             )
@@ -374,7 +421,7 @@ class Table(Generic[_Row]):
 
     def find(self, row_id: str) -> _Row | None:
         """The row, or None."""
-        found = self._catalogue.read(f"SELECT document FROM {self._name} WHERE id = ?", (row_id,))
+        found = self._catalogue.read(self._of_id, (row_id,))
         return self._kind.validate_json(found[0][0]) if found else None
 
     def get(self, row_id: str) -> _Row:
@@ -400,7 +447,7 @@ class Table(Generic[_Row]):
     def get_for_change(self, row_id: str) -> _Row:
         """The row as the open transaction sees it. Raises UnknownIdError."""
         with self._catalogue.transaction() as connection:
-            found = connection.execute(f"SELECT document FROM {self._name} WHERE id = ?", (row_id,)).fetchone()
+            found = connection.execute(self._of_id, (row_id,)).fetchone()
         if found is None:
             raise UnknownIdError(f"there is no {self.kind} {row_id}; GET {self._name} lists them")
         return self._kind.validate_json(found[0])
@@ -408,6 +455,7 @@ class Table(Generic[_Row]):
     def remove(self, row_id: str) -> None:
         """Delete a row and its copy, if they exist."""
         with self._catalogue.transaction() as connection:
+            self._catalogue.written.note(row_id)
             connection.execute(f"DELETE FROM {self._name} WHERE id = ?", (row_id,))
             if self._beside is not None:
                 self._catalogue.copies.remove(self._beside(row_id))

@@ -12,6 +12,8 @@ from spiked.recon.checkpoint_file import CHECKPOINT
 from spiked_service.base.ids import is_id
 
 _LOCK = "lock"
+_REMOVED = ".removed"
+"""Suffix of a hidden folder that is being deleted."""
 CAPTURE_ROW = "capture.json"
 """Name of the copy of a capture's row in its folder."""
 RECONSTRUCTION_ROW = "reconstruction.json"
@@ -163,18 +165,49 @@ class DataFolder:
     def remove(self, folder: Path) -> None:
         """Delete the folder of a capture or reconstruction, if it exists."""
         # Renamed first, so that a kill in between never leaves half a capture under its name.
-        removed = folder.with_name(f".{folder.name}.removed")
+        removed = folder.with_name(f".{folder.name}{_REMOVED}")
         if folder.exists():
             folder.rename(removed)
         shutil.rmtree(removed, ignore_errors=True)
 
+    def begin_purge(self, capture_id: str) -> None:
+        """Rename the folder of a capture, which says that it was purged, until `end_purge`. Raises OSError."""
+        removed = self._removed_capture(capture_id)
+        if self.capture(capture_id).exists():
+            shutil.rmtree(removed, ignore_errors=True)
+            self.capture(capture_id).rename(removed)
+        else:
+            removed.mkdir(exist_ok=True)
+
+    def undo_purge(self, capture_id: str) -> None:
+        """Undo `begin_purge`. Raises OSError."""
+        self._removed_capture(capture_id).rename(self.capture(capture_id))
+
+    def purged(self) -> set[str]:
+        """Ids of captures whose purge has begun and not ended; not of those that were put back from a backup."""
+        found = {path.name[1 : -len(_REMOVED)] for path in self._captures.glob(f".*{_REMOVED}")}
+        return {capture_id for capture_id in found if is_id(capture_id) and not self.capture(capture_id).exists()}
+
+    def empty_purged(self, capture_id: str) -> None:
+        """Delete the files of a purged capture, and keep its folder. Raises OSError."""
+        for path in self._removed_capture(capture_id).iterdir():
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+
+    def end_purge(self, capture_id: str) -> None:
+        """Delete the folder of a purged capture, if it exists."""
+        shutil.rmtree(self._removed_capture(capture_id), ignore_errors=True)
+
     def sweep(self) -> int:
-        """Delete incomplete files of killed processes. Return their number."""
-        removed = 0
+        """Delete incomplete files of killed processes. Return their number. Folders of `purged` captures stay."""
+        removed, purged = 0, {self._removed_capture(capture_id) for capture_id in self.purged()}
         for base in (self._captures, self._reconstructions):
-            for leftover in base.glob(".*.removed"):
-                shutil.rmtree(leftover, ignore_errors=True)
-                removed += 1
+            for leftover in base.glob(f".*{_REMOVED}"):
+                if leftover not in purged:
+                    shutil.rmtree(leftover, ignore_errors=True)
+                    removed += 1
             for part in base.rglob("*.part"):
                 part.unlink(missing_ok=True)
                 removed += 1
@@ -186,6 +219,9 @@ class DataFolder:
     def close(self) -> None:
         """Unlock the folder."""
         self._lock.close()
+
+    def _removed_capture(self, capture_id: str) -> Path:
+        return self._captures / f".{_checked(capture_id)}{_REMOVED}"
 
     @property
     def _captures(self) -> Path:

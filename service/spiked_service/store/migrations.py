@@ -155,6 +155,65 @@ MIGRATIONS = (
             AND state = OLD.state AND grade = coalesce(json_extract(OLD.document, '$.verdict.grade'), '');
     END;
     """,
+    """
+    CREATE TABLE purges (capture_id TEXT PRIMARY KEY) WITHOUT ROWID;
+    DROP INDEX captures_by_state;
+    DROP INDEX captures_by_group;
+    CREATE TABLE capture_list (
+        id TEXT PRIMARY KEY, deleted INTEGER NOT NULL, since INTEGER NOT NULL, state TEXT NOT NULL,
+        grade TEXT NOT NULL, keep INTEGER NOT NULL, group_id TEXT NOT NULL, tags TEXT NOT NULL, name TEXT NOT NULL,
+        length REAL NOT NULL, bytes INTEGER NOT NULL, verdict INTEGER NOT NULL, job TEXT NOT NULL
+    ) WITHOUT ROWID;
+    CREATE INDEX captures_listed ON capture_list (deleted, id);
+    CREATE INDEX captures_by_age ON capture_list (deleted, since);
+    CREATE INDEX captures_by_group ON capture_list (group_id) WHERE group_id <> '';
+    CREATE INDEX captures_by_name ON capture_list (deleted, name, id);
+    CREATE INDEX captures_by_length ON capture_list (deleted, length, id);
+    CREATE INDEX captures_by_bytes ON capture_list (deleted, bytes, id);
+    CREATE INDEX captures_by_verdict ON capture_list (deleted, verdict, id);
+    CREATE INDEX captures_by_job ON capture_list (deleted, job, id);
+    CREATE TABLE capture_texts (id TEXT PRIMARY KEY, text TEXT NOT NULL) WITHOUT ROWID;
+    CREATE TRIGGER captures_follow AFTER INSERT ON captures BEGIN
+        INSERT OR REPLACE INTO capture_list SELECT NEW.id, NEW.deleted_at IS NOT NULL,
+            coalesce(CAST(strftime('%s', coalesce(NEW.deleted_at, json_extract(NEW.document, '$.ended_at'),
+                json_extract(NEW.document, '$.started_at'))) AS INTEGER), 0),
+            NEW.state, coalesce(json_extract(NEW.document, '$.verdict.grade'), ''),
+            coalesce(json_extract(NEW.document, '$.keep'), 0), coalesce(json_extract(NEW.document, '$.group'), ''),
+            coalesce(json_extract(NEW.document, '$.tags'), '[]'),
+            lower(coalesce(nullif(json_extract(NEW.document, '$.name'), ''),
+                json_extract(NEW.document, '$.plan.source'), '')),
+            coalesce(json_extract(NEW.document, '$.recording.frames') * 1.0
+                / json_extract(NEW.document, '$.sensor.frame_rate_hz'), 0),
+            coalesce(json_extract(NEW.document, '$.recording.bytes'), 0),
+            CASE json_extract(NEW.document, '$.verdict.grade')
+                WHEN 'good' THEN 3 WHEN 'degraded' THEN 2 WHEN 'bad' THEN 1 ELSE 0 END,
+            coalesce((SELECT state FROM jobs WHERE capture_id = NEW.id ORDER BY id DESC LIMIT 1), '');
+        INSERT OR REPLACE INTO capture_texts SELECT NEW.id, lower(coalesce(json_extract(NEW.document, '$.name'), '')
+            || char(31) || coalesce(json_extract(NEW.document, '$.notes'), '')
+            || char(31) || coalesce(json_extract(NEW.document, '$.plan.source'), '')
+            || char(31) || coalesce(json_extract(NEW.document, '$.tags'), '')
+            || char(31) || coalesce(json_extract(NEW.document, '$.metadata'), ''));
+    END;
+    CREATE TRIGGER captures_forget AFTER DELETE ON captures BEGIN
+        DELETE FROM capture_list WHERE id = OLD.id;
+        DELETE FROM capture_texts WHERE id = OLD.id;
+    END;
+    CREATE TRIGGER jobs_listed AFTER INSERT ON jobs BEGIN
+        UPDATE capture_list SET job = NEW.state WHERE id = NEW.capture_id
+            AND NOT EXISTS (SELECT 1 FROM jobs WHERE capture_id = NEW.capture_id AND id > NEW.id);
+    END;
+    CREATE TRIGGER jobs_relisted AFTER UPDATE OF state ON jobs BEGIN
+        UPDATE capture_list SET job = NEW.state WHERE id = NEW.capture_id
+            AND NOT EXISTS (SELECT 1 FROM jobs WHERE capture_id = NEW.capture_id AND id > NEW.id);
+    END;
+    CREATE TRIGGER jobs_unlisted AFTER DELETE ON jobs BEGIN
+        UPDATE capture_list
+            SET job = coalesce((SELECT state FROM jobs WHERE capture_id = OLD.capture_id ORDER BY id DESC LIMIT 1), '')
+            WHERE id = OLD.capture_id
+            AND NOT EXISTS (SELECT 1 FROM jobs WHERE capture_id = OLD.capture_id AND id > OLD.id);
+    END;
+    INSERT OR REPLACE INTO captures (id, document) SELECT id, document FROM captures;
+    """,
 )
 """Script n migrates a catalogue from schema n to n + 1; the schema is the file's user_version.
 
@@ -169,6 +228,10 @@ columns in step with them, because SQLite reads a row's document for a column th
 * `jobs`: states and captures of all reconstructions, and what they are worth as the scene of their capture: 0 for a
   localisation, 1 without a version, 2 with one
 * `job_counts`: how many jobs there are, of each capture and of all (''); `capture_counts`: how many captures
+* `capture_list`: what captures are sorted and filtered by, with the state of their newest job; `since` is when one was
+  removed, else when it ended, in Unix seconds; `capture_texts`: the lower-case text that is searched
+
+`purges` has the captures that were deleted for good and whose jobs are being deleted: reading passes over these.
 """
 
 

@@ -46,12 +46,14 @@ def test_no_text_but_an_id_becomes_a_path(tmp_path: Path, text: str) -> None:
 
 def test_what_kills_left_half_done_is_swept(tmp_path: Path) -> None:
     folder = DataFolder(tmp_path)
-    kept, doomed = folder.capture(new_id()), folder.capture(new_id())
-    for one in (kept, doomed):
+    kept, doomed, purged = folder.capture(new_id()), folder.reconstruction(new_id()), folder.capture(new_id())
+    for one in (kept, doomed, purged):
         one.mkdir()
         (one / "thumbnail.webp.part").touch()
     (kept / "thumbnail.webp").touch()
     doomed.rename(doomed.with_name(f".{doomed.name}.removed"))
-    assert folder.sweep() == 2
+    folder.begin_purge(purged.name)
+    assert folder.sweep() == 3
     assert [path.name for path in folder.contents()[0] and kept.iterdir()] == ["thumbnail.webp"]
-    assert folder.contents()[0] == {kept.name}
+    assert folder.contents()[0] == {kept.name} and folder.contents()[1] == set()
+    assert folder.purged() == {purged.name}, "its jobs are to be deleted first"

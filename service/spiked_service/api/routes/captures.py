@@ -54,7 +54,7 @@ def capture_routes(captures: Captures, sources: Sources, route_class: type[APIRo
         """Captures, newest first unless another order is asked for. All pages are asked for with the same order."""
         wanted = CaptureFilter(query=q, state=state, deleted=deleted, group=group, tag=tag, grade=grade, keep=keep)
         page = captures.list(limit, cursor, sort, descending, **wanted)
-        items = [CaptureOut.of(captures.snapshot(row)) for row in page.items]
+        items = [CaptureOut.of(snapshot) for snapshot in captures.snapshots(page.items)]
         return CapturePage(items=items, next_cursor=page.next_cursor, total=page.total or 0)
 
     @router.get("/{capture_id:id}", responses=problems(404))
@@ -83,7 +83,7 @@ def _add_end_routes(router: APIRouter, captures: Captures) -> None:
 
     @router.post("/{capture_id:id}:purge", status_code=HTTPStatus.NO_CONTENT, responses=problems(404, 409))
     def purge_capture(capture_id: str, idempotency_key: IdempotencyKey = None) -> None:
-        """Delete a removed capture with its files for good, before retention does."""
+        """Delete a removed capture for good, before retention does. It is gone at once; its files follow soon."""
         if captures.get(capture_id).row.deleted_at is None:
             raise BusyError(f"capture {capture_id} has not been removed: remove it first, then it can be purged")
         captures.removal.purge(capture_id)

@@ -249,7 +249,7 @@ export interface paths {
         put?: never;
         /**
          * Purge Capture
-         * @description Delete a removed capture with its files for good, before retention does.
+         * @description Delete a removed capture for good, before retention does. It is gone at once; its files follow soon.
          *
          *     Scope of a token: `operate`.
          */

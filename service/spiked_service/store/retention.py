@@ -1,13 +1,13 @@
 """Retention: removes old captures so that the disk does not fill."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 from typing import Protocol
 
 from spiked_service.base.errors import BusyError
 from spiked_service.store.catalogue import Catalogue
+from spiked_service.store.disk_use import DiskUse
 from spiked_service.store.folder import UPLOAD_SUFFIXES, DataFolder
 from spiked_service.store.rows import CaptureRow
 
@@ -49,6 +49,7 @@ class Retention:
         self._catalogue = catalogue
         self._captures = captures
         self._log = log
+        self.disk_use = DiskUse(folder, catalogue)
         self.policy = Policy()
         """May be changed at any time."""
 
@@ -56,39 +57,51 @@ class Retention:
         """Remove what exceeds the policy, but for captures with a running job. Raises StoreError."""
         now = now or datetime.now(UTC)
         policy = self.policy
-        rows = [row for row in self._catalogue.captures.where("1 ORDER BY id") if row.state.over]
-        for row in rows:
-            if row.deleted_at is not None and now - row.deleted_at >= timedelta(days=policy.deleted_days):
-                self._purge(row, f"it was removed {policy.deleted_days:g} days ago")
-            elif policy.days is not None and _disposable(row) and _age(row, now) > timedelta(days=policy.days):
-                self._captures.remove(row.id)
-                self._log(f"capture {row.id} was removed: it is older than {policy.days:g} days")
+        kept = timedelta(days=policy.deleted_days)
+        for row in self._older("deleted = 1", now, kept):
+            if row.deleted_at is not None and now - row.deleted_at >= kept:
+                self._purge(row, f"it was removed {policy.deleted_days:g} days ago", removed=True)
+        if policy.days is not None:
+            kept = timedelta(days=policy.days)
+            for row in self._older("deleted = 0 AND keep = 0", now, kept):
+                if _disposable(row) and now - (row.ended_at or row.started_at) > kept:
+                    self._captures.remove(row.id)
+                    self._log(f"capture {row.id} was removed: it is older than {policy.days:g} days")
         self._shrink(policy.bytes)
         self._drop_uploads(now)
 
-    def used_bytes(self) -> dict[str, int]:
-        """Bytes on disk by capture, with its reconstructions."""
-        used = {row.id: _size(self._folder.capture(row.id)) for row in self._catalogue.captures.where()}
-        for row_id, capture_id in self._catalogue.read("SELECT id, capture_id FROM jobs"):
-            used[capture_id] = used.get(capture_id, 0) + _size(self._folder.reconstruction(row_id))
-        return used
+    def _older(self, condition: str, now: datetime, age: timedelta) -> Iterator[CaptureRow]:
+        """Captures that have been over, or removed, for that time or nearly so, the oldest first."""
+        query = f"SELECT id FROM capture_list WHERE {condition} AND since <= ? ORDER BY since"
+        yield from self._over(self._catalogue.read(query, (int(now.timestamp() - age.total_seconds()),)))
+
+    def _over(self, ids: Iterable[tuple[str]]) -> Iterator[CaptureRow]:
+        rows = (self._catalogue.captures.find(row_id) for (row_id,) in ids)
+        return (row for row in rows if row is not None and row.state.over)
 
     def _shrink(self, limit: int | None) -> None:
         if limit is None:
+            self.disk_use.forget()
             return
-        used = self.used_bytes()
+        used = self.disk_use.by_capture()
         total = sum(used.values())
-        rows = [row for row in self._catalogue.captures.where("1 ORDER BY id") if row.state.over]
-        candidates = [row for row in rows if row.deleted_at] + [row for row in rows if _disposable(row)]
-        for row in candidates:
-            if total <= limit:
-                return
-            if self._purge(row, f"all captures together are larger than {limit} bytes"):
-                total -= used.get(row.id, 0)
+        if total <= limit:
+            return
+        why = f"all captures together are larger than {limit} bytes"
+        kinds = {True: "deleted = 1", False: "deleted = 0 AND keep = 0"}
+        listed = {
+            removed: self._catalogue.read(f"SELECT id FROM capture_list WHERE {condition} ORDER BY id")
+            for removed, condition in kinds.items()
+        }
+        for removed, ids in listed.items():
+            for row in self._over(ids):
+                if total <= limit:
+                    return
+                if self._purge(row, why, removed=removed):
+                    total -= used.get(row.id, 0)
 
-    def _purge(self, row: CaptureRow, why: str) -> bool:
-        """Purge a capture, unless it was restored or kept meanwhile, or one of its jobs runs; whether it was."""
-        removed = row.deleted_at is not None
+    def _purge(self, row: CaptureRow, why: str, *, removed: bool) -> bool:
+        """Purge one that is `removed`, or not; not if that or `keep` has changed, or a job runs. Whether it was."""
         try:
             self._captures.purge(row.id, lambda now: now.deleted_at is not None if removed else _disposable(now))
         except BusyError:
@@ -106,19 +119,3 @@ class Retention:
 
 def _disposable(row: CaptureRow) -> bool:
     return not row.keep and row.deleted_at is None
-
-
-def _age(row: CaptureRow, now: datetime) -> timedelta:
-    return now - (row.ended_at or row.started_at)
-
-
-def _size(folder: Path) -> int:
-    """Bytes that the files below a folder occupy."""
-    total = 0
-    for path in folder.rglob("*"):
-        try:
-            stat = path.lstat()
-            total += stat.st_blocks * 512 // stat.st_nlink  # a job links the maps that it uses
-        except FileNotFoundError:
-            continue  # a running reconstruction lets go of versions
-    return total

@@ -1,6 +1,6 @@
 /** The table of captures, newest first, searched by the service. */
 
-import { type JSX, useEffect, useRef, useState } from "react";
+import { type JSX, memo, useCallback, useEffect, useRef, useState } from "react";
 
 import { address } from "../../shared/api/calls";
 import type { Capture, CaptureSort, Reconstruction } from "../../shared/api/types";
@@ -46,6 +46,11 @@ export function CapturesTable(): JSX.Element {
   const known = useService((state) => state.captures);
   const deleted = filter === "deleted";
 
+  const select = useCallback(
+    (id: string, wanted: boolean) =>
+      setSelected((old) => new Set(wanted ? [...old, id] : [...old].filter((one) => one !== id))),
+    [],
+  );
   const Bar = deleted ? DeletedBar : SelectionBar;
   const shown = listed?.items ?? NONE;
   const jobOf = useShownJobs(shown);
@@ -139,10 +144,8 @@ export function CapturesTable(): JSX.Element {
                 capture={known[one.id] ?? one}
                 job={jobOf(one.id)}
                 selected={selected.has(one.id)}
-                onSelect={(wanted) =>
-                  setSelected((old) => new Set(wanted ? [...old, one.id] : [...old].filter((id) => id !== one.id)))
-                }
-                onRemoved={() => forget(one.id)}
+                onSelect={select}
+                onRemoved={forget}
                 onRestored={again}
               />
             ))}
@@ -181,7 +184,8 @@ function MoreButton({ waits, onMore }: { waits: boolean; onMore: () => void }): 
   );
 }
 
-function Row({
+/** Drawn anew only if its capture or job has changed: captures that run are told of twice a second. */
+const Row = memo(function Row({
   capture,
   job,
   selected,
@@ -193,8 +197,8 @@ function Row({
   /** The one whose scene is shown; null where none is known. */
   job: Reconstruction | null;
   selected: boolean;
-  onSelect: (wanted: boolean) => void;
-  onRemoved: () => void;
+  onSelect: (id: string, wanted: boolean) => void;
+  onRemoved: (id: string) => void;
   onRestored: () => void;
 }): JSX.Element {
   const jobs = capture.reconstruction_count;
@@ -205,7 +209,7 @@ function Row({
           type="checkbox"
           aria-label={`Select ${nameOf(capture)}`}
           checked={selected}
-          onChange={(event) => onSelect(event.target.checked)}
+          onChange={(event) => onSelect(capture.id, event.target.checked)}
         />
       </td>
       <td>
@@ -250,7 +254,7 @@ function Row({
             className="bare"
             aria-label={`Delete ${nameOf(capture)}`}
             title="Delete"
-            onClick={() => void removeWithUndo(capture, onRemoved, onRestored)}
+            onClick={() => void removeWithUndo(capture, () => onRemoved(capture.id), onRestored)}
           >
             <Icon name="trash" />
           </ActionButton>
@@ -262,7 +266,7 @@ function Row({
       </td>
     </tr>
   );
-}
+});
 
 function Thumbnail({ id }: { id: string }): JSX.Element {
   const [missing, setMissing] = useState(false);

@@ -1,13 +1,14 @@
 /** The captures that the service lists: found, filtered and sorted by it over all of them, fetched page by page. */
 
-import { useEffect, useRef, useState } from "react";
+import { useCallback, useEffect, useRef, useState } from "react";
 
 import * as calls from "../../shared/api/calls";
 import type { Capture, CaptureSort, Grade } from "../../shared/api/types";
 import type { Route } from "../../shared/state/route";
 import { errorText, useService } from "../../shared/state/store";
 
-const PAGE = 100;
+/** More than a screen shows: drawing rows takes most of the time until the list is there, and further pages come by themselves. */
+const PAGE = 40;
 /** Most that one request may ask for. */
 const MOST = 200;
 const TYPING_MS = 200;
@@ -115,6 +116,12 @@ export function useListing(q: string, filter: Filter, { sort, descending }: Orde
     };
   }, [waits, atTheTop, newest, q, filter, sort, descending]);
 
+  const again = useCallback(() => setRound((n) => n + 1), []);
+  const forget = useCallback(
+    (id: string) =>
+      setListed((old) => old && { ...old, total: old.total - 1, items: old.items.filter((one) => one.id !== id) }),
+    [],
+  );
   const more = (): void => {
     if (busy || listed?.cursor == null) return;
     const before = listed;
@@ -129,15 +136,7 @@ export function useListing(q: string, filter: Filter, { sort, descending }: Orde
       .catch((error: unknown) => setProblem(errorText(error)))
       .finally(() => setBusy(false));
   };
-  return {
-    listed,
-    problem,
-    newer: waits && !atTheTop,
-    more,
-    again: () => setRound((n) => n + 1),
-    forget: (id) =>
-      setListed((old) => old && { ...old, total: old.total - 1, items: old.items.filter((one) => one.id !== id) }),
-  };
+  return { listed, problem, newer: waits && !atTheTop, more, again, forget };
 }
 
 const isSame = (one: Wanted, other: Wanted): boolean =>

@@ -4,7 +4,7 @@ import * as calls from "../api/calls";
 import type { Capture, Message, Reconstruction } from "../api/types";
 import { ApiError } from "../api/http";
 import { progressText } from "./capture";
-import { ENDED } from "./keptJobs";
+import { ENDED, FINISHED } from "./keptJobs";
 import * as notifying from "./notifying";
 import { poses } from "./poses";
 import { adjust } from "./route";
@@ -228,6 +228,25 @@ it("keeps the last jobs that ended, and those of the shown capture, however many
   expect(Object.keys(kept)).toHaveLength(ENDED);
   expect(kept["e4999"]).toBeDefined();
   expect(kept["e0"]).toBeUndefined();
+});
+
+it("keeps the last captures that it was told of, those that run, the newest and the shown one, however many come", () => {
+  const many = Array.from({ length: 2 * FINISHED }, (_, number) =>
+    capture(`c${String(number)}`, { state: "complete" }),
+  );
+  const all = [
+    capture("running"),
+    capture("shown", { state: "complete" }),
+    capture("z", { state: "complete" }),
+    ...many,
+  ];
+  useService.setState({ captures: Object.fromEntries(all.map((one) => [one.id, one])) });
+  adjust({ capture: "shown" });
+  handleMessage(message("capture", capture("c0", { state: "complete" })));
+  const kept = useService.getState().captures;
+  expect(Object.keys(kept)).toHaveLength(FINISHED + 1);
+  for (const one of ["running", "shown", "z", "c0"]) expect(kept[one]).toBeDefined();
+  adjust({ capture: null });
 });
 
 it("stores messages about jobs that came together as one change", () => {

@@ -9,7 +9,7 @@ import type { Capture, Device, Message, Preview, Reconstruction, SceneEvent, Sys
 import { notifyOfEnd } from "./notifying";
 import { poses } from "./poses";
 import { route } from "./route";
-import { FRONT, isBehind, isEnded, tooMany } from "./keptJobs";
+import { FRONT, isBehind, isEnded, isFinished, tooMany, tooManyCaptures } from "./keptJobs";
 
 const NEWEST = 20;
 /** Polling interval of REST without a WebSocket. */
@@ -30,7 +30,7 @@ export interface ServiceState {
   /** How often everything was fetched again; what one page alone shows is fetched again with it. */
   refreshed: number;
   devices: Device[];
-  /** Known captures by id; the table of all captures asks for its own pages. */
+  /** Known captures by id, of the ended ones the last told of; the table of all captures asks for its own pages. */
   captures: Record<string, Capture>;
   /** Known reconstructions by id; of a long queue its front, and few behind it; the last ones that have ended. */
   reconstructions: Record<string, Reconstruction>;
@@ -63,10 +63,9 @@ export const useService = create<ServiceState>(() => ({
 
 const { setState: set, getState: get } = useService;
 
-export const isFinished = (capture: Capture): boolean => capture.state === "complete" || capture.state === "failed";
 /** Whether the capture still takes frames; while it only refines, its device is free. */
 export const isAcquiring = (capture: Capture): boolean => ["starting", "waiting", "streaming"].includes(capture.state);
-export { isEnded };
+export { isEnded, isFinished };
 
 /** Ids are UUIDs of version 7: the largest is the newest. */
 export function newestCapture(captures: Record<string, Capture>): Capture | null {
@@ -159,11 +158,23 @@ function merged<T extends { id: string }>(
   ]);
 }
 
+/** Without the ended captures that are too many: those told of first; never the newest, nor the one in the address. */
+function withoutManyCaptures(captures: Record<string, Capture>): Record<string, Capture> {
+  let spared: (string | null | undefined)[] | undefined;
+  const forgotten = tooManyCaptures(captures, ({ id }) => {
+    spared ??= [route().capture, newestCapture(captures)?.id];
+    return spared.includes(id) ? Infinity : (heard.get(id) ?? 0);
+  });
+  if (forgotten.size === 0) return captures;
+  for (const id of forgotten) heard.delete(id);
+  return Object.fromEntries(Object.entries(captures).filter(([id]) => !forgotten.has(id)));
+}
+
 /** Store a capture that a message, or the answer to a change, tells of. */
 export function storeCapture(capture: Capture): void {
   hear(capture.id);
   set((state) => ({
-    captures: { ...state.captures, [capture.id]: capture },
+    captures: withoutManyCaptures({ ...state.captures, [capture.id]: capture }),
     rates: measuredRates(state.rates, capture),
   }));
 }
@@ -327,7 +338,7 @@ async function tellEnd(before: Reconstruction): Promise<void> {
 export async function loadCapture(id: string): Promise<void> {
   const asked = ++clock;
   const one = await calls.capture(id);
-  set((state) => ({ captures: merged(state.captures, [one], asked, () => true) }));
+  set((state) => ({ captures: withoutManyCaptures(merged(state.captures, [one], asked, () => true)) }));
 }
 
 async function mergeReconstructions(ask: () => Promise<Reconstruction[]>): Promise<void> {

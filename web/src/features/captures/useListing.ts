@@ -90,7 +90,7 @@ export function useListing(q: string, filter: Filter, { sort, descending }: Orde
     };
     const timer = setTimeout(
       () => void fetchAll().catch((error: unknown) => current && setProblem(errorText(error))),
-      TYPING_MS,
+      now.current === null ? 0 : TYPING_MS, // nobody types before there is a list
     );
     return () => {
       current = false;

@@ -6,7 +6,7 @@ B-spline of the knots' centres. Degree 3 for smooth motion, degree 1 where motio
 """
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -67,6 +67,7 @@ class Path(Protocol):
         """Rotations [m, 3, 3] and centres [m, 3] at `times` [m] in frames."""
 
 
+@final
 @dataclass(frozen=True)
 class Waypoints:
     """Poses at increasing `times` [n] (frames), and even turns and ways from each to the next."""
@@ -89,6 +90,13 @@ class Waypoints:
         """See `Path.poses`; at rest beyond both ends."""
         at = np.clip(np.asarray(times, float), self.begin, self.end)
         return interpolate_rotations(self.times, self.rotations, at), _interpolate_linear(self.times, self.centres, at)
+
+    def bend(self, times: ArrayLike, rotation: Array, centre: Array) -> "Waypoints":
+        """The path with poses perturbed: R <- Exp(rotation) R, c <- c + centre; both [m, 3] at increasing `times` [m],
+        interpolated between them, and constant beyond."""
+        at, known = np.clip(self.times, *np.asarray(times, float)[[0, -1]]), np.asarray(times, float)
+        turns, ways = (_interpolate_linear(known, part, at) for part in (rotation, centre))
+        return replace(self, rotations=exp_so3(turns) @ self.rotations, centres=self.centres + ways)
 
 
 @dataclass

@@ -117,7 +117,9 @@ class Refinement:
         """The tracked path with its information, as the prior of the alignment."""
         odometry = self._tracker.odometry
         tracked, information = odometry.spline, odometry.information()
-        return None if tracked is None or information is None else TrajectoryPrior(tracked, information)
+        if tracked is None or information is None:
+            return None
+        return TrajectoryPrior(tracked.rotations, tracked.centres, information)
 
     @property
     def left_s(self) -> float | None:
@@ -141,6 +143,6 @@ class Refinement:
             tracking = self._time_left.tracking(tracker.odometry.long, travelled_px / now, tracker.sensor)
             travelled_px *= max(expected / now, 1.0)
         long = tracker.odometry.sparse or expected > LONG_FRAMES
-        align = options.refine_poses and tracker.given is None and not long
+        align = options.refine_poses and tracker.given is None
         plan = plan_of(self._trainer, options.steps, tracker.views.kept, travelled_px, align, long)
         return {**tracking, **plan.work(None, 0)}

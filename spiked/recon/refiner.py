@@ -9,25 +9,26 @@ from spiked.recon.mapping.pose_steps import ALIGNED_VIEWS, PoseStep
 from spiked.recon.mapping.trainer import MapTrainer
 from spiked.recon.run_progress import PROGRESS_STEPS, RunProgress
 from spiked.recon.time_left import Part, RefinementPlan, TimeLeft
-from spiked.spline import Path, Spline, Waypoints
+from spiked.spline import Path, Waypoints
 
 GRADIENT_STEPS = 100
 """Steps of a pose step that goes along the gradient, in place of one alignment."""
 
 
 def plan_of(
-    trainer: MapTrainer, most_steps: int, ids: list[int], travelled_px: float, align: bool, prune: bool
+    trainer: MapTrainer, most_steps: int, ids: list[int], travelled_px: float, align: bool, long: bool
 ) -> RefinementPlan:
     """The refinement of a map to the views `ids` of a path of so much image motion, in at most `most_steps` steps for
-    small images."""
+    small images. On a `long` path the map is pruned."""
     options, camera = trainer.options, trainer.camera
     pixels, extent = camera.width * camera.height, trainer.extent_of(travelled_px)
     fast = float(np.mean([trainer.views[i].frames.warped is not None for i in ids])) if ids else 0.0
     return RefinementPlan(
         options.schedule.steps(most_steps, pixels, fast, extent),
         len(options.seeding.order(ids, extent)) if ids else 0,
-        min(len(ids), ALIGNED_VIEWS) if align else 0,
-        min(len(ids), options.pruning.views) if prune else 0,
+        () if not align else options.schedule.align_long_at if long else options.schedule.align_at,
+        len(ids) if long else min(len(ids), ALIGNED_VIEWS),
+        min(len(ids), options.pruning.views) if long else 0,
         pixels,
         trainer.mapper.cap_of(extent),
         trainer.sensor.mosaic is not None or fast > 0.5,
@@ -44,7 +45,7 @@ class Refiner:
     ) -> None:
         """points [N, 3] are landmarks on the tracked `path`.
 
-        With a `pose_step` a path that is a spline is corrected by the map. The `clock` measures the work.
+        With a `pose_step` the path is corrected by the map. The `clock` measures the work.
         """
         self.path = path
         """The path, corrected so far."""
@@ -99,8 +100,7 @@ class Refiner:
             trainer.restart()
         trainer.reshuffle()
         ids = trainer.views.mappable(self.path)
-        align = self._pose_step is not None and isinstance(self.path, Spline)
-        plan = plan_of(trainer, most_steps, ids, trainer.views.travelled_px, align, self._prunes)
+        plan = plan_of(trainer, most_steps, ids, trainer.views.travelled_px, self._pose_step is not None, self._prunes)
         trainer.seed(self.path, self._points, trainer.options.seeding.order(ids, trainer.extent))
         if self._prunes and len(trainer.mapper):
             trainer.mapper.limit_sizes()
@@ -116,8 +116,8 @@ class Refiner:
             self._clock.lap(Part.PRUNING, work_s)
 
     def _align_if_due(self, share: float, plan: RefinementPlan) -> None:
-        due = self._schedule.alignments_due(share)
-        if due <= self.aligned or self._pose_step is None or not isinstance(self.path, Spline):
+        due = plan.alignments_due(share)
+        if due <= self.aligned or self._pose_step is None:
             return
         self.aligned = due
         ids = self._trainer.views.mappable(self.path)

@@ -17,6 +17,7 @@ from spiked.recon.mapping.mapper import LARGE_PIXELS
 from spiked.recon.mapping.options import MapOptions
 from spiked.recon.mapping.pyramid import SMALLEST_PIXELS
 from spiked.recon.odometry.keyframe_adjuster import LONG_FRAMES
+from spiked.recon.options import Options
 from spiked.sensor import Sensor
 
 REFERENCE_PIXELS = 100_000
@@ -96,8 +97,10 @@ class RefinementPlan:
 
     steps: int
     swept_views: int
+    align_at: tuple[float, ...]
+    """Shares at which the path is aligned; empty: it is not."""
     aligned_views: int
-    """Views in an alignment of the path; 0: it is not aligned."""
+    """Views in an alignment of the path."""
     pruned_views: int
     """Views in a pruning of the map; 0: it is not pruned."""
     pixels: int
@@ -146,6 +149,10 @@ class RefinementPlan:
             total += each * self.step_s(float(at), now)
         return total
 
+    def alignments_due(self, share: float) -> int:
+        """Number of alignments that should have been made when that share is done."""
+        return sum(share >= at for at in self.align_at)
+
     def aligning_s(self, splats: float) -> float:
         """Work of one alignment."""
         large = self.coloured or self.pixels > LARGE_PIXELS
@@ -161,13 +168,12 @@ class RefinementPlan:
         share = (done or 0) / max(self.steps, 1)
         if done is None:
             splats = round(SEEDED_SHARE * self.most_splats)
-        schedule, pruning = self.options.schedule, self.options.pruning
+        pruning = self.options.pruning
         full = max(self.most_splats, splats)
         return {
             Part.SEEDING: self.seeding_s() if done is None else 0.0,
             Part.STEPS: self.steps_s(done or 0, splats),
-            Part.ALIGNING: (schedule.alignments - schedule.alignments_due(share))
-            * self.aligning_s((splats + full) / 2),
+            Part.ALIGNING: (len(self.align_at) - self.alignments_due(share)) * self.aligning_s((splats + full) / 2),
             Part.PRUNING: (len(pruning.at) - pruning.due(share)) * self.pruning_s(full),
         }
 
@@ -285,7 +291,8 @@ def typical_work_s(width: int, height: int, frames: int, steps: int, options: Ma
     plan = RefinementPlan(
         options.schedule.steps(steps, pixels, 0.0, extent),
         round(options.seeding.views * extent),
-        0 if long else round(views),
+        options.schedule.align_long_at if long else (),
+        min(round(views), Options.max_views),
         options.pruning.views if long else 0,
         pixels,
         most,

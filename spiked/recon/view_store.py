@@ -93,6 +93,10 @@ class ViewStore:
         """Image motion of the whole path."""
         return self._travelled_px[-1] if self._travelled_px else 0.0
 
+    def travelled_to(self, ids: Sequence[int]) -> Array:
+        """Image motion of the path up to each of these views, in px."""
+        return np.array([self._travelled_px[view_id] for view_id in ids])
+
     @property
     def kept(self) -> list[int]:
         """Ids of the views that the map may use, in order of time."""

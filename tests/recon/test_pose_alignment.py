@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import spiked.native._dense as _dense
 
-from spiked.pose import exp_so3, log_so3
-from spiked.recon.mapping.pose_alignment import TrajectoryPrior, ViewNormals, marginalise_landmarks
+from spiked.pose import Array, exp_so3, log_so3
+from spiked.recon.mapping.pose_alignment import DRIFT_PX, TrajectoryPrior, ViewNormals, marginalise_landmarks
 from spiked.render import Camera
 from spiked.sensor import Intrinsics
-from spiked.spline import Spline
+from spiked.spline import Spline, Waypoints
 
 CAMERA = Camera(Intrinsics(150.0, 152.0, 79.0, 51.0), 160, 100)
 NORMAL, OFFSET = np.array([0.15, -0.1, 1.0]), 2.0
@@ -117,7 +117,9 @@ def test_the_path_is_found_although_every_place_of_the_map_has_moved() -> None:
         whole += jacobian.T @ jacobian
         right += jacobian.T @ error
 
-    square, gradient = marginalise_landmarks(sums, first, shares, 9)
+    by_view, slope = marginalise_landmarks(sums)
+    basis = np.kron(spline.basis_matrix(times), np.eye(6))
+    square, gradient = basis.T @ by_view @ basis, slope @ basis
     held = np.linalg.norm(np.linalg.solve(whole[:54, :54], -right[:54]).reshape(9, 6) - moved)
     freed = np.linalg.norm(np.linalg.solve(square, -gradient).reshape(9, 6) - moved)
     assert held > 0.5  # a map taken to be right misleads
@@ -129,25 +131,21 @@ def test_the_path_is_found_although_every_place_of_the_map_has_moved() -> None:
 
 def test_places_are_taken_out_a_few_at_a_time_with_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(2)
-    spline = still(7)
-    first, shares = spline.locate(np.linspace(spline.begin, spline.end - 1e-6, 9))
     sums = []
-    for _ in first:
+    for _ in range(9):
         rows = rng.normal(0, 1, (30, 8, 10))
         keys = rng.choice(50, 30, replace=False).astype(np.int64)
         blocks = np.einsum("pri,prj->pij", rows[:, :, :3], rows)
         sums.append(ViewNormals(np.einsum("pri,prj->ij", rows[:, :, 3:9], rows[:, :, 3:]), keys, blocks, 1.0))
-    at_once = marginalise_landmarks(sums, first, shares, 7)
-    monkeypatch.setattr("spiked.recon.mapping.pose_alignment.CHUNK_FLOATS", 18 * 7 * 4)
-    for one, other in zip(at_once, marginalise_landmarks(sums, first, shares, 7), strict=True):
+    at_once = marginalise_landmarks(sums)
+    monkeypatch.setattr("spiked.recon.mapping.pose_alignment.GROUP_LANDMARKS", 7)
+    for one, other in zip(at_once, marginalise_landmarks(sums), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(one).max())
 
 
 def test_views_that_show_nothing_say_nothing() -> None:
-    spline = still(6)
-    first, shares = spline.locate(np.array([spline.begin, spline.end - 1e-6]))
     nothing = ViewNormals(np.zeros((6, 7)), np.zeros(0, np.int64), np.zeros((0, 3, 10)), 0.0)
-    square, gradient = marginalise_landmarks([nothing, nothing], first, shares, 6)
+    square, gradient = marginalise_landmarks([nothing, nothing])
     assert not square.any()
     assert not gradient.any()
 
@@ -156,10 +154,34 @@ def test_what_was_known_pulls_a_path_back() -> None:
     rng = np.random.default_rng(3)
     spline = still(5)
     root = rng.normal(0, 1, (30, 30))
-    known = TrajectoryPrior(spline, root @ root.T)
+    known = TrajectoryPrior(spline.rotations, spline.centres, root @ root.T)
     step = rng.normal(0, 1e-3, (5, 6))
     other = spline.move(step[:, :3], step[:, 3:])
     np.testing.assert_allclose(log_so3(other.rotations), step[:, :3], atol=1e-9)
-    back = np.linalg.solve(known.information, -known.gradient(other)).reshape(5, 6)
+    back = np.linalg.solve(known.information, -known.gradient(other.rotations, other.centres)).reshape(5, 6)
     np.testing.assert_allclose(back, -step, atol=1e-8)
-    assert not known.gradient(spline).any()
+    assert not known.gradient(spline.rotations, spline.centres).any()
+
+
+def test_drift_may_grow_along_a_path_but_not_jump() -> None:
+    moved_px = np.array([4.0, 9.0, 0.0, 4.0])
+    poses = np.tile(np.eye(3), (5, 1, 1)), np.zeros((5, 3))
+    known = TrajectoryPrior.drifting(*poses, moved_px, rad=1e-3, depth=2.0)
+
+    def energy(centres: Array) -> float:
+        return 0.5 * float(known.gradient(poses[0], centres) @ np.concatenate([np.zeros((5, 3)), centres], 1).ravel())
+
+    along = np.array([0.0, 1.0, 2.0, 2.0, 3.0])[:, None] * np.array([1e-5, 0, 0])
+    assert energy(np.full((5, 3), 1e-3)) == pytest.approx(0.0, abs=1e-9)  # the frame of reference is free
+    deviation = DRIFT_PX * 1e-3 * 2.0
+    assert energy(along) == pytest.approx(0.5 * (1e-5 / deviation) ** 2 * (1 / 4 + 1 / 9 + 1 / 4))
+    assert energy(along[[0, 2, 1, 3, 4]]) > 2 * energy(along)
+
+
+def test_waypoints_are_bent_as_the_views_say() -> None:
+    path = Waypoints(np.array([0.0, 10.0, 20.0, 30.0]), np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 3)))
+    turns, ways = np.array([[0, 0, 0.2], [0, 0, 0.4]]), np.array([[0, 1.0, 0], [0, 3.0, 0]])
+    bent = path.bend([10.0, 20.0], turns, ways)
+    np.testing.assert_allclose(log_so3(bent.rotations)[:, 2], [0.2, 0.2, 0.4, 0.4], atol=1e-12)
+    np.testing.assert_allclose(bent.centres[:, 1], [1, 1, 3, 3])
+    np.testing.assert_allclose(path.bend([0.0, 30.0], turns, ways).centres[:, 1], [1, 5 / 3, 7 / 3, 3])

@@ -9,13 +9,16 @@ import pytest
 from spiked_service.results.recording_feed import reconstruct_recording
 
 from spiked.recon import MapOptions, Options, Reconstructor, Status
+from spiked.recon.mapping.schedule import Schedule
 from spiked.recon.time_left import LONG_END, Pace, Part, RefinementPlan, TimeLeft, typical_work_s
 from spiked.recording import RecordingWriter, open_recording
 from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
 
 SENSOR = Sensor(160, 104, 20_000.0, intrinsics=Intrinsics.from_fov(160, 104, 60))
-PLAN = RefinementPlan(1000, 11, 80, 0, 100_000, 80_000, coloured=False, options=MapOptions(), threads=2)
+PLAN = RefinementPlan(
+    1000, 11, Schedule.align_at, 80, 0, 100_000, 80_000, coloured=False, options=MapOptions(), threads=2
+)
 
 
 def test_a_pace_follows_other_programs_that_come() -> None:
@@ -45,6 +48,8 @@ def test_what_is_done_is_not_left() -> None:
     assert before[Part.SEEDING] > 0 == begun[Part.SEEDING]
     assert begun[Part.ALIGNING] == pytest.approx(5 * PLAN.aligning_s(54_000))
     assert set(ended.values()) == {0.0}
+    due = [PLAN.alignments_due(share) for share in (0.0, 0.13, 0.3, 0.69, 0.7, 1.0)]
+    assert due == [0, 0, 2, 4, 5, 5]
     assert all(part[Part.PRUNING] == 0 for part in (before, begun, ended)), "short paths are not pruned"
 
 

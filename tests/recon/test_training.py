@@ -30,8 +30,6 @@ def test_a_schedule_ends_at_full_size_with_rates_of_zero() -> None:
     assert rates[0] == 1 and rates[-1] == 0 and rates == sorted(rates, reverse=True)
     coarse = [schedule.coarseness(share) for share in shares]
     assert coarse[0] == 1 and coarse == sorted(coarse, reverse=True) and coarse[60] == pytest.approx(0) == coarse[-1]
-    due = [schedule.alignments_due(share) for share in shares]
-    assert due[0] == 0 and due == sorted(due) and due[71] == due[-1] == schedule.alignments
     steps = [schedule.alignment_step(number) for number in (1, 2, 3)]
     assert steps == [1, 2 / 3, 1 / 2]
 

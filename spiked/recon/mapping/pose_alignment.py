@@ -1,4 +1,5 @@
-"""Dense alignment of the whole path with the map: one Gauss-Newton step over all views, in the knots of the spline.
+"""Dense alignment of the whole path with the map: one Gauss-Newton step over all views, in the knots of a spline, or in
+the poses of the views where the path is interpolated between them.
 
 Each view is rendered with its depth. The image gradient of the render gives the derivative of each pixel with respect
 to the pose (forward-additive direct method) and to the landmark that it sees. The map is as uncertain as its
@@ -6,8 +7,9 @@ path, so landmarks are free and marginalised like the points of a bundle adjustm
 the path is a prior. Basis weights map the blocks of the views to the knots.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -21,12 +23,14 @@ from spiked.recon.mapping.frame_warp import FrameWarp
 from spiked.recon.mapping.mapper import Mapper
 from spiked.recon.mapping.pyramid import Level
 from spiked.recon.mapping.render_requests import RenderPlanner, RenderRequest
-from spiked.recon.odometry.normal_equations import marginalise
 from spiked.recon.statistics import median
 from spiked.render.charge import WARP_CELL_PX
 from spiked.render.splats import RenderedImage
 from spiked.sensor import Image
-from spiked.spline import Spline
+from spiked.spline import Spline, Waypoints
+
+Index = NDArray[np.int64]
+Aligned = TypeVar("Aligned", Spline, Waypoints)
 
 LANDMARK_PX = 16
 """Approximate width of a landmark in the image: all pixels in its cube of space share its three coordinates. Half and
@@ -37,8 +41,11 @@ GRADIENT_QUANTILE = 0.7
 """Quantile of the gradient magnitude below which pixels are left out."""
 KNOT_DAMPING = 1e-3
 """Damping of each knot, relative to its information; 0.02 is worse (decision 13)."""
-CHUNK_FLOATS = 4_000_000
-"""Floats held at once while landmarks are marginalised."""
+GROUP_LANDMARKS = 64
+"""Landmarks marginalised at once: fewer cost more calls, more are seen by more views, the square of which counts."""
+DRIFT_PX = 3.5e-3
+"""Error of a long path after 1 px of image motion, in px; it grows with the root of the motion. Three times as much or
+a third makes no difference (docs/decisions/0058-long-paths-aligned-with-the-map.md)."""
 MIN_ALPHA = 0.9
 """Coverage of the pixels that are compared."""
 EDGE_PX = 2
@@ -50,47 +57,70 @@ units of this standard deviation."""
 
 @dataclass(frozen=True)
 class TrajectoryPrior:
-    """The tracked path and its information matrix, a Gaussian prior for the alignment."""
+    """The tracked path and its information matrix, a Gaussian prior for the alignment.
 
-    spline: Spline
+    The path is given by P poses: knots of a spline, or poses at views.
+    """
+
+    rotations: Array
+    """[P, 3, 3]"""
+    centres: Array
+    """[P, 3]"""
     information: Array
-    """[6 knots, 6 knots], inverse covariance of (rotation vector on the left, centre)."""
+    """[6 P, 6 P], inverse covariance of (rotation vector on the left, centre)."""
 
-    def gradient(self, other: Spline) -> Array:
-        """Gradient [6 knots] of the prior's energy at another path with the same knots."""
-        turned = log_so3(other.rotations @ self.spline.rotations.swapaxes(1, 2))
-        apart = np.concatenate([turned, other.centres - self.spline.centres], 1)
-        return np.asarray(self.information @ apart.ravel())
+    @classmethod
+    def drifting(cls, rotations: Array, centres: Array, moved_px: Array, rad: float, depth: float) -> "TrajectoryPrior":
+        """A path whose error is a random walk with the image motion `moved_px` [P - 1] from each pose to the next.
+
+        `rad` is the angle of a pixel, and `depth` that of the scene.
+        """
+        steps = np.diff(np.eye(len(centres)), axis=0)
+        deviation = DRIFT_PX * rad * np.array([1, 1, 1, depth, depth, depth])
+        walk = (steps.T / np.maximum(moved_px, 1.0)) @ steps
+        return cls(rotations, centres, np.asarray(np.kron(walk, np.diag(1 / deviation**2)), np.float64))
+
+    def gradient(self, rotations: Array, centres: Array) -> Array:
+        """Gradient [6 P] of the prior's energy at other poses."""
+        turned = log_so3(rotations @ self.rotations.swapaxes(1, 2))
+        return np.asarray(self.information @ np.concatenate([turned, centres - self.centres], 1).ravel())
 
 
-def align_spline(
-    spline: Spline,
+def align(
+    path: Aligned,
     times: Sequence[float],
     views: Iterable[tuple[int, View]],
     mapper: Mapper,
     planner: RenderPlanner,
     known: TrajectoryPrior | None = None,
     share: float = 1.0,
-) -> Spline:
-    """One Gauss-Newton step of the spline towards agreement of the map and views at `times`, given with ids.
+) -> Aligned:
+    """One Gauss-Newton step of a path towards agreement of the map and views at `times`, given with ids.
 
-    `known` is a prior on a spline with the same knots. `share` of the step is taken.
+    A spline moves by its knots, waypoints by the poses at `times`; `known` is a prior on these. `share` of the step is
+    taken.
     """
     pixel = mapper.alignment_level.factor
     sums = []
-    for (key, view), rotation, centre in zip(views, *spline.poses(times), strict=True):
-        sums.append(_view_normals(key, view, planner.request(view, spline, pixel), rotation, centre, mapper))
-    square, gradient = marginalise_landmarks(sums, *spline.locate(np.array(times)), len(spline.centres))
+    for (key, view), rotation, centre in zip(views, *path.poses(times), strict=True):
+        sums.append(_view_normals(key, view, planner.request(view, path, pixel), rotation, centre, mapper))
     variance = float(np.mean([s.variance for s in sums]))
     if not variance:  # no view has a valid pixel
-        return spline
-    square, gradient = square / variance, gradient / variance
+        return path
+    square, gradient = (part / variance for part in marginalise_landmarks(sums))
+    rotations, centres = path.poses(times)
+    if isinstance(path, Spline):
+        rotations, centres = path.rotations, path.centres
+        basis = np.kron(path.basis_matrix(times), np.eye(6))
+        square, gradient = basis.T @ square @ basis, gradient @ basis
     if known is not None:
-        square, gradient = square + known.information, gradient + known.gradient(spline)
+        square, gradient = square + known.information, gradient + known.gradient(rotations, centres)
     diagonal = np.diag(square).copy()
     square[np.diag_indices(len(square))] += KNOT_DAMPING * diagonal + 1e-6 * diagonal.max()
     step = np.asarray(-share * np.linalg.solve(square, gradient).reshape(-1, 6), np.float64)
-    return spline.move(step[:, :3], step[:, 3:])
+    if isinstance(path, Spline):
+        return path.move(step[:, :3], step[:, 3:])
+    return path.bend(times, step[:, :3], step[:, 3:])
 
 
 @dataclass(frozen=True)
@@ -103,40 +133,48 @@ class ViewNormals:
     variance: float  # of an error
 
 
-def marginalise_landmarks(
-    sums: list[ViewNormals], first: NDArray[np.int64], shares: Array, knots: int
-) -> tuple[Array, Array]:
-    """Hessian [6 knots, 6 knots] and gradient [6 knots] with all landmarks marginalised (Schur complement).
-
-    The pose of each view blends the knots from `first` [views] on with the weights `shares` [views, degree + 1].
-    """
-    hessian, gradient = np.zeros((knots, 6, knots, 6)), np.zeros((knots, 6))
-    for s, at, share in zip(sums, first, shares, strict=True):
-        used = slice(at, at + len(share))
-        hessian[used, :, used] += np.einsum("a,ij,b->aibj", share, s.pose[:, :6], share)
-        gradient[used] += share[:, None] * s.pose[:, 6]
-    square, right = hessian.reshape(6 * knots, 6 * knots), gradient.ravel()
-    if not any(len(s.keys) for s in sums):
-        return square, right
+def marginalise_landmarks(sums: list[ViewNormals]) -> tuple[Array, Array]:
+    """Hessian [6 V, 6 V] and gradient [6 V] by the poses of V views, all landmarks marginalised (Schur complement)."""
+    count = len(sums)
+    hessian, gradient = np.zeros((count, 6, count, 6)), np.zeros((count, 6))
+    for view, s in enumerate(sums):
+        hessian[view, :, view], gradient[view] = s.pose[:, :6], s.pose[:, 6]
+    square, right = hessian.reshape(6 * count, 6 * count), gradient.ravel()
     names, number = np.unique(np.concatenate([s.keys for s in sums]), return_inverse=True)
-    numbers = np.split(number, np.cumsum([len(s.keys) for s in sums])[:-1])
+    if not len(names):
+        return square, right
+    seen_by = np.repeat(np.arange(count), [len(s.keys) for s in sums])
+    places = np.concatenate([s.places for s in sums])
     own = np.zeros((len(names), 3, 4))  # Hessian and gradient of each landmark
-    for s, n in zip(sums, numbers, strict=True):
-        own[n] += s.places[:, :, [0, 1, 2, 9]]
+    np.add.at(own, number, places[:, :, [0, 1, 2, 9]])
     trace = np.trace(own[:, :, :3], axis1=1, axis2=2) / 3
     damping = LANDMARK_DAMPING * trace + LANDMARK_DAMPING_FLOOR * median(trace)
     roots = np.linalg.inv(np.linalg.cholesky(own[:, :, :3] + damping[:, None, None] * np.eye(3)))
-    chunk = max(1, CHUNK_FLOATS // (18 * knots))
-    for begin in range(0, len(names), chunk):
-        taken = slice(begin, min(begin + chunk, len(names)))
-        cross = np.zeros((taken.stop - begin, 3, knots, 6))
-        for s, n, at, share in zip(sums, numbers, first, shares, strict=True):
-            here = (n >= begin) & (n < taken.stop)
-            cross[n[here] - begin, :, at : at + len(share)] += s.places[here, :, None, 3:9] * share[None, None, :, None]
-        eliminated = (roots[taken] @ cross.reshape(len(cross), 3, -1)).reshape(-1, 6 * knots)
-        whitened_gradient = (roots[taken] @ own[taken, :, 3:]).ravel()
-        square, right = marginalise(square, right, eliminated, whitened_gradient)
+    whitened = np.einsum("lij,lj->li", roots, own[:, :, 3])
+    for landmarks, rows in _groups(number, seen_by, len(names)):
+        views, column = np.unique(seen_by[rows], return_inverse=True)
+        block = np.zeros((len(landmarks), 3, len(views), 6))
+        block[np.searchsorted(landmarks, number[rows]), :, column] = roots[number[rows]] @ places[rows, :, 3:9]
+        flat = block.reshape(3 * len(landmarks), 6 * len(views))
+        at = (6 * views[:, None] + np.arange(6)).ravel()
+        square[np.ix_(at, at)] -= flat.T @ flat
+        right[at] -= whitened[landmarks].ravel() @ flat
     return square, right
+
+
+def _groups(number: Index, seen_by: Index, count: int) -> Iterator[tuple[Index, Index]]:
+    """`count` landmarks in groups that few views see: the landmarks, ascending, and the rows of what they were seen in.
+
+    number [n] and seen_by [n] are the landmark and the view of each row; views ascend.
+    """
+    by_landmark = np.argsort(number, kind="stable")
+    ends = np.cumsum(np.bincount(number, minlength=count))
+    begins = np.append(0, ends[:-1])
+    first, last = seen_by[by_landmark[begins]], seen_by[by_landmark[ends - 1]]
+    order = np.lexsort((last, first))
+    for begin in range(0, count, GROUP_LANDMARKS):
+        landmarks = np.sort(order[begin : begin + GROUP_LANDMARKS])
+        yield landmarks, np.concatenate([by_landmark[begins[one] : ends[one]] for one in landmarks])
 
 
 def _view_normals(

@@ -7,13 +7,13 @@ from typing import Protocol
 import numpy as np
 
 from spiked.pose import Array
-from spiked.recon.mapping.pose_alignment import TrajectoryPrior, align_spline, pose_curvature
+from spiked.recon.mapping.pose_alignment import TrajectoryPrior, align, pose_curvature
 from spiked.recon.mapping.trainer import MapTrainer, ViewRender
 from spiked.sensor import Image
-from spiked.spline import Spline
+from spiked.spline import Path, Spline, Waypoints
 
 ALIGNED_VIEWS = 160
-"""Most views of an alignment."""
+"""Most views of an alignment of a spline; of a path that is interpolated between views it is all that are kept."""
 APART_FRAMES = 32.0
 """Frames between the two renders whose difference is compared, n of the paper (Eq 6)."""
 STEP_SHARES = 0.3, 0.05
@@ -31,26 +31,38 @@ CURVATURE_DAMPING = 1e-3
 class PoseStep(Protocol):
     """Corrects a path."""
 
-    def improve(self, path: Spline, ids: Sequence[int], steps: int, share: float) -> Spline:
+    def improve(self, path: Path, ids: Sequence[int], steps: int, share: float) -> Path:
         """The path after about `steps` steps on the views `ids`; `share` of the refinement is done."""
 
 
 @dataclass
 class GaussNewton:
-    """One damped step of `align_spline` over all views, whatever the number of steps."""
+    """One step of `align` over all views, whatever the number of steps."""
 
     trainer: MapTrainer
     prior: TrajectoryPrior | None = None
+    """On the knots of a spline."""
     taken: int = 0
-    """Number of steps so far: each is shorter than the one before, see `Schedule.alignment_step`."""
+    """Number of steps so far: each of a spline is shorter than the one before, see `Schedule.alignment_step`."""
+    _tracked: Waypoints | None = None
+    """The tracked path where it is interpolated between views."""
 
-    def improve(self, path: Spline, ids: Sequence[int], steps: int, share: float) -> Spline:
+    def improve(self, path: Path, ids: Sequence[int], steps: int, share: float) -> Path:
         """See `PoseStep.improve`."""
         del steps, share
         self.taken += 1
-        ids, trainer = ids[:: -(-len(ids) // ALIGNED_VIEWS)], self.trainer
-        times, part = [trainer.views[i].time for i in ids], trainer.options.schedule.alignment_step(self.taken)
-        return align_spline(path, times, trainer.views.images(ids), trainer.mapper, trainer.planner, self.prior, part)
+        trainer = self.trainer
+        mapper, planner = trainer.mapper, trainer.planner
+        if isinstance(path, Spline):
+            ids = ids[:: -(-len(ids) // ALIGNED_VIEWS)]
+            times, part = [trainer.views[i].time for i in ids], trainer.options.schedule.alignment_step(self.taken)
+            return align(path, times, trainer.views.images(ids), mapper, planner, self.prior, part)
+        assert isinstance(path, Waypoints)
+        self._tracked = tracked = self._tracked or path
+        times, moved_px = [trainer.views[i].time for i in ids], np.diff(trainer.views.travelled_to(ids))
+        rad = 1 / trainer.camera.intrinsics.fx
+        known = TrajectoryPrior.drifting(*tracked.poses(times), moved_px, rad, planner.depth)
+        return align(path, times, trainer.views.images(ids), mapper, planner, known)
 
 
 class PoseGradient:
@@ -74,8 +86,10 @@ class PoseGradient:
         self._slope = np.zeros((0, 6))
         self._curvature = np.zeros((0, 6, 6))
 
-    def improve(self, path: Spline, ids: Sequence[int], steps: int, share: float) -> Spline:
-        """See `PoseStep.improve`; each step is on one view of a random order."""
+    def improve(self, path: Path, ids: Sequence[int], steps: int, share: float) -> Path:
+        """See `PoseStep.improve`; each step is on one view of a random order. A path that is no spline stays."""
+        if not isinstance(path, Spline):
+            return path
         order: list[int] = []
         for _ in range(steps):
             order = order or [int(i) for i in self._rng.permutation(ids)]

@@ -13,10 +13,10 @@ class Schedule:
     """Decimal powers by which all learning rates fall (decision 3)."""
     settling_share: float = 0.15
     """Last share, in which the rates fall to zero: otherwise the map follows the last views' noise (decision 3)."""
-    alignments: int = 5
-    """Alignments of the whole path with the map (decision 13)."""
-    aligned_share: float = 0.7
-    """Share with alignments; the path is fixed after it (decision 13)."""
+    align_at: tuple[float, ...] = (0.14, 0.28, 0.42, 0.56, 0.7)
+    """Shares at which the whole path is aligned with the map; it is fixed after the last (decision 13)."""
+    align_long_at: tuple[float, ...] = (0.6, 0.7, 0.8)
+    """The same of a path that is interpolated between views: images have their full size by then (decision 58)."""
     small_pixels: int = 130_000
     """Images up to this size get the full number of steps."""
     large_power: float = 0.4
@@ -50,10 +50,6 @@ class Schedule:
     def rate(self, share: float) -> float:
         """Factor on all learning rates."""
         return float(10 ** (-self.rate_decades * share) * min(1.0, (1 - share) / self.settling_share))
-
-    def alignments_due(self, share: float) -> int:
-        """Number of alignments that should have been made."""
-        return min(self.alignments, int(self.alignments * share / self.aligned_share))
 
     def alignment_step(self, number: int) -> float:
         """Share of the full Gauss-Newton step for alignment `number`, from 1 on.

@@ -17,7 +17,6 @@ from spiked.recon.mapping.mapper import LARGE_PIXELS
 from spiked.recon.mapping.options import MapOptions
 from spiked.recon.mapping.pyramid import SMALLEST_PIXELS
 from spiked.recon.odometry.keyframe_adjuster import LONG_FRAMES
-from spiked.recon.options import Options
 from spiked.sensor import Sensor
 
 REFERENCE_PIXELS = 100_000
@@ -60,6 +59,8 @@ TYPICAL_SPEED_PX = 0.0173
 """Image motion a frame of a hand-held camera: the walk's 3,460 px in 200,000 frames. For recordings that wait."""
 TYPICAL_VIEW_FRAMES = 20
 """Frames a view of a path that is not long: living has 78 views in 1,280 frames."""
+TYPICAL_KEPT = 400
+"""Views that are kept for the map, at most, by default."""
 
 
 class Part(StrEnum):
@@ -292,7 +293,7 @@ def typical_work_s(width: int, height: int, frames: int, steps: int, options: Ma
         options.schedule.steps(steps, pixels, 0.0, extent),
         round(options.seeding.views * extent),
         options.schedule.align_long_at if long else (),
-        min(round(views), Options.max_views),
+        min(round(views), TYPICAL_KEPT),
         options.pruning.views if long else 0,
         pixels,
         most,

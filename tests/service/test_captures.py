@@ -222,9 +222,9 @@ def test_states_are_updated_again_after_the_catalogue_could_not_be_read(
 ) -> None:
     random_recording(tmp_path / "noise.dat", 100)
     capture_id = data_store.captures.start(recorded_only(f"replay:{tmp_path / 'noise.dat'}?repeat=10000")).id
-    read, ticks = data_store.catalogue.job_ids, 0
+    read, ticks = data_store.catalogue.newest_jobs, 0
 
-    def fails_once(*asked: Any) -> list[str]:
+    def fails_once(*asked: Any) -> Any:
         nonlocal ticks
         if threading.current_thread().name == "counters":
             ticks += 1
@@ -232,7 +232,7 @@ def test_states_are_updated_again_after_the_catalogue_could_not_be_read(
                 raise StoreError("the catalogue cannot be read: disk I/O error")
         return read(*asked)
 
-    monkeypatch.setattr(data_store.catalogue, "job_ids", fails_once)
+    monkeypatch.setattr(data_store.catalogue, "newest_jobs", fails_once)
     until(lambda: ticks > 2, "the thread that updates the states continues")
     data_store.captures.stop(capture_id)
     assert over(data_store, capture_id).row.state is CaptureState.COMPLETE

@@ -32,19 +32,21 @@ export function RerunPanel({
   const schema = useFetch("options", calls.optionSchema);
   const devices = useService((state) => state.devices);
   const [from, setFrom] = useState("");
-  const [poses, setPoses] = useState<{ name: string; text: string; every: number } | null>(null);
+  const [file, setFile] = useState<File | null>(null);
+  const [every, setEvery] = useState(1);
   const [calibration, setCalibration] = useState("");
   const paths = jobs.filter((one) => one.version > 0 && one.poses > 1);
 
-  const read = async (file: File | undefined): Promise<void> => {
-    setPoses(null);
-    if (file !== undefined) await attempt(async () => setPoses({ name: file.name, ...thinned(await file.text()) }));
+  const choose = async (chosen: File | null): Promise<void> => {
+    setFile(chosen);
+    setEvery(1);
+    if (chosen !== null) await attempt(async () => setEvery(thinned(await chosen.text()).every));
   };
   const submit = async (values: OptionValues): Promise<void> => {
     await attempt(async () => {
-      if (from === FILE && poses === null) throw new Error("Choose the TUM file with the poses.");
+      if (from === FILE && file === null) throw new Error("Choose the TUM file with the poses.");
       await onSubmit(textAsLens(values), {
-        poses: from === FILE ? (poses?.text ?? null) : null,
+        poses: from === FILE && file !== null ? thinned(await file.text()).text : null,
         poses_of: from === FILE || from === "" ? null : from,
         calibration_of: calibration === "" ? null : calibration,
       });
@@ -84,7 +86,7 @@ export function RerunPanel({
                   <>
                     Lines <code>time x y z qx qy qz qw</code>, camera to world, in seconds since the start of the
                     capture.
-                    {poses !== null && poses.every > 1 && ` Every ${poses.every}th pose of ${poses.name} is sent.`}
+                    {file !== null && every > 1 && ` Every ${every}th pose of ${file.name} is sent.`}
                   </>
                 }
               >
@@ -93,7 +95,7 @@ export function RerunPanel({
                     {...called}
                     type="file"
                     accept=".tum,.txt"
-                    onChange={(event) => void read(event.target.files?.[0])}
+                    onChange={(event) => void choose(event.target.files?.[0] ?? null)}
                   />
                 )}
               </Labelled>

@@ -120,9 +120,7 @@ class Reconstructions:
         Raises UnknownIdError, BusyError for a map that is not finished, StoreError, and ConfigurationError for a
         capture without a recording, what is no map, another camera whose lens is not known, poses that are no path.
         """
-        made = (new_id(), capture_id, False, JobState.QUEUED, datetime.now(UTC), options or ReconstructionOptions())
-        maps = tuple(MapRef(map_id) for map_id in map_ids)
-        row = ReconstructionRow(*made, priority, task=task, maps=maps, part=part, user=user)
+        row = _queued(capture_id, options, priority, task, map_ids, part, user)
         try:
             # Before the lock: a path of a minute is a large file, and captures that begin and end wait for the lock.
             row = (given or Given()).put(row, self._folder, self.rows, self._catalogue.captures.get(capture_id))
@@ -338,3 +336,27 @@ class Reconstructions:
         if row.state is JobState.QUEUED:
             self._least_poses[row.id] = row.poses
         return row
+
+
+def _queued(
+    capture_id: str,
+    options: ReconstructionOptions | None,
+    priority: int,
+    task: Task,
+    map_ids: Sequence[str],
+    part: FrameRange | None,
+    user: str,
+) -> ReconstructionRow:
+    return ReconstructionRow(
+        new_id(),
+        capture_id,
+        False,
+        JobState.QUEUED,
+        datetime.now(UTC),
+        options=options or ReconstructionOptions(),
+        priority=priority,
+        task=task,
+        maps=tuple(MapRef(map_id) for map_id in map_ids),
+        part=part,
+        user=user,
+    )

@@ -32,21 +32,25 @@ export function RerunPanel({
   const schema = useFetch("options", calls.optionSchema);
   const devices = useService((state) => state.devices);
   const [from, setFrom] = useState("");
-  const [file, setFile] = useState<File | null>(null);
-  const [every, setEvery] = useState(1);
+  const [poses, setPoses] = useState<Promise<ReturnType<typeof thinned>> | null>(null);
+  const [thinning, setThinning] = useState("");
   const [calibration, setCalibration] = useState("");
   const paths = jobs.filter((one) => one.version > 0 && one.poses > 1);
 
-  const choose = async (chosen: File | null): Promise<void> => {
-    setFile(chosen);
-    setEvery(1);
-    if (chosen !== null) await attempt(async () => setEvery(thinned(await chosen.text()).every));
+  const choose = async (file: File | undefined): Promise<void> => {
+    const read = file === undefined ? null : file.text().then((text) => thinned(text));
+    setPoses(read);
+    setThinning("");
+    await attempt(async () => {
+      const every = (await read)?.every ?? 1;
+      if (file !== undefined && every > 1) setThinning(` Every ${every}th pose of ${file.name} is sent.`);
+    });
   };
   const submit = async (values: OptionValues): Promise<void> => {
     await attempt(async () => {
-      if (from === FILE && file === null) throw new Error("Choose the TUM file with the poses.");
+      if (from === FILE && poses === null) throw new Error("Choose the TUM file with the poses.");
       await onSubmit(textAsLens(values), {
-        poses: from === FILE && file !== null ? thinned(await file.text()).text : null,
+        poses: from === FILE && poses !== null ? (await poses).text : null,
         poses_of: from === FILE || from === "" ? null : from,
         calibration_of: calibration === "" ? null : calibration,
       });
@@ -86,7 +90,7 @@ export function RerunPanel({
                   <>
                     Lines <code>time x y z qx qy qz qw</code>, camera to world, in seconds since the start of the
                     capture.
-                    {file !== null && every > 1 && ` Every ${every}th pose of ${file.name} is sent.`}
+                    {thinning}
                   </>
                 }
               >
@@ -95,7 +99,7 @@ export function RerunPanel({
                     {...called}
                     type="file"
                     accept=".tum,.txt"
-                    onChange={(event) => void choose(event.target.files?.[0] ?? null)}
+                    onChange={(event) => void choose(event.target.files?.[0])}
                   />
                 )}
               </Labelled>

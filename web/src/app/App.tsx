@@ -1,23 +1,18 @@
 /** Navigation, connection status and the current page. */
 
-import { type JSX, lazy, Suspense, useEffect, useState } from "react";
+import { type JSX, useEffect, useState } from "react";
 
 import { UploadBar } from "../features/captures/UploadBar";
-import { LivePage } from "../features/live/LivePage";
 import { go, type PageName, useRoute } from "../shared/state/route";
 import { follow, useService } from "../shared/state/store";
 import { choose, type Theme, useTheme } from "../shared/state/theme";
 import { Icon, type IconName } from "../shared/ui/icons";
 import { PageLink } from "../shared/ui/PageLink";
-import { Loading } from "../shared/ui/parts";
 import { Toasts } from "../shared/ui/Toasts";
 import { ErrorBoundary } from "./ErrorBoundary";
 import { Help } from "./Help";
+import { Page } from "./Page";
 import { SignIn } from "./SignIn";
-
-const ScenePage = lazy(() => import("../features/scene/ScenePage").then((m) => ({ default: m.ScenePage })));
-const CapturesPage = lazy(() => import("../features/captures/CapturesPage").then((m) => ({ default: m.CapturesPage })));
-const SetupPage = lazy(() => import("../features/setup/SetupPage").then((m) => ({ default: m.SetupPage })));
 
 const TABS: readonly { page: PageName; label: string; icon: IconName; key: string }[] = [
   { page: "live", label: "Live", icon: "live", key: "1" },
@@ -107,12 +102,7 @@ export function App(): JSX.Element {
           <SignIn />
         ) : (
           <ErrorBoundary key={page}>
-            <Suspense fallback={<Loading what="the page" />}>
-              {page === "live" && <LivePage />}
-              {page === "scene" && <ScenePage />}
-              {page === "captures" && <CapturesPage />}
-              {page === "setup" && <SetupPage />}
-            </Suspense>
+            <Page name={page} />
           </ErrorBoundary>
         )}
       </main>

@@ -8,7 +8,7 @@ import type { Route } from "../../shared/state/route";
 import { errorText, useService } from "../../shared/state/store";
 
 /** More than a screen shows: drawing rows takes most of the time until the list is there, and further pages come by themselves. */
-const PAGE = 40;
+const PAGE = 25;
 /** Most that one request may ask for. */
 const MOST = 200;
 const TYPING_MS = 200;

@@ -160,7 +160,7 @@ class Exports:
         )
 
     def _make(self, command: ExportCommand | VideoCommand, request: Request) -> None:
-        """Run the worker to its end. Raises OverloadedError, DiskFullError and ConfigurationError."""
+        """Run the worker to its end. Raises OverloadedError, also if it dies, DiskFullError and ConfigurationError."""
         if not self._making.acquire(blocking=False):
             raise OverloadedError("another export is being made; try again when it is ready")
         try:
@@ -186,7 +186,7 @@ class Exports:
 
         def on_exit(reason: str | None) -> None:
             if reason is not None:
-                errors.append(ConfigurationError(reason))
+                errors.append(OverloadedError(f"the export has not come to its end: {reason}"))
             ended.set()
 
         worker = WorkerProcess(command, self._folder.path / "exports.log", on_event, on_exit)
@@ -202,6 +202,7 @@ class Exports:
                 raise ConfigurationError(f"this was not ready after {LONGEST_S / 3600:g} hours: ask for less")
             raise OverloadedError("the client has closed the connection, so the export was given up")
         if errors:
+            self._tidy(KEPT)  # of what a worker has begun that died
             raise errors[0]
 
     def _tidy(self, most: int) -> bool:

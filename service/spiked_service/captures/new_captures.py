@@ -74,7 +74,15 @@ class NewCaptures:
         """A capture with its row and folder; `size` bytes are reserved for its recording. Raises StoreError."""
         now = datetime.now(UTC)
         row = CaptureRow(
-            new_id(), Origin.LIVE, plan, CaptureState.STARTING, now, name=plan.name, notes=plan.notes, group=group
+            new_id(),
+            Origin.LIVE,
+            plan,
+            CaptureState.STARTING,
+            now,
+            name=plan.name,
+            notes=plan.notes,
+            group=group,
+            frames_planned=plan.frames,
         )
         if plan.record:
             self._disk_space.reserve_recording(self._folder.recording(row.id), size)

@@ -34,6 +34,13 @@ def test_a_capture_tells_what_it_was(done: CaptureOut) -> None:
     assert done.counters is not None and done.counters.received == FRAMES
 
 
+def test_the_answer_to_a_start_says_the_planned_length(service: Any) -> None:
+    plan = {"source": "sim:?width=64&height=48", "frames": 64, "reconstruct": False}
+    started = service.http.post("captures", json=plan).json()
+    assert started["frames_planned"] == 64, started
+    service.client.wait_for_capture(started["id"], 60)
+
+
 def test_the_recording_comes_whole_in_ranges_and_only_if_changed(service: Any, done: CaptureOut) -> None:
     url = f"captures/{done.id}/recording"
     whole = service.http.get(url)

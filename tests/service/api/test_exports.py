@@ -3,11 +3,13 @@
 import io
 import json
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import av
 import httpx
+import psutil
 import pytest
 from plyfile import PlyData
 from waiting import until
@@ -114,6 +116,25 @@ def test_an_export_whose_client_has_gone_makes_way_for_others(service: Any, job:
     until(lambda: service.http.get(f"{url}/ply?views=7").status_code == 200, "another export is made", 15)
     kept = Path(service.http.get("system").json()["data_folder"]) / "exports"
     assert not [file for file in kept.iterdir() if file.name.startswith(".")], "what was begun is gone"
+
+
+def test_an_export_whose_worker_is_killed_is_to_be_asked_for_again(service: Any, job: str) -> None:
+    url = f"reconstructions/{job}/exports"
+    with ThreadPoolExecutor(1) as client:
+        answer = client.submit(service.http.get, f"{url}/video?width=1000&height=800&seconds=100&fps=30", timeout=60)
+        kept = Path(service.http.get("system").json()["data_folder"]) / "exports"
+        begun = until(lambda: list(kept.glob(".*")), "the export has begun", 30)
+        until(lambda: [one for one in exporting() if not one.kill()], "its worker is killed", 30)
+    assert answer.result().status_code == 503, answer.result().text
+    assert "killed by signal 9" in answer.result().json()["detail"]
+    assert not begun[0].exists(), "what was begun is gone"
+    assert service.http.get(f"{url}/ply?views=6").status_code == 200
+
+
+def exporting() -> list[psutil.Process]:
+    """Workers that make exports."""
+    everything = psutil.process_iter(["cmdline"])
+    return [one for one in everything if {"spiked_service.workers", "export"} <= set(one.info["cmdline"] or [])]
 
 
 def test_a_recording_is_sent_in_slow_motion(service: Any, done: CaptureOut) -> None:

@@ -167,20 +167,22 @@ def kill(kind: str, lab: Lab, random_: random.Random) -> bool:
     return True
 
 
-def broken(service: Service, jobs: list[str]) -> list[str]:
-    """Jobs whose listed versions lack a file, or have one of another size."""
-    found = []
+def broken(service: Service, jobs: list[str]) -> dict[str, list[str]]:
+    """What is missing of jobs whose listed versions lack a file, or have one of another size."""
+    found = {}
     for job in jobs:
         folder = service.data / "reconstructions" / job
         kept = versions(folder)
-        whole = kept and all(
-            (folder / one.scene).is_file()
-            and (folder / one.scene).stat().st_size == one.scene_bytes
-            and (folder / one.trajectory).is_file()
-            for one in kept
-        )
-        if not whole:
-            found.append(job)
+        missing = [] if kept else ["no versions"]
+        for one in kept:
+            scene = folder / one.scene
+            if not scene.is_file() or scene.stat().st_size != one.scene_bytes:
+                size = f"{scene.stat().st_size} bytes" if scene.is_file() else "none"
+                missing.append(f"{one.scene}: {size} instead of {one.scene_bytes}")
+            if not (folder / one.trajectory).is_file():
+                missing.append(f"{one.trajectory}: none")
+        if missing:
+            found[job] = [*missing, f"there are {sorted(path.name for path in folder.iterdir())}"]
     return found
 
 

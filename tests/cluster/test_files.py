@@ -1,21 +1,31 @@
 """Files of jobs in an object store."""
 
+import fcntl
+import shutil
+from contextlib import nullcontext, suppress
 from pathlib import Path
+from typing import IO
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 from spiked_service.cluster import object_store
+from spiked_service.cluster.attempt_log import AttemptLog
 from spiked_service.cluster.configured import cluster_of
-from spiked_service.cluster.job_files import INPUTS, moved, stage
+from spiked_service.cluster.job_files import INPUTS, OUTPUTS, files_in, moved, stage
+from spiked_service.cluster.job_folder import JobFolder
 from spiked_service.cluster.messages import StoredFile
 from spiked_service.cluster.object_store import ObjectStore, ObjectStoreError, stored_file
 from spiked_service.cluster.scratch import scratch_folder
 from spiked_service.cluster.shared_recordings import SharedRecordings
+from spiked_service.results.versions import Publisher, is_whole, versions
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.settings.settings import load_settings
 from spiked_service.workers.messages import ReconstructionCommand
 
 from spiked.errors import ConfigurationError
+from spiked.scene import Scene
+from spiked.trajectory import Trajectory
 
 
 class Far(ObjectStore):
@@ -141,3 +151,53 @@ def test_settings_that_cannot_work_are_refused(tmp_path: Path, flags: dict[str, 
 def test_options_of_the_engine_are_pairs(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="NAME=VALUE"):
         load_settings({"executor_options": "slurm_partition"})
+
+
+def test_whatever_ends_a_fetch_the_index_lists_only_what_is_there(tmp_path: Path) -> None:
+    """Two agents of one attempt made versions with the same names: the service was restarted between them."""
+    trajectory = Trajectory(np.array([0.5]), np.eye(3)[None], np.zeros((1, 3)))
+
+    def scene(splats: int) -> Scene:
+        shapes = ((splats, 3), (splats, 4), (splats, 3), (splats,), (splats, 1))
+        return Scene(*(np.ones(shape, np.float32) for shape in shapes))
+
+    first, second, store = tmp_path / "first", tmp_path / "second", ObjectStore((tmp_path / "store").as_uri())
+    for folder, splats in ((first, 1), (second, 2)):
+        folder.mkdir()
+        publisher = Publisher(folder)
+        for _ in range(2):
+            publisher.publish(scene(splats), trajectory, 0.1)
+    third = Publisher(first).publish(scene(3), trajectory, 0.1)
+    files = [stored_file(path, path.name) for path in files_in(second)]
+    for missing in (*files, None):
+        job = tmp_path / f"job without {missing and missing.name}"
+        shutil.copytree(first, job)
+        shutil.rmtree(tmp_path / "store", ignore_errors=True)
+        for stored in files:
+            if stored is not missing:
+                store.put_file(second / stored.name, f"{OUTPUTS}/{stored.sha256}", stored)
+        one = JobFolder(job, AttemptLog(job / "log", "one"))
+        one.look()
+        with suppress(ObjectStoreError) if missing else nullcontext():
+            one.fetch(files, store)
+        assert all(is_whole(job, published) for published in versions(job))
+        if missing is None:
+            assert versions(job) == versions(second) and not (job / third.scene).exists()
+
+
+def test_an_agent_whose_scratch_was_removed_before_it_was_locked_makes_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPIKED_SCRATCH", str(tmp_path))
+    made, lock = [], fcntl.flock
+
+    def late(file: IO[str], how: int) -> None:
+        if not made:
+            made.extend(tmp_path.iterdir())
+            shutil.rmtree(made[0])  # as another agent does that finds it not locked
+        lock(file, how)
+
+    monkeypatch.setattr("spiked_service.cluster.scratch.fcntl.flock", late)
+    with scratch_folder() as folder:
+        assert folder.is_dir() and folder != made[0]
+    assert not list(tmp_path.iterdir())

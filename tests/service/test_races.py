@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from spiked_service.api.idempotency import Answer, IdempotencyKeys
 from spiked_service.api.problems import ConflictError
@@ -13,6 +14,7 @@ from spiked_service.base.errors import BusyError
 from spiked_service.base.ids import new_id
 from spiked_service.captures.archive import DataStore
 from spiked_service.captures.uploads import Uploads
+from spiked_service.results.versions import Publisher, versions
 from spiked_service.store.catalogue import StoreError
 from spiked_service.store.retention import Policy
 from spiked_service.store.rows import (
@@ -28,6 +30,9 @@ from spiked_service.store.rows import (
     UploadRow,
 )
 from waiting import until
+
+from spiked.scene import Scene
+from spiked.trajectory import Trajectory
 
 from .survival import SMALL, kept, over
 
@@ -155,6 +160,27 @@ def test_a_result_whose_files_are_gone_is_not_called_complete(tmp_path: Path) ->
         now = data_store.reconstructions.rows.get(job.id)
         assert "its files are gone" in now.reason and now.version == 0
         assert data_store.reconstructions.rows.versions(job.id) == []
+
+
+def test_versions_whose_files_are_damaged_are_not_listed_after_a_start(tmp_path: Path) -> None:
+    trajectory = Trajectory(np.array([0.5]), np.eye(3)[None], np.zeros((1, 3)))
+    with kept(tmp_path / "data") as data_store:
+        row = stored(data_store)
+        job = ReconstructionRow(new_id(), row.id, False, JobState.COMPLETE, NOW, version=3)
+        folder = data_store.folder.reconstruction(job.id)
+        folder.mkdir(parents=True)
+        publisher = Publisher(folder)
+        for _ in range(3):
+            publisher.publish(Scene.empty(1), trajectory, 0.1)
+        data_store.catalogue.reconstructions.put(job)
+        for published in publisher.versions[1:]:
+            (folder / published.scene).unlink()
+    with kept(tmp_path / "data") as data_store:
+        until(lambda: data_store.reconstructions.rows.get(job.id).version == 1, "it is told")
+        now = data_store.reconstructions.rows.get(job.id)
+        assert now.state is JobState.COMPLETE
+        assert [one.version for one in data_store.reconstructions.rows.versions(job.id)] == [1]
+        assert [one.version for one in versions(folder)] == [1]
 
 
 def test_a_request_is_not_carried_out_twice_after_a_kill(data_store: DataStore) -> None:

@@ -15,6 +15,7 @@ from spiked_service.captures.recording_quality import reassess, recover_and_asse
 from spiked_service.captures.states import CaptureEvent, next_state
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.repository import ReconstructionRepository
+from spiked_service.results.versions import newest
 from spiked_service.store.catalogue import Catalogue
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import (
@@ -165,10 +166,17 @@ class Recovery:
         self._notifier.log("error", message, None, reconstruction_id)
 
     def _check_versions(self, reconstruction_id: str) -> None:
-        """Check that the catalogue lists the versions of an ended reconstruction."""
+        """Check that the versions of an ended reconstruction are whole, and that the catalogue lists them."""
         row = self._catalogue.reconstructions.find(reconstruction_id)
         if row is None or not row.state.over:  # it was restarted or removed meanwhile
             return
+        if gone := self._rows.forget_incomplete(reconstruction_id):
+            left = newest(self._folder.reconstruction(reconstruction_id))
+            if left is not None and row.version in gone:
+                self._catalogue.reconstructions.set(row.id, version=left.version, splats=left.splats)
+            numbers = ", ".join(map(str, gone))
+            message = f"files are missing or damaged, so that these versions are not listed any more: {numbers}"
+            self._notifier.log("error", message, row.capture_id, row.id)
         if not note_versions(self._folder, self._catalogue, reconstruction_id) and row.version:
             self._lose_result(row)
 

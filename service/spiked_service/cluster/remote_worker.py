@@ -15,7 +15,8 @@ from spiked.errors import SpikedError
 from spiked.recon.checkpoint_file import CHECKPOINT
 from spiked_service.cluster.attempt_log import AttemptLog
 from spiked_service.cluster.checkpoint_copies import fetch_copy, newest_copy
-from spiked_service.cluster.job_files import LOG, MANIFEST, OUTPUTS, files_in, of_a_version, stage
+from spiked_service.cluster.job_files import LOG, MANIFEST, stage
+from spiked_service.cluster.job_folder import JobFolder
 from spiked_service.cluster.messages import (
     AttemptWork,
     Begin,
@@ -30,7 +31,6 @@ from spiked_service.cluster.messages import (
 from spiked_service.cluster.object_store import ObjectStore, ObjectStoreError
 from spiked_service.cluster.shared_recordings import SharedRecordings
 from spiked_service.events.logging import logger
-from spiked_service.results.versions import INDEX
 from spiked_service.workers.messages import JobCommand, Logged, NodeFound, NotBegun, WorkerEvent
 from spiked_service.workers.process import relay
 
@@ -105,8 +105,7 @@ class RemoteWorker:
         self._on_exit = on_exit
         self._inputs: Inputs | None = None
         self._log = AttemptLog(command.folder / LOG, attempt)
-        self._have: dict[str, str] = {}
-        """Hashes of the files in the folder of the job, by name."""
+        self._folder = JobFolder(command.folder, self._log)
         self._agent: str | None = None
         self._claim: str | None = None
         """The agent that is to begin it, after another attempt."""
@@ -259,11 +258,13 @@ class RemoteWorker:
 
     def _follow(self) -> str | None:
         """Follow the attempt to its end. Return the trouble of its worker."""
-        if self._submit is None and self._store.get(MANIFEST) is not None:
-            return self._finish("")  # it has ended meanwhile
+        if self._submit is None:
+            self._folder.look()
+            if self._store.get(MANIFEST) is not None:
+                return self._finish("")  # it has ended meanwhile
         if not self._begun:
             inputs = stage(self._command, self._store, self._hold)
-            self._have = {stored.name: stored.sha256 for stored in inputs.folder}
+            self._folder.know(inputs.folder)
             with self._lock:
                 self._inputs, self._seen_s = inputs, time.monotonic()
             if self._submit is not None and not (self._detached or self._left_s):
@@ -310,7 +311,7 @@ class RemoteWorker:
         if told.sequence and told.sequence <= self._taken:
             return  # its answer was lost
         if told.files is not None:
-            self._fetch(told.files)
+            self._folder.fetch(told.files, self._store)
         self._deliver(told.events)
         self._complete = self._complete and told.sequence in (0, self._taken + 1)
         self._taken = max(self._taken, told.sequence)
@@ -334,7 +335,7 @@ class RemoteWorker:
             manifest = Manifest.model_validate_json(content)
         except ValidationError:
             return "the manifest of its results cannot be read"
-        self._fetch(manifest.files)
+        self._folder.fetch(manifest.files, self._store)
         self._take_checkpoint(manifest.checkpoint, over=manifest.trouble is None)
         self._stored = True
         if not (self._complete and manifest.reports == self._taken):
@@ -347,18 +348,3 @@ class RemoteWorker:
             fetch_copy(self._store, copy, self._command.folder)
         elif over:
             shutil.rmtree(self._command.folder / CHECKPOINT, ignore_errors=True)
-
-    def _fetch(self, files: list[StoredFile]) -> None:
-        """Bring the folder of the job to what the attempt has, the index of the versions last."""
-        folder = self._command.folder
-        names = {stored.name for stored in files}
-        for stored in sorted(files, key=lambda one: one.name == INDEX):
-            if self._have.get(stored.name) != stored.sha256:
-                path = self._log.arriving if stored.name == LOG else folder / stored.name
-                self._store.fetch(f"{OUTPUTS}/{stored.sha256}", path, stored)
-                self._have[stored.name] = stored.sha256
-                if stored.name == LOG:
-                    self._log.take()
-        for path in files_in(folder):
-            if of_a_version(path) and path.relative_to(folder).as_posix() not in names:
-                path.unlink(missing_ok=True)

@@ -25,13 +25,17 @@ def scratch_folder() -> Iterator[Path]:
     base = scratch_base()
     for old in base.glob(f"{_PREFIX}*"):
         _remove_if_left(old)
-    folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=base))
-    with (folder / _LOCK).open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        try:
-            yield folder
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=base))
+        with (folder / _LOCK).open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (folder / _LOCK).exists():
+                continue  # another agent has removed it before it was locked
+            try:
+                yield folder
+            finally:
+                shutil.rmtree(folder, ignore_errors=True)
+        return
 
 
 def _remove_if_left(folder: Path) -> None:

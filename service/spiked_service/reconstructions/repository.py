@@ -19,7 +19,7 @@ from spiked_service.results.pinned_map import pin
 from spiked_service.results.published import Published
 from spiked_service.results.scene_scale import forget_scale
 from spiked_service.results.timeline_writer import NAME as TIMELINE
-from spiked_service.results.versions import Publisher, newest, version_row
+from spiked_service.results.versions import Publisher, forget_incomplete, newest, version_row
 from spiked_service.store.catalogue import Catalogue, Page, StoreError
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import JobState, MapRef, ReconstructionEdit, ReconstructionRow, VersionRow
@@ -155,6 +155,12 @@ class ReconstructionRepository:
         self._set_running(row)
         self._view.tell(row, ran=ran)
 
+    def forget_incomplete(self, reconstruction_id: str) -> list[int]:
+        """List only whole versions of a job that has ended, and is not edited. The numbers of the others."""
+        with self._lock:
+            over = self.get(reconstruction_id).state.over and reconstruction_id not in self._edited
+            return forget_incomplete(self.folder(reconstruction_id)) if over else []
+
     def publish_edit(self, reconstruction_id: str, version: int, edit: Callable[[Publisher], Published]) -> Published:
         """Publish another version of a reconstruction that has ended, made of its newest, `version`.
 
@@ -260,7 +266,7 @@ class ReconstructionRepository:
         """
         found = []
         for folder, used in zip(self._folder.maps(row.id, len(row.maps)), row.maps, strict=True):
-            map_row, source, published, sensor = self._map(used.reconstruction_id)
+            map_row, source, published, sensor = _map_of(self._catalogue, self._folder, used.reconstruction_id)
             try:
                 pin(folder, map_row, source, published, sensor)
             except FileNotFoundError as error:
@@ -277,16 +283,8 @@ class ReconstructionRepository:
 
     def map_camera(self, reconstruction_id: str) -> Camera:
         """The camera that made a map. Raises UnknownIdError, and ConfigurationError for what is no map."""
-        _, _, published, sensor = self._map(reconstruction_id)
+        _, _, published, sensor = _map_of(self._catalogue, self._folder, reconstruction_id)
         return Camera(published.optics(sensor), sensor.width, sensor.height)
-
-    def _map(self, reconstruction_id: str) -> tuple[ReconstructionRow, Path, Published, Sensor]:
-        row = self._catalogue.reconstructions.get(reconstruction_id)
-        folder, capture = self._folder.reconstruction(row.id), self._catalogue.captures.get(row.capture_id)
-        published = newest(folder)
-        if published is None or capture.sensor is None:
-            raise ConfigurationError(f"reconstruction {row.id} has no version, so it is no map")
-        return row, folder, published, capture.sensor
 
     def add_version(self, row: ReconstructionRow, published: Published, kept: set[int]) -> None:
         """Save a published version and forget those that are not in `kept`. Errors are logged."""
@@ -337,3 +335,14 @@ class ReconstructionRepository:
 def _stored(row: ReconstructionRow) -> ReconstructionRow:
     """A row as the catalogue has it: places in the queue, and expectations of what is over, are not kept."""
     return replace(row, queue_place=None, eta_s=None if row.state.over else row.eta_s)
+
+
+def _map_of(
+    catalogue: Catalogue, folder: DataFolder, reconstruction_id: str
+) -> tuple[ReconstructionRow, Path, Published, Sensor]:
+    row = catalogue.reconstructions.get(reconstruction_id)
+    files, capture = folder.reconstruction(row.id), catalogue.captures.get(row.capture_id)
+    published = newest(files)
+    if published is None or capture.sensor is None:
+        raise ConfigurationError(f"reconstruction {row.id} has no version, so it is no map")
+    return row, files, published, capture.sensor

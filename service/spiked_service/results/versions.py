@@ -1,6 +1,6 @@
 """Versions of a scene and its trajectory: one process publishes them, others read them at any time."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -69,7 +69,7 @@ class Publisher:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._versions = versions(folder)
+        self._versions = [one for one in versions(folder) if is_whole(folder, one)]
         self._protected: set[int] = set()
         self._shown = ShownScene()
 
@@ -196,7 +196,7 @@ class Publisher:
         kept = _thinned([*self._versions, published], self._protected)
         without_slots = [one.model_copy(update={"slots": None}) for one in kept[:-_NEWEST]]
         kept = without_slots + kept[-_NEWEST:]
-        write_atomically(self._folder / INDEX, _Index(versions=kept).model_dump_json().encode())
+        _write_index(self._folder, kept)
         earlier, self._versions = self._versions, kept
         gone = {one.version: one for one in earlier}.keys() - {one.version for one in kept}
         slots = {one.slots for one in kept}
@@ -252,6 +252,45 @@ def versions(folder: Path) -> list[Published]:
         return _Index.model_validate_json((folder / INDEX).read_bytes()).versions
     except FileNotFoundError:
         return []
+
+
+def is_whole(folder: Path, published: Published) -> bool:
+    """Whether the files of a version are there, the scene with the size that it had."""
+    scene, paths = folder / published.scene, [folder / one.trajectory for one in published.paths]
+    posed = (folder / published.trajectory).is_file() or pose_file(folder, published).is_file()
+    whole = scene.is_file() and scene.stat().st_size == published.scene_bytes
+    return whole and posed and all(path.is_file() for path in paths)
+
+
+def forget_incomplete(folder: Path) -> list[int]:
+    """List only versions that are whole. Return the numbers of the others. Nobody may publish meanwhile."""
+    return _forget(folder, lambda one: not is_whole(folder, one))
+
+
+def forget_with(folder: Path, names: Collection[str]) -> list[int]:
+    """List no version with one of these files, before they are replaced or removed. Return their numbers."""
+    return _forget(folder, lambda one: not names_of(one).isdisjoint(names))
+
+
+def names_of(published: Published) -> set[str]:
+    """Names of the files of a version."""
+    paths = (one.trajectory for one in published.paths)
+    return {published.scene, published.trajectory, *paths, *([] if published.slots is None else [published.slots])}
+
+
+def _forget(folder: Path, is_gone: Callable[[Published], bool]) -> list[int]:
+    listed = versions(folder)
+    kept = [one for one in listed if not is_gone(one)]
+    if len(kept) < len(listed):
+        _write_index(folder, kept)
+    return [one.version for one in listed if one not in kept]
+
+
+def _write_index(folder: Path, kept: list[Published]) -> None:
+    if kept:
+        write_atomically(folder / INDEX, _Index(versions=kept).model_dump_json().encode())
+    else:
+        (folder / INDEX).unlink()
 
 
 def newest(folder: Path) -> Published | None:

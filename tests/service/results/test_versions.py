@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from spiked_service.results.versions import Publisher, RecordedPath, at, newest, versions
+from spiked_service.results.versions import Publisher, RecordedPath, at, forget_incomplete, newest, versions
 
 from spiked.scene import Scene
 from spiked.trajectory import Trajectory
@@ -105,3 +105,26 @@ def test_of_a_version_that_has_no_room_nothing_is_left(tmp_path: Path) -> None:
             finally:
                 others.unlink()
         assert refused >= 4 and publisher.version == 2
+
+
+@pytest.mark.parametrize("harm", ["no scene", "part of a scene", "no poses", "no other path"])
+def test_a_version_whose_files_are_not_whole_is_not_listed(tmp_path: Path, harm: str) -> None:
+    publisher = Publisher(tmp_path)
+    trajectory = Trajectory(np.array([0.5]), np.eye(3)[None], np.zeros((1, 3)))
+    others = [RecordedPath("one", 100.0, trajectory)]
+    for _ in range(3):
+        publisher.publish(Scene.empty(1), trajectory, 0.1, others=others)
+    assert forget_incomplete(tmp_path) == []
+    second = versions(tmp_path)[1]
+    if harm == "part of a scene":
+        (tmp_path / second.scene).write_bytes((tmp_path / second.scene).read_bytes()[:-1])
+    else:
+        gone = {"no scene": second.scene, "no poses": second.trajectory, "no other path": second.paths[0].trajectory}
+        (tmp_path / gone[harm]).unlink()
+    assert Publisher(tmp_path).kept == [1, 3], "whoever goes on does not list it again"
+    assert forget_incomplete(tmp_path) == [2]
+    assert [one.version for one in versions(tmp_path)] == [1, 3]
+    for one in versions(tmp_path):
+        (tmp_path / one.scene).unlink()
+    assert forget_incomplete(tmp_path) == [1, 3]
+    assert versions(tmp_path) == []

@@ -15,7 +15,7 @@ from spiked_service.captures.recording_quality import reassess, recover_and_asse
 from spiked_service.captures.states import CaptureEvent, next_state
 from spiked_service.reconstructions.notifier import Notifier
 from spiked_service.reconstructions.repository import ReconstructionRepository
-from spiked_service.results.versions import newest
+from spiked_service.results.versions import is_whole, newest, versions
 from spiked_service.store.catalogue import Catalogue
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.rows import (
@@ -170,15 +170,22 @@ class Recovery:
         row = self._catalogue.reconstructions.find(reconstruction_id)
         if row is None or not row.state.over:  # it was restarted or removed meanwhile
             return
-        if gone := self._rows.forget_incomplete(reconstruction_id):
-            left = newest(self._folder.reconstruction(reconstruction_id))
-            if left is not None and row.version in gone:
-                self._catalogue.reconstructions.set(row.id, version=left.version, splats=left.splats)
+        folder = self._folder.reconstruction(reconstruction_id)
+        if not all(is_whole(folder, one) for one in versions(folder)):
+            self._forget_incomplete(row)
+        if not note_versions(self._folder, self._catalogue, reconstruction_id) and row.version:
+            self._lose_result(row)
+
+    def _forget_incomplete(self, row: ReconstructionRow) -> None:
+        """Take versions from the list whose files are missing or damaged."""
+        gone = self._rows.forget_incomplete(row.id)
+        left = newest(self._folder.reconstruction(row.id))
+        if left is not None and row.version in gone:
+            self._catalogue.reconstructions.set(row.id, version=left.version, splats=left.splats)
+        if gone:
             numbers = ", ".join(map(str, gone))
             message = f"files are missing or damaged, so that these versions are not listed any more: {numbers}"
             self._notifier.log("error", message, row.capture_id, row.id)
-        if not note_versions(self._folder, self._catalogue, reconstruction_id) and row.version:
-            self._lose_result(row)
 
     def _set_job_aside(self, reconstruction_id: str) -> None:
         """Move a reconstruction away whose capture is missing."""

@@ -181,7 +181,9 @@ class Recovery:
         gone = self._rows.forget_incomplete(row.id)
         left = newest(self._folder.reconstruction(row.id))
         if left is not None and row.version in gone:
-            self._catalogue.reconstructions.set(row.id, version=left.version, splats=left.splats)
+            self._catalogue.reconstructions.set(
+                row.id, version=left.version, splats=left.splats, poses=left.poses, psnr_db=left.psnr_db
+            )
         if gone:
             numbers = ", ".join(map(str, gone))
             message = f"files are missing or damaged, so that these versions are not listed any more: {numbers}"

@@ -10,7 +10,7 @@ from spiked_service.store.catalogue import Catalogue
 
 from tests.many_captures import MANY, many
 
-FIRST = 40
+FIRST = 25
 """Rows of the first page."""
 
 

@@ -37,7 +37,7 @@ from cluster_stores import SERVERS, Store, s3_store
 from faulty_proxy import FaultyProxy
 from namespace_machine import Machine
 from ports import free_port
-from spiked_service.results.versions import versions
+from spiked_service.results.versions import is_whole, versions
 
 from spiked.recording import RecordingWriter
 from spiked.sensor import Intrinsics, Sensor
@@ -167,22 +167,15 @@ def kill(kind: str, lab: Lab, random_: random.Random) -> bool:
     return True
 
 
-def broken(service: Service, jobs: list[str]) -> dict[str, list[str]]:
-    """What is missing of jobs whose listed versions lack a file, or have one of another size."""
+def broken(service: Service, jobs: list[str]) -> dict[str, Any]:
+    """Versions that are listed and not whole, and the sizes of all files, of jobs that have such or none."""
     found = {}
     for job in jobs:
         folder = service.data / "reconstructions" / job
         kept = versions(folder)
-        missing = [] if kept else ["no versions"]
-        for one in kept:
-            scene = folder / one.scene
-            if not scene.is_file() or scene.stat().st_size != one.scene_bytes:
-                size = f"{scene.stat().st_size} bytes" if scene.is_file() else "none"
-                missing.append(f"{one.scene}: {size} instead of {one.scene_bytes}")
-            if not (folder / one.trajectory).is_file():
-                missing.append(f"{one.trajectory}: none")
-        if missing:
-            found[job] = [*missing, f"there are {sorted(path.name for path in folder.iterdir())}"]
+        half = [one.model_dump(mode="json") for one in kept if not is_whole(folder, one)]
+        if half or not kept:
+            found[job] = {"half": half, "files": {path.name: path.stat().st_size for path in folder.iterdir()}}
     return found
 
 

@@ -177,7 +177,6 @@ def test_whatever_ends_a_fetch_the_index_lists_only_what_is_there(tmp_path: Path
             if stored is not missing:
                 store.put_file(second / stored.name, f"{OUTPUTS}/{stored.sha256}", stored)
         one = JobFolder(job, AttemptLog(job / "log", "one"))
-        one.look()
         with suppress(ObjectStoreError) if missing else nullcontext():
             one.fetch(files, store)
         assert all(is_whole(job, published) for published in versions(job))

@@ -1,13 +1,14 @@
 """Reconciles the catalogue with the files of the data folder when the service starts."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from spiked_service.results.versions import version_row, versions
+from spiked_service.results.published import Published
+from spiked_service.results.versions import version_row
 from spiked_service.store.catalogue import Catalogue, DamagedError, StoreError, Table
 from spiked_service.store.folder import DataFolder
 from spiked_service.store.row_copies import outdated, read_copy
@@ -63,12 +64,11 @@ def reconcile(folder: DataFolder, catalogue: Catalogue, log: Log) -> Orphans:
     )
 
 
-def note_versions(folder: DataFolder, catalogue: Catalogue, reconstruction_id: str) -> bool:
+def note_versions(catalogue: Catalogue, reconstruction_id: str, published: Sequence[Published]) -> bool:
     """Set the versions of a reconstruction in the catalogue to those in its folder; whether there are any.
 
-    Raises StoreError, OSError.
+    Raises StoreError.
     """
-    published = versions(folder.reconstruction(reconstruction_id))
     kept = {one.version for one in published}
     if kept == catalogue.version_numbers(reconstruction_id):
         return bool(kept)

@@ -171,23 +171,26 @@ class Recovery:
         if row is None or not row.state.over:  # it was restarted or removed meanwhile
             return
         folder = self._folder.reconstruction(reconstruction_id)
-        if not all(is_whole(folder, one) for one in versions(folder)):
+        published = versions(folder)
+        if not all(is_whole(folder, one) for one in published):
             self._forget_incomplete(row)
-        if not note_versions(self._folder, self._catalogue, reconstruction_id) and row.version:
+            published = versions(folder)
+        if not note_versions(self._catalogue, reconstruction_id, published) and row.version:
             self._lose_result(row)
 
     def _forget_incomplete(self, row: ReconstructionRow) -> None:
         """Take versions from the list whose files are missing or damaged."""
         gone = self._rows.forget_incomplete(row.id)
+        if not gone:
+            return  # it is edited now, or whole again
         left = newest(self._folder.reconstruction(row.id))
         if left is not None and row.version in gone:
             self._catalogue.reconstructions.set(
                 row.id, version=left.version, splats=left.splats, poses=left.poses, psnr_db=left.psnr_db
             )
-        if gone:
-            numbers = ", ".join(map(str, gone))
-            message = f"files are missing or damaged, so that these versions are not listed any more: {numbers}"
-            self._notifier.log("error", message, row.capture_id, row.id)
+        numbers = ", ".join(map(str, gone))
+        message = f"files are missing or damaged, so that these versions are not listed any more: {numbers}"
+        self._notifier.log("error", message, row.capture_id, row.id)
 
     def _set_job_aside(self, reconstruction_id: str) -> None:
         """Move a reconstruction away whose capture is missing."""

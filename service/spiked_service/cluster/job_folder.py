@@ -16,16 +16,8 @@ class JobFolder:
     def __init__(self, folder: Path, log: AttemptLog) -> None:
         self.path = folder
         self._log = log
-        self._have: dict[str, str] = {}
-        """Hashes of the files, by name."""
-
-    def look(self) -> None:
-        """Find out what is there."""
-        self._have = {path.relative_to(self.path).as_posix(): sha256_of(path) for path in files_in(self.path)}
-
-    def know(self, files: Sequence[StoredFile]) -> None:
-        """These files have been found there."""
-        self._have = {stored.name: stored.sha256 for stored in files}
+        self._known: dict[str, str] | None = None
+        """Hashes of the files, by name; None before the first fetch."""
 
     def fetch(self, files: Sequence[StoredFile], store: ObjectStore) -> None:
         """Bring it to what the attempt of this store has, the index of the versions last.
@@ -33,18 +25,20 @@ class JobFolder:
         Another agent of the attempt may have made other versions with the same names. Whatever ends this in the middle,
         the index lists only what is there. Raises ObjectStoreError and OSError.
         """
-        wanted = {stored.name: stored.sha256 for stored in files}
+        if self._known is None:
+            self._known = {path.relative_to(self.path).as_posix(): sha256_of(path) for path in files_in(self.path)}
+        have, wanted = self._known, {stored.name: stored.sha256 for stored in files}
         versioned = {path.relative_to(self.path).as_posix() for path in files_in(self.path) if of_a_version(path)}
-        other = {name for name in versioned if wanted.get(name) != self._have.get(name)}
+        other = {name for name in versioned if wanted.get(name) != have.get(name)}
         if forget_with(self.path, other):
-            self._have.pop(INDEX, None)
+            have.pop(INDEX, None)
         for stored in sorted(files, key=lambda one: one.name == INDEX):
-            if self._have.get(stored.name) != stored.sha256:
+            if have.get(stored.name) != stored.sha256:
                 path = self._log.arriving if stored.name == LOG else self.path / stored.name
                 store.fetch(f"{OUTPUTS}/{stored.sha256}", path, stored)
-                self._have[stored.name] = stored.sha256
+                have[stored.name] = stored.sha256
                 if stored.name == LOG:
                     self._log.take()
         for name in other - wanted.keys():
             (self.path / name).unlink(missing_ok=True)
-            self._have.pop(name, None)
+            have.pop(name, None)

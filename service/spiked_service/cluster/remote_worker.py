@@ -258,13 +258,10 @@ class RemoteWorker:
 
     def _follow(self) -> str | None:
         """Follow the attempt to its end. Return the trouble of its worker."""
-        if self._submit is None:
-            self._folder.look()
-            if self._store.get(MANIFEST) is not None:
-                return self._finish("")  # it has ended meanwhile
+        if self._submit is None and self._store.get(MANIFEST) is not None:
+            return self._finish("")  # it has ended meanwhile
         if not self._begun:
             inputs = stage(self._command, self._store, self._hold)
-            self._folder.know(inputs.folder)
             with self._lock:
                 self._inputs, self._seen_s = inputs, time.monotonic()
             if self._submit is not None and not (self._detached or self._left_s):

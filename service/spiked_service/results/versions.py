@@ -204,16 +204,19 @@ class Publisher:
             if one.slots is not None and one.slots not in slots:
                 (self._folder / one.slots).unlink(missing_ok=True)
             if one.version in gone:
-                (self._folder / one.scene).unlink(missing_ok=True)
-                (self._folder / one.trajectory).unlink(missing_ok=True)
-                pose_file(self._folder, one).unlink(missing_ok=True)
-                for path in one.paths:
-                    (self._folder / path.trajectory).unlink(missing_ok=True)
+                for name in _names_of(one):
+                    (self._folder / name).unlink(missing_ok=True)
 
 
 def pose_file(folder: Path, published: Published) -> Path:
     """The pose file of a version; for one of an older release it is written at the first read."""
     return (folder / published.trajectory).with_suffix(".poses")
+
+
+def _names_of(published: Published) -> set[str]:
+    """Names of the files of a version."""
+    poses = {published.trajectory, pose_file(Path(), published).name, *(one.trajectory for one in published.paths)}
+    return {published.scene} | poses | (set() if published.slots is None else {published.slots})
 
 
 def version_row(reconstruction_id: str, published: Published) -> VersionRow:
@@ -269,13 +272,7 @@ def forget_incomplete(folder: Path) -> list[int]:
 
 def forget_with(folder: Path, names: Collection[str]) -> list[int]:
     """List no version with one of these files, before they are replaced or removed. Return their numbers."""
-    return _forget(folder, lambda one: not names_of(one).isdisjoint(names))
-
-
-def names_of(published: Published) -> set[str]:
-    """Names of the files of a version."""
-    paths = (one.trajectory for one in published.paths)
-    return {published.scene, published.trajectory, *paths, *([] if published.slots is None else [published.slots])}
+    return _forget(folder, lambda one: not _names_of(one).isdisjoint(names))
 
 
 def _forget(folder: Path, is_gone: Callable[[Published], bool]) -> list[int]:

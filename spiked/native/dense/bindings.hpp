@@ -4,6 +4,7 @@
 
 namespace spiked {
 
+void bind_landmarks(nanobind::module_& m);
 void bind_nuisances(nanobind::module_& m);
 void bind_photometric(nanobind::module_& m);
 void bind_plane_sweep(nanobind::module_& m);

@@ -2,6 +2,7 @@
 #include "bindings.hpp"
 
 NB_MODULE(_dense, m) {
+    spiked::bind_landmarks(m);
     spiked::bind_nuisances(m);
     spiked::bind_photometric(m);
     spiked::bind_plane_sweep(m);

@@ -10,14 +10,13 @@
 #include "../common/clones.hpp"
 #include "../geometry/camera.hpp"
 #include "bindings.hpp"
+#include "landmarks.hpp"
 
 namespace spiked {
 namespace {
 
 using Image = Array<const float, 2>;
 
-constexpr int kLandmark = 3, kPose = 6;
-constexpr int kRow = kLandmark + kPose + 1;  // derivatives by landmark and by pose, and the error
 constexpr int kCoordinateBits = 18;
 
 // The cube of space that a point lies in. Cubes are about equally large in the image at any depth: their side doubles

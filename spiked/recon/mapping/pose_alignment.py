@@ -7,7 +7,7 @@ path, so landmarks are free and marginalised like the points of a bundle adjustm
 the path is a prior. Basis weights map the blocks of the views to the knots.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -32,17 +32,10 @@ from spiked.spline import Spline, Waypoints
 Index = NDArray[np.int64]
 Aligned = TypeVar("Aligned", Spline, Waypoints)
 
-LANDMARK_PX = 16
-"""Approximate width of a landmark in the image: all pixels in its cube of space share its three coordinates. Half and
-twice the width are as good (decision 13)."""
-LANDMARK_DAMPING, LANDMARK_DAMPING_FLOOR = 1e-2, 1e-3
-"""Damping of a landmark, relative to its own information and to the median landmark's: few pixels may see it."""
 GRADIENT_QUANTILE = 0.7
 """Quantile of the gradient magnitude below which pixels are left out."""
 KNOT_DAMPING = 1e-3
 """Damping of each knot, relative to its information; 0.02 is worse (decision 13)."""
-GROUP_LANDMARKS = 64
-"""Landmarks marginalised at once: fewer cost more calls, more are seen by more views, the square of which counts."""
 DRIFT_PX = 3.5e-3
 """Error of a long path after 1 px of image motion, in px; it grows with the root of the motion. Three times as much or
 a third makes no difference (docs/decisions/0058-long-paths-aligned-with-the-map.md)."""
@@ -53,6 +46,26 @@ EDGE_PX = 2
 MAD_SCALE, ROBUST_SCALES = 1.5, 3.0
 """Standard deviation of normal errors over their median size (1.48, rounded), and the scale of the Cauchy weight in
 units of this standard deviation."""
+
+
+@dataclass(frozen=True)
+class LandmarkPrior:
+    """What is known of landmarks before the views: all pixels in a cube of space share one, which is held a little, as
+    few pixels may see it."""
+
+    width_px: float
+    """Approximate width of a landmark in the image."""
+    damping: float
+    """Damping, relative to a landmark's own information."""
+    damping_floor: float
+    """Damping, relative to the median landmark's information."""
+
+
+SPLINE_LANDMARKS = LandmarkPrior(16, 1e-2, 1e-3)
+"""Half and twice the width are as good (decision 13); hardly held ones cost up to 0.4 dB (decision 59)."""
+LONG_LANDMARKS = LandmarkPrior(8, 1e-5, 1e-6)
+"""Of a path that is interpolated between views: those of a spline hold its bend, which moves each of them (decision
+59)."""
 
 
 @dataclass(frozen=True)
@@ -101,13 +114,15 @@ def align(
     taken.
     """
     pixel = mapper.alignment_level.factor
+    landmarks = SPLINE_LANDMARKS if isinstance(path, Spline) else LONG_LANDMARKS
     sums = []
     for (key, view), rotation, centre in zip(views, *path.poses(times), strict=True):
-        sums.append(_view_normals(key, view, planner.request(view, path, pixel), rotation, centre, mapper))
+        request = planner.request(view, path, pixel)
+        sums.append(_view_normals(key, view, request, rotation, centre, mapper, landmarks.width_px))
     variance = float(np.mean([s.variance for s in sums]))
     if not variance:  # no view has a valid pixel
         return path
-    square, gradient = (part / variance for part in marginalise_landmarks(sums))
+    square, gradient = (part / variance for part in marginalise_landmarks(sums, landmarks))
     rotations, centres = path.poses(times)
     if isinstance(path, Spline):
         rotations, centres = path.rotations, path.centres
@@ -128,59 +143,27 @@ class ViewNormals:
     """Normal equations of one view's pixels, see `photometric_normals`."""
 
     pose: Array  # [6, 7]
-    keys: NDArray[np.int64]  # [P]
-    places: Array  # [P, 3, 10]
+    keys: Index  # [P]
+    places: NDArray[np.float32]  # [P, 3, 10]
     variance: float  # of an error
 
 
-def marginalise_landmarks(sums: list[ViewNormals]) -> tuple[Array, Array]:
+def marginalise_landmarks(sums: list[ViewNormals], known: LandmarkPrior) -> tuple[Array, Array]:
     """Hessian [6 V, 6 V] and gradient [6 V] by the poses of V views, all landmarks marginalised (Schur complement)."""
     count = len(sums)
     hessian, gradient = np.zeros((count, 6, count, 6)), np.zeros((count, 6))
     for view, s in enumerate(sums):
         hessian[view, :, view], gradient[view] = s.pose[:, :6], s.pose[:, 6]
     square, right = hessian.reshape(6 * count, 6 * count), gradient.ravel()
-    names, number = np.unique(np.concatenate([s.keys for s in sums]), return_inverse=True)
-    if not len(names):
-        return square, right
-    seen_by = np.repeat(np.arange(count), [len(s.keys) for s in sums])
-    places = np.concatenate([s.places for s in sums])
-    own = np.zeros((len(names), 3, 4))  # Hessian and gradient of each landmark
-    np.add.at(own, number, places[:, :, [0, 1, 2, 9]])
-    trace = np.trace(own[:, :, :3], axis1=1, axis2=2) / 3
-    damping = LANDMARK_DAMPING * trace + LANDMARK_DAMPING_FLOOR * median(trace)
-    roots = np.linalg.inv(np.linalg.cholesky(own[:, :, :3] + damping[:, None, None] * np.eye(3)))
-    whitened = np.einsum("lij,lj->li", roots, own[:, :, 3])
-    for landmarks, rows in _groups(number, seen_by, len(names)):
-        views, column = np.unique(seen_by[rows], return_inverse=True)
-        block = np.zeros((len(landmarks), 3, len(views), 6))
-        block[np.searchsorted(landmarks, number[rows]), :, column] = roots[number[rows]] @ places[rows, :, 3:9]
-        flat = block.reshape(3 * len(landmarks), 6 * len(views))
-        at = (6 * views[:, None] + np.arange(6)).ravel()
-        square[np.ix_(at, at)] -= flat.T @ flat
-        right[at] -= whitened[landmarks].ravel() @ flat
+    keys, places = [s.keys for s in sums], [s.places for s in sums]
+    _dense.marginalise(keys, places, known.damping, known.damping_floor, square, right)
     return square, right
 
 
-def _groups(number: Index, seen_by: Index, count: int) -> Iterator[tuple[Index, Index]]:
-    """`count` landmarks in groups that few views see: the landmarks, ascending, and the rows of what they were seen in.
-
-    number [n] and seen_by [n] are the landmark and the view of each row; views ascend.
-    """
-    by_landmark = np.argsort(number, kind="stable")
-    ends = np.cumsum(np.bincount(number, minlength=count))
-    begins = np.append(0, ends[:-1])
-    first, last = seen_by[by_landmark[begins]], seen_by[by_landmark[ends - 1]]
-    order = np.lexsort((last, first))
-    for begin in range(0, count, GROUP_LANDMARKS):
-        landmarks = np.sort(order[begin : begin + GROUP_LANDMARKS])
-        yield landmarks, np.concatenate([by_landmark[begins[one] : ends[one]] for one in landmarks])
-
-
 def _view_normals(
-    key: int, view: View, request: RenderRequest, rotation: Array, centre: Array, mapper: Mapper
+    key: int, view: View, request: RenderRequest, rotation: Array, centre: Array, mapper: Mapper, width_px: float
 ) -> ViewNormals:
-    """Normal equations of a view for its pose and the landmarks in view, in units of white."""
+    """Normal equations of a view for its pose and the landmarks in view, `width_px` wide, in units of white."""
     level = mapper.alignment_level
     if request.warp is None:
         image, smooth, seen, certainty = _windowed(key, view, request, mapper, level)
@@ -197,7 +180,7 @@ def _view_normals(
     e = error[strong]
     scale = MAD_SCALE * (median(np.abs(e)) if len(e) else 0.0) + 1e-6
     weight = np.where(strong, certainty / (1 + (error / (ROBUST_SCALES * scale)) ** 2), 0).astype(np.float32)
-    pose, keys, places = _normals(error, du, dv, image.depth, weight, level, rotation, centre)
+    pose, keys, places = _normals(error, du, dv, image.depth, weight, level, rotation, centre, width_px)
     variance = float((weight * error**2).sum() / max(float(weight.sum()), 1e-12))
     return ViewNormals(pose, keys, places, variance)
 
@@ -208,8 +191,16 @@ def _slopes(image: Image) -> tuple[Image, Image]:
 
 
 def _normals(
-    error: Image, du: Image, dv: Image, depth: Image, weight: Image, level: Level, rotation: Array, centre: Array
-) -> tuple[Array, NDArray[np.int64], Array]:
+    error: Image,
+    du: Image,
+    dv: Image,
+    depth: Image,
+    weight: Image,
+    level: Level,
+    rotation: Array,
+    centre: Array,
+    width_px: float = SPLINE_LANDMARKS.width_px,
+) -> tuple[Array, Index, NDArray[np.float32]]:
     """Normal equations of the pixels with weight, see `ViewNormals`."""
     count, k = int((weight > 0).sum()), level.camera.intrinsics
     pose, keys, places = np.empty((6, 7)), np.empty(count, np.int64), np.empty((count, 3, 10))
@@ -225,13 +216,13 @@ def _normals(
         k.cy,
         np.ascontiguousarray(rotation),
         centre,
-        LANDMARK_PX / k.fx,
+        width_px / k.fx,
         pose,
         keys,
         places,
         **k.lens(),
     )
-    return pose, keys[:found], places[:found].copy()
+    return pose, keys[:found].copy(), places[:found].astype(np.float32)
 
 
 def pose_curvature(image: RenderedImage, level: Level, white: float, rotation: Array, centre: Array) -> Array:

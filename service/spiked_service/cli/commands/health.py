@@ -64,7 +64,8 @@ def health(
         messages.print(f"{where} does not answer: {getattr(error, 'reason', error)}", markup=False)
         raise typer.Exit(1) from error
     for check in report.get("checks", []):
-        output.print(f"{check['verdict']:8s} {check['name']}: {check['finding']}", markup=False)
+        finding = f": {check['finding']}" if check["finding"] else ""
+        output.print(f"{check['verdict']:8s} {check['name']}{finding}", markup=False)
     if report.get("status") not in ("ok", "warning"):
         raise typer.Exit(1)
 

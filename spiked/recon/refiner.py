@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from spiked.pose import Array
-from spiked.recon.mapping.pose_steps import ALIGNED_VIEWS, PoseStep
+from spiked.recon.mapping.pose_steps import ALIGNED_VIEWS, LONG_ALIGNED_VIEWS, PoseStep
 from spiked.recon.mapping.trainer import MapTrainer
 from spiked.recon.run_progress import PROGRESS_STEPS, RunProgress
 from spiked.recon.time_left import Part, RefinementPlan, TimeLeft
@@ -27,7 +27,7 @@ def plan_of(
         options.schedule.steps(most_steps, pixels, fast, extent),
         len(options.seeding.order(ids, extent)) if ids else 0,
         () if not align else options.schedule.align_long_at if long else options.schedule.align_at,
-        len(ids) if long else min(len(ids), ALIGNED_VIEWS),
+        min(len(ids), LONG_ALIGNED_VIEWS if long else ALIGNED_VIEWS),
         min(len(ids), options.pruning.views) if long else 0,
         pixels,
         trainer.mapper.cap_of(extent),

@@ -11,6 +11,7 @@ from spiked.evaluate import score_trajectory
 from spiked.pose import Array, exp_so3
 from spiked.recon import Options, Reconstructor
 from spiked.recon.frontend.feature_tracks import picture, white_of
+from spiked.recon.mapping.pose_steps import GaussNewton
 from spiked.recon.odometry.keyframe_adjuster import LONG_FRAMES
 from spiked.recon.odometry.loop_closure import LoopSearch, find_closures
 from spiked.recon.odometry.odometry import Odometry
@@ -18,6 +19,7 @@ from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import SimulatedCamera
 from spiked.simulate.motion import HandShake, Stage, hand_shake
 from spiked.simulate.room import Room
+from spiked.spline import Waypoints
 from spiked.trajectory import Trajectory
 
 SENSOR = Sensor(160, 100, 20_000.0, intrinsics=Intrinsics.from_fov(160, 100, 60))
@@ -166,6 +168,25 @@ def test_the_map_corrects_a_path_that_is_interpolated(walked: tuple[Reconstructo
     reconstructor.finish()
     after = _ate_percent(reconstructor, truth)
     assert after < 0.95 * before
+
+
+def test_an_alignment_of_many_views_takes_some_of_them(
+    walked: tuple[Reconstructor, Trajectory], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its matrix grows with the square of the views: what it corrects is interpolated between those it takes."""
+    monkeypatch.setattr("spiked.recon.mapping.pose_steps.LONG_ALIGNED_VIEWS", 20)
+    trainer, path = walked[0].trainer, walked[0].path
+    assert isinstance(path, Waypoints)
+    ids = trainer.views.mappable(path)
+    corrected = GaussNewton(trainer).improve(path, ids, 1, 0.7)
+    assert isinstance(corrected, Waypoints)
+    taken = [trainer.views[i].time for i in trainer.views.spread(ids, 20)]
+    assert len(taken) == 20 < len(ids)
+    moved = corrected.centres - path.centres
+    at = np.searchsorted(path.times, taken)
+    between = np.stack([np.interp(path.times, taken, one) for one in moved[at].T], 1)
+    np.testing.assert_allclose(moved, between, atol=1e-9)
+    assert np.abs(moved).max() > 1e-6
 
 
 def _ate_percent(reconstructor: Reconstructor, truth: Trajectory) -> float:

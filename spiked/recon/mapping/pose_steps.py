@@ -13,7 +13,10 @@ from spiked.sensor import Image
 from spiked.spline import Path, Spline, Waypoints
 
 ALIGNED_VIEWS = 160
-"""Most views of an alignment of a spline; of a path that is interpolated between views it is all that are kept."""
+"""Most views of an alignment of a spline."""
+LONG_ALIGNED_VIEWS = 800
+"""The same of a path that is interpolated between views: the matrix takes 184 MB then, and grows with the square. 400
+are nearly as good (decision 58)."""
 APART_FRAMES = 32.0
 """Frames between the two renders whose difference is compared, n of the paper (Eq 6)."""
 STEP_SHARES = 0.3, 0.05
@@ -58,6 +61,7 @@ class GaussNewton:
             times, part = [trainer.views[i].time for i in ids], trainer.options.schedule.alignment_step(self.taken)
             return align(path, times, trainer.views.images(ids), mapper, planner, self.prior, part)
         assert isinstance(path, Waypoints)
+        ids = trainer.views.spread(ids, LONG_ALIGNED_VIEWS)
         self._tracked = tracked = self._tracked or path
         times, moved_px = [trainer.views[i].time for i in ids], np.diff(trainer.views.travelled_to(ids))
         rad = 1 / trainer.camera.intrinsics.fx

@@ -12,13 +12,14 @@ from pathlib import Path
 
 import httpx
 import pytest
+from certificates import certificate
 from ports import free_port
 from waiting import until
 
 DIST = Path(__file__).parents[1] / "dist"
 FRAMES = 1280
 TOKEN = "a-token-of-this-test-0123456789"
-TOOLS = "crun", "umoci", "openssl", "unshare"
+TOOLS = "crun", "umoci", "unshare"
 NAME = f"spiked-test-{os.getpid()}"
 IN_ONE_HIERARCHY = "umount -l /sys/fs/cgroup/unified 2>/dev/null; exec crun --cgroup-manager=disabled"
 """crun refuses machines that have both versions of control groups; its own mount namespace hides the newer one."""
@@ -37,17 +38,15 @@ def bundle_of(image: Path, folder: Path, port: int) -> Path:
     tag = manifest["annotations"]["org.opencontainers.image.ref.name"]
     subprocess.run(["umoci", "unpack", "--image", f"{layout}:{tag}", bundle], check=True, capture_output=True)
     tls.mkdir()
-    command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
-    command += ["-subj", "/CN=localhost", "-keyout", str(tls / "key.pem"), "-out", str(tls / "chain.pem")]
-    subprocess.run(command, check=True, capture_output=True)
-    (tls / "key.pem").chmod(0o644)  # the service is not root
+    chain, key = certificate(tls, "localhost")
+    key.chmod(0o644)  # the service is not root
     config = bundle / "config.json"
     made = json.loads(config.read_text())
     assert made["process"]["user"]["uid"] == 8650
     made["process"]["terminal"] = False
     made["process"]["args"] += ["--device", "sim:", "--frames", str(FRAMES)]
     made["process"].pop("oomScoreAdj", None)  # may not be lowered everywhere
-    given = {"TOKEN": TOKEN, "PORT": str(port), "TLS_CERTIFICATE": "/tls/chain.pem", "TLS_KEY": "/tls/key.pem"}
+    given = {"TOKEN": TOKEN, "PORT": str(port), "TLS_CERTIFICATE": f"/tls/{chain.name}", "TLS_KEY": f"/tls/{key.name}"}
     made["process"]["env"] += [f"SPIKED_{name}={value}" for name, value in given.items()]
     made["mounts"] = [one for one in made["mounts"] if one["destination"] != "/sys/fs/cgroup"]
     made["mounts"].append({"destination": "/tls", "type": "bind", "source": str(tls), "options": ["bind", "ro"]})

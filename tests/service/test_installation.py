@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import typer
+from certificates import certificate
 from spiked_service.cli.commands.health import address_of, health
 from spiked_service.cli.main import app
 from spiked_service.operations import installation
@@ -25,7 +26,6 @@ from typer.testing import CliRunner
 from spiked.errors import ConfigurationError
 
 from .store.test_migrations import SCHEMAS, made_of
-from .test_operations import certificate
 
 
 def found(data: Path, config: Path | None = None) -> dict[str, Diagnosis]:

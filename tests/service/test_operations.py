@@ -16,6 +16,7 @@ from typing import Any
 
 import httpx
 import pytest
+from certificates import certificate
 from spiked_service.base.health import CheckResult, CheckStatus, EventLoopHeartbeat, Health, failed
 from spiked_service.operations.systemd import SystemdNotifier
 from spiked_service.settings.reload import ReloadableSettings
@@ -195,18 +196,6 @@ def test_an_event_loop_that_hangs_is_seen() -> None:
 
     asyncio.run(loop())
     assert seen == [CheckStatus.OK, CheckStatus.OK, CheckStatus.FAILED]
-
-
-def certificate(folder: Path, name: str) -> tuple[Path, Path]:
-    """A self-signed one for 127.0.0.1."""
-    key, chain = folder / f"{name}.key", folder / f"{name}.crt"
-    command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
-    command += ["-keyout", str(key), "-out", str(chain), "-days", "2", "-subj", f"/CN={name}"]
-    try:
-        subprocess.run([*command, "-addext", "subjectAltName=IP:127.0.0.1"], capture_output=True, check=True)
-    except FileNotFoundError:
-        pytest.skip("needs openssl to make a certificate")
-    return chain, key
 
 
 def test_tls_with_a_certificate_that_is_changed_while_serving(daemon: Callable[..., Any], tmp_path: Path) -> None:

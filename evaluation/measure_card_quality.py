@@ -1,11 +1,11 @@
 """Compare the map of a live capture through a capture card with that of the same frames in a file.
 
-    .venv/bin/python evaluation/measure_card_quality.py STREAM_DIR [--steps 150] [--rate 30]
+    .venv/bin/python evaluation/measure_card_quality.py STREAM_DIR [--steps 2000] [--rate 30] [--page PICTURE.png]
 
 STREAM_DIR: a 1000x1000 stream with truth, as `spiked simulate` writes it. The virtual card of tests writes its frames
 once into a pipe, at `--rate` frames a second so that the tracker need not skip any; a daemon captures from it as
 `pcie:PIPE` with live reconstruction. The same frames are reconstructed from the file with the same number of steps.
-Both results are scored by `spiked evaluate`.
+Both results are scored by `spiked evaluate`. `--page` keeps a picture of the page that shows the live job's scene.
 """
 
 import argparse
@@ -29,10 +29,13 @@ from virtual_card import virtual_card
 
 SPIKED = Path(sys.executable).with_name("spiked")
 PATIENCE_S = 1800.0
+FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+SETTLES_MS = 20_000
+"""Until a scene is fetched and drawn by software."""
 SHOWN = ("coverage", "ate_percent", "rpe_r_deg", "psnr_db", "worst_psnr_db", "ssim")
 
 
-def live(recording: Path, out: Path, steps: int, rate: float) -> tuple[bool, int]:
+def live(recording: Path, out: Path, steps: int, rate: float, page: Path | None) -> tuple[bool, int]:
     """Write trajectory and scene of the live job into `out`; whether the recording is bit-exact, and frames tracked."""
     whole = open_recording(recording)
     sensor = whole.sensor
@@ -59,9 +62,22 @@ def live(recording: Path, out: Path, steps: int, rate: float) -> tuple[bool, int
             print(f"live job: {done.state}, {done.reason}", file=sys.stderr)
             (out / "trajectory.tum").write_bytes(client.trajectory_file(job))
             (out / "scene.ply").write_bytes(client.scene(job))
+            if page is not None:
+                look(f"{address}/?page=scene&capture={capture_id}", page)
             stored = client.save_recording(capture_id, Path(folder) / "stored.dat")
             same = np.array_equal(np.fromfile(stored, np.uint8), compact.reshape(-1))
             return same, done.poses
+
+
+def look(address: str, picture: Path) -> None:
+    """Keep a picture of a page that draws a scene."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver, driver.chromium.launch(args=FLAGS) as browser:
+        shown = browser.new_page(viewport={"width": 1400, "height": 900})
+        shown.goto(address)
+        shown.wait_for_timeout(SETTLES_MS)
+        shown.screenshot(path=picture)
 
 
 def scores(result: Path, recording: Path) -> dict[str, float]:
@@ -76,8 +92,9 @@ def scores(result: Path, recording: Path) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("stream", type=Path)
-    parser.add_argument("--steps", type=int, default=150)
+    parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--rate", type=float, default=30.0)
+    parser.add_argument("--page", type=Path, metavar="PICTURE.png")
     given = parser.parse_args()
     recording = next(given.stream.glob("*.dat"))
     print(f"| {recording.stem} | " + " | ".join(SHOWN) + " | s |\n|" + "---|" * (len(SHOWN) + 2), flush=True)
@@ -86,7 +103,7 @@ def main() -> None:
             out, begin = Path(folder) / name, time.monotonic()
             if name == "live":
                 out.mkdir()
-                same, poses = live(recording, out, given.steps, given.rate)
+                same, poses = live(recording, out, given.steps, given.rate, given.page)
             else:
                 command = [str(SPIKED), "reconstruct", str(recording), "-o", str(out), "--steps", str(given.steps)]
                 subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

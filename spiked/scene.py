@@ -118,9 +118,11 @@ class Scene:
         return some if self.harmonics is None else replace(some, harmonics=self.harmonics[rows])
 
     def join(self, other: "Scene") -> "Scene":
-        """These Gaussians followed by those of `other`; where one scene has harmonics, the other's are 0."""
+        """These Gaussians followed by those of `other`; where one scene has harmonics, the other's are 0. White is the
+        brighter one of the two."""
         pairs = zip(self.arrays(), other.arrays(), strict=True)
-        both = _scene((np.concatenate(pair) for pair in pairs), self.white)
+        whites = [one.white for one in (self, other) if one.white is not None]
+        both = _scene((np.concatenate(pair) for pair in pairs), max(whites, default=None))
         count = COEFFICIENTS[max(self.degree, other.degree)]
         if not count:
             return both

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +118,11 @@ def test_a_ply_of_another_program_does_not_say_its_radiance(scene: Scene, tmp_pa
     back = Scene.read_ply(tmp_path / "s.ply")
     assert back.white is None and back.colour_of_white == 1
     assert back.select(np.arange(3)).join(back).white is None
+
+
+def test_white_of_joined_scenes_is_the_brighter_one(scene: Scene) -> None:
+    dim, bright = replace(scene, white=0.2), replace(scene, white=0.3)
+    assert dim.join(bright).white == bright.join(dim).white == scene.join(bright).white == 0.3
 
 
 def test_bad_scenes_are_refused(scene: Scene, tmp_path: Path) -> None:

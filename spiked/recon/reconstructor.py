@@ -273,7 +273,7 @@ class Reconstructor:
     @property
     def white(self) -> float:
         """The radiance (spikes a frame) that should be shown as white."""
-        return self.trainer.mapper.white
+        return self.trainer.mapper.shown_white
 
     def view(self, rotation: Array, centre: Array) -> Image:
         """The map from a pose (camera-to-world, trajectory's unit): radiance [H, W, C], float32."""

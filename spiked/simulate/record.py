@@ -36,6 +36,13 @@ _COVERAGE_STRIDE = 64
 _PAIRS = 100_000
 """Points times poses that are projected at a time."""
 
+_BESIDE = 0.015
+"""Standard deviation of a view beside the path, along and about each axis: radians, and shares of the median depth."""
+
+_SEEN_SHARE, _DRAWS = 0.999, 32
+"""Coverage from which a drawn view beside the path is taken, and the draws of which else the best is: what no frame
+saw cannot be reconstructed, and would score the scene's corners instead of the reconstruction."""
+
 
 def camera_of_files(
     sensor: Sensor,
@@ -82,8 +89,9 @@ def simulate(
 
     The folder, which must be new or empty, then holds NAME.dat, its sidecar NAME.json, groundtruth.tum (a pose for the
     middle of each frame), and `views` held-out noise-free pictures in views/ with their poses in views.json, evenly
-    spread over time; every other one lies beside the path, drawn by `seed`. These pictures have no distortion; of a
-    lens with distortion, views_lens/ has pictures of the same poses as the lens shows them. If the camera interpolates
+    spread over time; every other one lies beside the path, drawn by `seed` so that some frame saw each of its points,
+    if that can be had. These pictures have no distortion; of a lens with distortion, views_lens/ has pictures of the
+    same poses as the lens shows them. If the camera interpolates
     between exact pictures, `simulation.interpolation` of the sidecar is the error of that, measured as in
     `InterpolationError`.
     Memory does not grow with `frames`. `progress` is called with the number of frames written. Raises RecordingError
@@ -198,9 +206,10 @@ def _write_views(camera: SimulatedCamera, folder: Path, frames: int, *, views: i
         on_path = number % 2 == 0
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotations[number], centres[number]
+        nearest = int(frame) // _COVERAGE_STRIDE
+        covered = _coverage(camera, pose, path, nearest)
         if not on_path:
-            pose[:3, 3] += 0.015 * median_depth * rng.standard_normal(3)
-            pose[:3, :3] = pose[:3, :3] @ exp_so3(0.015 * rng.standard_normal(3))
+            pose, covered = _beside(camera, pose, path, nearest, median_depth, rng)
         files = {"file": f"views/{number:02d}.png"}
         _write_view(camera, pose, folder / files["file"], undistorted=True)
         if through_lens:
@@ -212,7 +221,7 @@ def _write_views(camera: SimulatedCamera, folder: Path, frames: int, *, views: i
                 "on_trajectory": on_path,
                 "timestamp": (int(frame) + 0.5) / camera.sensor.frame_rate_hz,
                 "c2w": pose.tolist(),
-                "coverage": _coverage(camera, pose, path, int(frame) // _COVERAGE_STRIDE),
+                "coverage": covered,
             }
         )
     table = {
@@ -223,6 +232,28 @@ def _write_views(camera: SimulatedCamera, folder: Path, frames: int, *, views: i
         "views": entries,
     }
     (folder / "views.json").write_text(json.dumps(table, indent=1), encoding="utf-8")
+
+
+def _beside(
+    camera: SimulatedCamera,
+    pose: Array,
+    path: tuple[Array, Array],
+    nearest: int,
+    median_depth: float,
+    rng: np.random.Generator,
+) -> tuple[Array, float]:
+    """A random pose beside one of the path, and its coverage."""
+    best, most = pose, -1.0
+    for _ in range(_DRAWS):
+        drawn = pose.copy()
+        drawn[:3, 3] += _BESIDE * median_depth * rng.standard_normal(3)
+        drawn[:3, :3] = pose[:3, :3] @ exp_so3(_BESIDE * rng.standard_normal(3))
+        covered = _coverage(camera, drawn, path, nearest)
+        if covered > most:
+            best, most = drawn, covered
+        if covered >= _SEEN_SHARE:
+            break
+    return best, most
 
 
 def _write_view(camera: SimulatedCamera, pose: Array, path: Path, *, undistorted: bool) -> None:

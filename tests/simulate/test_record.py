@@ -15,6 +15,7 @@ from spiked.render import Camera, Rasteriser
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Layout, Mosaic, Sensor
 from spiked.simulate import SensorNoise, SimulatedCamera
+from spiked.simulate.motion import Recorded
 from spiked.simulate.record import camera_of_files, simulate
 from spiked.trajectory import Trajectory
 
@@ -48,6 +49,20 @@ def test_the_folder_holds_what_the_camera_saw(tmp_path: Path, mosaic: Mosaic | N
         nearest = np.abs(centres - pose[:3, 3]).sum(1).min()
         assert (nearest < 1e-6) == view["on_trajectory"]
         assert 0.8 < view["coverage"] <= 1
+
+
+def test_views_beside_the_path_show_what_its_frames_saw(tmp_path: Path) -> None:
+    """The camera pans to and fro about all axes by more than a view beside the path is turned and moved."""
+    sensor = Sensor(96, 60, 20000.0)
+    start = SimulatedCamera(sensor, 1).motion.poses([0.0])
+    angles = np.array([[0.0, 0, 0], [0.08, 0, 0], [-0.08, 0, 0], [0, 0.08, 0], [0, -0.08, 0], [0, 0, 0]])
+    turn = np.array([cv2.Rodrigues(angle)[0] for angle in angles])
+    motion = Recorded(np.linspace(0, 1280, 6), start[0] @ turn, np.repeat(start[1], 6, 0))
+    path = simulate(SimulatedCamera(sensor, 1, motion, step_px=2.0), tmp_path / "pan", "pan", 1280, views=12)
+    views = json.loads((path.parent / "views.json").read_text())["views"]
+    assert all(view["coverage"] >= 0.999 for view in views)
+    beside = np.array([view["c2w"] for view in views if not view["on_trajectory"]])
+    assert len(beside) == 6 and np.linalg.norm(beside[:, :3, 3] - start[1], axis=1).min() > 0.01
 
 
 def test_nothing_is_written_over(tmp_path: Path) -> None:

@@ -31,8 +31,6 @@ RATE = 2000
 FRAMES = 1000
 FOV_DEG = 60.0
 OVER = ("complete", "failed")
-MOST_FRAMES_OFF = 1
-"""Error of the offset of two cameras, at most: docs/recordings.md has up to 0.26 frames."""
 
 
 @pytest.fixture(scope="module")
@@ -231,7 +229,11 @@ def test_frames_are_timed_within_a_millisecond_on_a_busy_machine(
     assert np.abs(rates_hz / RATE - 1).max() < 0.01, rates_hz
 
 
+# The error is up to 129 us on busy cores and 45 us on idle ones (docs/recordings.md).
+@pytest.mark.parametrize(("rate", "most_frames_off"), [(RATE, 1), pytest.param(20_000, 3, marks=pytest.mark.slow)])
 def test_two_cameras_share_a_time_base(
+    rate: int,
+    most_frames_off: int,
     cameras: Callable[..., VirtualCameras],
     daemon: Callable[..., Any],
     room: Path,
@@ -240,8 +242,8 @@ def test_two_cameras_share_a_time_base(
 ) -> None:
     ports = ("2-1", "2-2")
     rig = cameras(
-        *(CameraSettings(str(room), rate_hz=RATE, buffer_frames=200, port=port) for port in ports),
-        usbfs_memory_mb=64,
+        *(CameraSettings(str(room), rate_hz=rate, buffer_frames=rate // 10, port=port) for port in ports),
+        usbfs_memory_mb=256,
         own_processes=True,
     )
     try:
@@ -249,8 +251,8 @@ def test_two_cameras_share_a_time_base(
     except PermissionError:
         pytest.skip("needs real-time priority for the virtual cameras")
     http = daemon("--no-capture", seen=rig).http
-    sources = [f"usb:{port}?rate={RATE}&transfer_kib=64" for port in ports]
-    plans = [{"source": source, "frames": 10 * RATE, "reconstruct": False} for source in sources]
+    sources = [f"usb:{port}?rate={rate}&transfer_kib={64 if rate == RATE else 1024}" for port in ports]
+    plans = [{"source": source, "frames": 10 * rate, "reconstruct": False} for source in sources]
     group = http.post("groups", json={"captures": plans}).json()
     ids = [one["id"] for one in group["captures"]]
     began_s = []
@@ -259,20 +261,20 @@ def test_two_cameras_share_a_time_base(
         until(lambda one=capture_id: http.get(f"captures/{one}").json()["state"] in OVER, "it ends")  # type: ignore[misc]
         recording = open_recording(tmp_path / "data" / "captures" / capture_id / "recording.dat")
         numbers = recording.compact(0, recording.frames)[:, :8].copy().view("<i8")[:, 0]
-        assert recording.frames == 10 * RATE and not recording.gaps
+        assert recording.frames == 10 * rate and not recording.gaps
         repeated = sent(room, range(FRAMES))[:, 8:]
         for first, frames in recording.chunks(FRAMES):
             assert (frames[:, 8:] == repeated[numbers[first : first + len(frames)] % FRAMES]).all()
-        began_s.append(rig.report(number).start_s + numbers[0] / RATE)
+        began_s.append(rig.report(number).start_s + numbers[0] / rate)
         recordings.append(recording)
     found, true_s = offset(*recordings), began_s[1] - began_s[0]
     error_us = 1e6 * (found.seconds - true_s)
-    figure("offset of two cameras", f"{error_us:+.0f} us", f"a frame is {1e6 / RATE:.0f} us")
+    figure("offset of two cameras", f"{error_us:+.0f} us", f"a frame is {1e6 / rate:.0f} us")
     assert found.sigma_s is not None
     (told,) = http.get(f"groups/{group['id']}").json()["offsets"]
     assert (told["offset_s"], told["sigma_s"]) == (found.seconds, found.sigma_s)
     figure("its standard deviation", f"{1e6 * found.sigma_s:.0f} us", "")
-    assert abs(error_us) < MOST_FRAMES_OFF * 1e6 / RATE, (found.seconds, true_s)
+    assert abs(error_us) < most_frames_off * 1e6 / rate, (found.seconds, true_s)
 
 
 def test_a_rate_that_is_not_the_stated_one_is_a_warning(

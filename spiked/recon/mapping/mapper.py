@@ -35,6 +35,8 @@ NUISANCES_FROM = 50
 """Steps before view brightness is estimated: the map has to converge roughly first (decision 5)."""
 GAINS_FROM = 800
 """Steps before pixel gains are estimated: earlier they absorb errors of the geometry (decision 13)."""
+BRIGHTER = 1.05
+"""Step by which a map's white rises: each changes the colours of all splats that a page has."""
 NUISANCE_STEPS = 200
 """Steps between estimates of the pixel gains."""
 
@@ -59,7 +61,11 @@ class Mapper:
         self.channels = self.levels[0].channels
         self.descent = descent_for(Scene.empty(self.colours), *BETAS, threads)
         self.white = 1.0
-        """The radiance (spikes a frame) that is shown as white: `WHITE_PERCENTILE` of the first seeded view."""
+        """The radiance (spikes a frame) in whose units losses and rates are: `WHITE_PERCENTILE` of the first seeded
+        view."""
+        self.shown_white = 1.0
+        """The radiance that should be shown as white: the largest `WHITE_PERCENTILE` of all seeded views, in steps of
+        `BRIGHTER`; viewers cut off what is brighter."""
         self.depth = 1.0
         """Typical depth of the scene; the learning rate of the means is relative to it."""
         self.nuisances = Nuisances(sensor.height, sensor.width)
@@ -111,8 +117,8 @@ class Mapper:
             alpha = self.rasteriser.forward(self.scene, swept.rotation[None], swept.centre[None]).alpha
             empty = alpha < seeding.opacity
         else:
-            self.white = float(np.percentile(rate, WHITE_PERCENTILE))
             empty = np.ones(rate.shape, bool)
+        self._adapt_white(rate)
         empty &= swept.sweep.confidence >= surer
         stride = seeding.stride(rate.size, int(self.cap / self.extent), self.options.stride_px)
         chosen = seeding.pixels(empty, stride, self.cap - len(self))
@@ -127,12 +133,20 @@ class Mapper:
     def seed_view(self, view: View, rotation: Array, centre: Array, depth: Image) -> None:
         """Begin the map with one view at a depth for each pixel [H, W]."""
         rate, seeding = view.rate, self.options.seeding
-        self.white = float(np.percentile(rate, WHITE_PERCENTILE))
+        self._adapt_white(rate)
         stride = seeding.stride(rate.size, int(self.cap / self.extent), self.options.stride_px)
         chosen = seeding.pixels(np.ones(rate.shape, bool), stride, self.cap)
         if chosen is not None:
             colours = fill_mosaic(rate, self.channels)[chosen]
             self._add(chosen, depth[chosen], colours, stride, rotation, centre)
+
+    def _adapt_white(self, rate: Image) -> None:
+        """Before the splats of a seeded view with these rates are added."""
+        bright = float(np.percentile(rate, WHITE_PERCENTILE))
+        if len(self) == 0:
+            self.white = self.shown_white = bright
+        elif bright > BRIGHTER * self.shown_white:
+            self.shown_white = bright
 
     def _add(
         self,

@@ -37,6 +37,8 @@ GAINS_FROM = 800
 """Steps before pixel gains are estimated: earlier they absorb errors of the geometry (decision 13)."""
 BRIGHTER = 1.05
 """Step by which a map's white rises: each changes the colours of all splats that a page has."""
+NOISE_PX = 3, 3
+"""Pixels over whose mean a view's white is taken."""
 NUISANCE_STEPS = 200
 """Steps between estimates of the pixel gains."""
 
@@ -64,8 +66,8 @@ class Mapper:
         """The radiance (spikes a frame) in whose units losses and rates are: `WHITE_PERCENTILE` of the first seeded
         view."""
         self.shown_white = 1.0
-        """The radiance that should be shown as white: the largest `WHITE_PERCENTILE` of all seeded views, in steps of
-        `BRIGHTER`; viewers cut off what is brighter."""
+        """The radiance that should be shown as white: that of the brightest seeded view, in steps of `BRIGHTER`; viewers
+        cut off what is brighter."""
         self.depth = 1.0
         """Typical depth of the scene; the learning rate of the means is relative to it."""
         self.nuisances = Nuisances(sensor.height, sensor.width)
@@ -142,10 +144,11 @@ class Mapper:
 
     def _adapt_white(self, rate: Image) -> None:
         """Before the splats of a seeded view with these rates are added."""
-        bright = float(np.percentile(rate, WHITE_PERCENTILE))
         if len(self) == 0:
-            self.white = self.shown_white = bright
-        elif bright > BRIGHTER * self.shown_white:
+            self.white = self.shown_white = float(np.percentile(rate, WHITE_PERCENTILE))
+        # Without the noise, of which the brightest of many views would have the most.
+        bright = float(np.percentile(cv2.blur(fill_mosaic(rate, self.channels), NOISE_PX), WHITE_PERCENTILE))
+        if bright > BRIGHTER * self.shown_white:
             self.shown_white = bright
 
     def _add(

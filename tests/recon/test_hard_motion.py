@@ -114,3 +114,13 @@ def test_a_burst_of_six_pixels_a_frame_is_told_and_the_path_goes_on_behind_it() 
     assert any(state is State.RELOC and "found again" in reason for _, state, reason in changes), changes
     times = reconstructor.trajectory().times_s * SENSOR.frame_rate_hz
     assert not ((times > 408) & (times < 416)).any(), "no poses are invented in the burst"
+
+
+def test_a_recording_that_ends_with_little_parallax_has_a_rough_path() -> None:
+    """30 ms of a slow hand, 0.3 px of parallax: a first map of a path that goes on would wait for more."""
+    assert SENSOR.intrinsics is not None
+    motion = make_motion(MotionKind.ARC, Room(False, 2).stage(SENSOR.intrinsics, 0.03, 0.04), 2)
+    reconstructor, error, covered = followed(motion, 600)
+    status = reconstructor.status()
+    assert status.state is State.DEGRADED and "only known to about" in status.reason
+    assert covered == 1 and error < 10, error

@@ -10,7 +10,7 @@ from spiked.evaluate import score_trajectory
 from spiked.pose import exp_so3
 from spiked.recon import Options, Reconstructor, State
 from spiked.recon.odometry.bundle_adjustment import Bundle
-from spiked.recon.odometry.initialisation import Views
+from spiked.recon.odometry.initialisation import LeastParallax, Views
 from spiked.recon.odometry.normal_equations import FreeOptics
 from spiked.recon.odometry.self_calibration import MAX_FOCAL_SIGMA, Focal, try_optics
 from spiked.recording import open_recording
@@ -46,14 +46,14 @@ def test_adjustment_finds_the_focal_length() -> None:
 
 def test_the_first_map_is_found_without_a_focal_length() -> None:
     pixels, *_ = tracks(0.25, 0.3)
-    verdict, found = try_optics(Views(pixels, np.arange(pixels.shape[1]), GUESS), 0, 0.8, False)
+    verdict, found = try_optics(Views(pixels, np.arange(pixels.shape[1]), GUESS), 0, LeastParallax(0.8), False)
     assert verdict.winner is not None, verdict.reason
     assert found.fx == pytest.approx(K.fx, rel=0.03)
 
 
 def test_turning_with_an_unknown_focal_length_is_not_taken_for_moving() -> None:
     pixels, *_ = tracks(0.15, 0.0)
-    verdict, _ = try_optics(Views(pixels, np.arange(pixels.shape[1]), GUESS), 0, 1.2, False)
+    verdict, _ = try_optics(Views(pixels, np.arange(pixels.shape[1]), GUESS), 0, LeastParallax(1.2), False)
     assert verdict.winner is None and verdict.needs_motion and "parallax" in verdict.reason
 
 

@@ -66,8 +66,8 @@ class Mapper:
         """The radiance (spikes a frame) in whose units losses and rates are: `WHITE_PERCENTILE` of the first seeded
         view."""
         self.shown_white = 1.0
-        """The radiance that should be shown as white: that of the brightest seeded view, in steps of `BRIGHTER`; viewers
-        cut off what is brighter."""
+        """The radiance that should be shown as white, of the brightest seeded view, in steps of `BRIGHTER`: viewers cut
+        off what is brighter."""
         self.depth = 1.0
         """Typical depth of the scene; the learning rate of the means is relative to it."""
         self.nuisances = Nuisances(sensor.height, sensor.width)

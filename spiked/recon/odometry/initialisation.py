@@ -24,10 +24,6 @@ INLIER_PX = 1.0
 """Largest reprojection error of an inlier."""
 LEAST_INLIERS = 0.6
 """Share of inliers that an initialisation needs."""
-MIN_PARALLAX_PX = 0.5
-"""Parallax (image motion beyond rotation) that a bootstrap needs; tracks are good to 0.05 px (decision 12)."""
-PARALLAX_NOISES = 5.0
-"""Parallax over the tracks' noise that an initialisation needs: with less, depths are noise."""
 SAME_SCENE_CORRELATION = 0.8
 """Correlation of inverse depths above which two results are the same scene."""
 WORSE_RATIO = 1.1
@@ -58,6 +54,20 @@ class Guess(StrEnum):
     RANDOM = "random"
     FIVE_POINT = "five_point"
     MIRROR = "mirror"
+
+
+@dataclass(frozen=True)
+class LeastParallax:
+    """Parallax (image motion beyond rotation) that a bootstrap needs."""
+
+    px: float = 0.5
+    """Tracks are good to 0.05 px (decision 12)."""
+    noises: float = 5.0
+    """Parallax over the tracks' noise: with less, depths are noise."""
+
+
+FULL_PARALLAX, ROUGH_PARALLAX = LeastParallax(), LeastParallax(0.15, 2.0)
+"""For a path that goes on, and for a recording that ends without one (decision 61)."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +120,7 @@ class InitialisationResult:
     """More sideways motion would make the depths observable."""
 
 
-def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = MIN_PARALLAX_PX) -> InitialisationResult:
+def bootstrap(views: Views, seed: int = 0, least: LeastParallax = FULL_PARALLAX) -> InitialisationResult:
     """Try all guesses on `views`. Accepts when there is enough parallax for the noise of the tracks, inliers > 60 % and
     every different outcome, the depth-reversed one above all, is clearly worse."""
     if len(views.ids) < MIN_TRACKS:
@@ -118,8 +128,8 @@ def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = MIN_PARALLAX
             None, f"only {len(views.ids)} tracks span the views; more texture or light is needed", [], views.ids
         )
     rotation_only = parallax_px(views)
-    if rotation_only < min_parallax_px:
-        reason = f"parallax {rotation_only:.1f} px is below {min_parallax_px:g}"
+    if rotation_only < least.px:
+        reason = f"parallax {rotation_only:.1f} px is below {least.px:g}"
         return InitialisationResult(None, reason, [], views.ids, needs_motion=True)
     rng = np.random.default_rng(seed)
     count = len(views.ids)
@@ -134,7 +144,7 @@ def bootstrap(views: Views, seed: int = 0, min_parallax_px: float = MIN_PARALLAX
         if bundle is None:
             continue
         tried.append(_converge(guess, bundle, rotation_only))
-        wanted = PARALLAX_NOISES * tried[0].noise_px()
+        wanted = least.noises * tried[0].noise_px()
         if rotation_only < wanted and tried[0].inliers > LEAST_INLIERS:
             reason = f"parallax {rotation_only:.1f} px is below {wanted:.1f} for tracks this noisy"
             return InitialisationResult(None, reason, tried, views.ids, wanted, needs_motion=True)

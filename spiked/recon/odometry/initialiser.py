@@ -1,17 +1,19 @@
 """Selects the views of the initialisation, decides when to attempt it, and starts the map from its result."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
 
 from spiked.recon.odometry.initialisation import (
     BOOT_VIEWS,
+    FULL_PARALLAX,
     INLIER_PX,
     LEAST_INLIERS,
-    MIN_PARALLAX_PX,
+    ROUGH_PARALLAX,
     InitialisationResult,
+    LeastParallax,
     Views,
 )
 from spiked.recon.odometry.motion_segmentation import initialise
@@ -43,15 +45,16 @@ class Initialiser:
     """The camera is live: reasons advise how to move it."""
     _start: int = 0
     """Id of the first view of the next attempt."""
-    _min_parallax_px: float = MIN_PARALLAX_PX
+    _least: LeastParallax = FULL_PARALLAX
     _min_views: int = 0
 
-    def attempt(self, final: bool = False) -> bool:
-        """Attempt after a new view, if there are enough of them and enough new ones; `final`: it is the last one.
+    def attempt(self, final: bool = False, stood: bool = True) -> bool:
+        """Attempt after a new view, if there are enough of them and enough new ones; `final`: it is the last one. Views
+        before the camera `stood` still are left out.
 
         Returns whether the map was initialised: then all views from the first of the attempt on have poses.
         """
-        self._move_start()
+        self._move_start(stood)
         views = self.map.views[self._start :]
         count, time = len(views), self.map.views[-1].time
         advice = MOVE_NOW if self.live and not final else MOVE_AGAIN
@@ -66,7 +69,9 @@ class Initialiser:
         result = self._solve(chosen)
         if result.winner is None:
             if result.tried:
-                self._min_parallax_px = max(MIN_PARALLAX_PX, NEXT_PARALLAX_SHARE * result.wanted_parallax_px)
+                self._least = replace(
+                    self._least, px=max(FULL_PARALLAX.px, NEXT_PARALLAX_SHARE * result.wanted_parallax_px)
+                )
                 self._min_views = int(NEXT_VIEWS_RATIO * count) + 1
             self.status.set(time, State.BOOT, f"{result.reason}: {advice}" if result.needs_motion else result.reason)
             return False
@@ -87,18 +92,27 @@ class Initialiser:
             self.status.explain(f"the recording is too short: {count} views, a first map needs {BOOT_VIEWS}")
         elif self.attempt(final=True):
             return True
-        self.status.explain(self._stationary_reason() or self.status.reason)
+        reason, stationary = self.status.reason, self._stationary_reason()
+        if count >= BOOT_VIEWS and stationary is None and self._rough_attempt():
+            return True
+        self.status.explain(stationary or reason)
         return False
 
-    def _move_start(self) -> None:
-        """Move the first view forward until it shares tracks with the newest, and behind a standstill."""
+    def _rough_attempt(self) -> bool:
+        """With as little parallax as tells depths at all, from the first view on that shares tracks with the newest: a
+        rough path is better than none."""
+        self._start, self._least = 0, ROUGH_PARALLAX
+        return self.attempt(final=True, stood=False)
+
+    def _move_start(self, stood: bool) -> None:
+        """Move the first view forward until it shares tracks with the newest, and behind a standstill if it `stood`."""
         views, newest = self.map.views, self.map.views[-1]
         common = np.intersect1d(views[self._start].ids, newest.ids)
         while len(common) < MIN_COMMON_TRACKS and self._start < len(views) - BOOT_VIEWS:
             self._start += 1
             common = np.intersect1d(views[self._start].ids, newest.ids)
             self._min_views = 0
-        if len(common) >= MIN_COMMON_TRACKS and self._start < newest.id:
+        if stood and len(common) >= MIN_COMMON_TRACKS and self._start < newest.id:
             moved = np.linalg.norm(newest.pixels_of(common) - views[self._start].pixels_of(common), axis=1)
             if np.median(moved) < STOOD_PX:
                 self._start, self._min_views = newest.id, 0
@@ -109,9 +123,9 @@ class Initialiser:
         pixels = np.stack([view.pixels_of(common) for view in chosen])
         views = Views(pixels, common, self.map.intrinsics)
         if self.map.lens_known or self.map.lens is not None:
-            return initialise(views, self.seed, self._min_parallax_px)
+            return initialise(views, self.seed, self._least)
         known = self.map.focal is None
-        result, self.map.intrinsics = try_optics(views, self.seed, self._min_parallax_px, focal_known=known)
+        result, self.map.intrinsics = try_optics(views, self.seed, self._least, focal_known=known)
         if self.map.intrinsics.distortion is not None:
             self.map.lens = EstimatedLens(self.map.intrinsics, np.inf)
         return result

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.recon.odometry.initialisation import (
-    MIN_PARALLAX_PX,
+    FULL_PARALLAX,
     Hypothesis,
     InitialisationResult,
+    LeastParallax,
     Views,
     bootstrap,
     converge_without,
@@ -32,9 +33,9 @@ CLUSTERING_ROUNDS = 20
 """Most iterations of the 2-means clustering."""
 
 
-def initialise(views: Views, seed: int = 0, min_parallax_px: float = MIN_PARALLAX_PX) -> InitialisationResult:
+def initialise(views: Views, seed: int = 0, least: LeastParallax = FULL_PARALLAX) -> InitialisationResult:
     """As `bootstrap`, without the tracks of distinct motion if they contradict the others."""
-    result = bootstrap(views, seed, min_parallax_px)
+    result = bootstrap(views, seed, least)
     if not result.tried:
         return result
     apart = moving_apart(views)
@@ -48,7 +49,7 @@ def initialise(views: Views, seed: int = 0, min_parallax_px: float = MIN_PARALLA
         if UNCHANGED_RATIO[0] < np.median(_agreement(refitted)) / np.median(before) < UNCHANGED_RATIO[1]:
             return result
     rest = replace(views, pixels=views.pixels[:, ~apart], ids=views.ids[~apart])
-    other = bootstrap(rest, seed, min_parallax_px)
+    other = bootstrap(rest, seed, least)
     if other.winner is None or np.median(_agreement(other.winner)) > IMPROVED_RATIO * np.median(before):
         return result
     return other

@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 from spiked.distortion import Distortion, LensModel
 from spiked.errors import ConfigurationError
 from spiked.recon.odometry.bundle_adjustment import Bundle
-from spiked.recon.odometry.initialisation import INLIER_PX, SCALE_PX, InitialisationResult, Views, parallax_px
+from spiked.recon.odometry.initialisation import (
+    INLIER_PX,
+    SCALE_PX,
+    InitialisationResult,
+    LeastParallax,
+    Views,
+    parallax_px,
+)
 from spiked.recon.odometry.motion_segmentation import initialise
 from spiked.recon.odometry.normal_equations import FreeOptics, PoseBlocks
 from spiked.sensor import Intrinsics
@@ -114,7 +121,7 @@ def optics_moved(before: Intrinsics, after: Intrinsics) -> bool:
 
 
 def try_optics(
-    views: Views, seed: int, min_parallax_px: float, focal_known: bool
+    views: Views, seed: int, least: LeastParallax, focal_known: bool
 ) -> tuple[InitialisationResult, Intrinsics]:
     """Initialise as a pinhole camera and through a lens, with each field of view if the focal length is not known.
 
@@ -127,17 +134,17 @@ def try_optics(
         starts = [replace(views, intrinsics=_with_field(views.intrinsics, fov)) for fov in FIELDS_OF_VIEW_DEG]
         # A wrong focal length turns rotation into apparent parallax: the smallest parallax of all trials counts.
         turning = min(parallax_px(one) for one in starts)
-        if turning < min_parallax_px:
-            reason = f"parallax {turning:.1f} px is below {min_parallax_px:g} for any focal length"
+        if turning < least.px:
+            reason = f"parallax {turning:.1f} px is below {least.px:g} for any focal length"
             return InitialisationResult(None, reason, [], views.ids, needs_motion=True), views.intrinsics
-    results = [initialise(one, seed, min_parallax_px) for one in starts]
+    results = [initialise(one, seed, least) for one in starts]
     straight = _best(results, FreeOptics(focal=not focal_known))
     if straight is None:
         return results[0], views.intrinsics
     lenses = [
         replace(one, intrinsics=replace(one.intrinsics, distortion=lens)) for lens in FIRST_LENSES for one in starts
     ]
-    results = [initialise(one, seed, min_parallax_px) for one in lenses if not one.intrinsics.folds]
+    results = [initialise(one, seed, least) for one in lenses if not one.intrinsics.folds]
     bent = _best(results, FreeOptics(focal=not focal_known, radial=True))
     if bent is None or bent.cost > FIRST_LENS_RATIO * straight.cost or corner_px(bent.intrinsics) < LEAST_LENS_PX:
         return straight.result, straight.intrinsics

@@ -11,6 +11,7 @@ Both results are scored by `spiked evaluate`. `--page` keeps a picture of the pa
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -73,7 +74,10 @@ def look(address: str, picture: Path) -> None:
     """Keep a picture of a page that draws a scene."""
     from playwright.sync_api import sync_playwright
 
-    with sync_playwright() as driver, driver.chromium.launch(args=FLAGS) as browser:
+    with (
+        sync_playwright() as driver,
+        driver.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS) as browser,
+    ):
         shown = browser.new_page(viewport={"width": 1400, "height": 900})
         shown.goto(address)
         shown.wait_for_timeout(SETTLES_MS)

@@ -38,7 +38,7 @@ GAINS_FROM = 800
 BRIGHTER = 1.05
 """Step by which a map's white rises: each changes the colours of all splats that a page has."""
 NOISE_PX = 3, 3
-"""Pixels over whose mean a view's white is taken."""
+"""Pixels of one colour over whose mean a view's white is taken."""
 NUISANCE_STEPS = 200
 """Steps between estimates of the pixel gains."""
 
@@ -147,7 +147,9 @@ class Mapper:
         if len(self) == 0:
             self.white = self.shown_white = float(np.percentile(rate, WHITE_PERCENTILE))
         # Without the noise, of which the brightest of many views would have the most.
-        bright = float(np.percentile(cv2.blur(fill_mosaic(rate, self.channels), NOISE_PX), WHITE_PERCENTILE))
+        sites = [rate] if self.channels is None else [rate[i::2, j::2] for i in (0, 1) for j in (0, 1)]
+        smooth = np.concatenate([cv2.blur(site, NOISE_PX).ravel() for site in sites])
+        bright = float(np.percentile(smooth, WHITE_PERCENTILE))
         if bright > BRIGHTER * self.shown_white:
             self.shown_white = bright
 

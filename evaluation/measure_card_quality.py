@@ -80,6 +80,8 @@ def look(address: str, picture: Path) -> None:
     ):
         shown = browser.new_page(viewport={"width": 1400, "height": 900})
         shown.goto(address)
+        for button in ("Draw splats", "Camera"):
+            shown.get_by_role("button", name=button).click()
         shown.wait_for_timeout(SETTLES_MS)
         shown.screenshot(path=picture)
 

@@ -1,5 +1,6 @@
 """Long paths: keyframes instead of a spline, and loops that close."""
 
+import pickle
 from copy import deepcopy
 from dataclasses import dataclass
 
@@ -93,6 +94,29 @@ def test_loops_are_closed_while_it_runs(not_ended: Odometry, walked: tuple[Recon
     assert len(not_ended.closures) >= 3
     assert walked[0].odometry.closures[: len(not_ended.closures)] == not_ended.closures
     assert all(later - earlier > FRAMES / 4 for earlier, later in not_ended.closures)
+
+
+def test_places_that_are_seen_again_are_kept_once(not_ended: Odometry) -> None:
+    """Half of the views are of the way back."""
+    assert not_ended._keyframes is not None
+    index = not_ended._keyframes.loops.index
+    when = np.array([place.view.time for place in index.places])
+    there, back = (when < FRAMES / 2).sum(), (when > FRAMES / 2).sum()
+    assert there > 10 and back < 0.75 * there, (there, back)
+
+
+def test_a_checkpoint_writes_the_features_of_places_once(not_ended: Odometry) -> None:
+    """They are most of what grows with the path: pickled each time, they took a sixth of the tracking of a minute."""
+    assert not_ended._keyframes is not None
+    index, once = not_ended._keyframes.loops.index, {id(array) for array in not_ended.fixed_arrays()}
+    for place in index.places:
+        assert {id(place.features.pixels), id(place.features.descriptors), id(place.tracks)} <= once
+    assert index._retrieval is not None
+    anew = sum(len(pickle.dumps(array)) for array in vars(index._retrieval).values() if isinstance(array, np.ndarray))
+    assert len(pickle.dumps(index._retrieval)) - anew > 1e5 > anew, "what is written once, and each time"
+    back = pickle.loads(pickle.dumps(index._retrieval))
+    query = index.places[3].features
+    assert np.array_equal(back.votes(query), index._retrieval.votes(query))
 
 
 def test_the_trajectory_so_far_has_the_poses_of_the_views(walked: tuple[Reconstructor, Trajectory]) -> None:

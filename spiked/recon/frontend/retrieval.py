@@ -1,6 +1,7 @@
 """Retrieval: which of many images share features with a query, by short descriptors."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,21 +24,31 @@ class Retrieval:
         self._mean = pool.mean(0)
         _, axes = np.linalg.eigh(np.cov((pool - self._mean).T))
         self._axes = np.ascontiguousarray(axes[:, -REDUCED:], np.float32)
-        self._pool = self._short(pool)
-        self._sizes = [len(one) for one in images]
+        self._images = [self._short(one.descriptors) for one in images]
+        self._pool: NDArray[np.float32] | None = None
+        """Those of all images, made when it is needed."""
 
     def __len__(self) -> int:
-        return len(self._sizes)
+        return len(self._images)
+
+    def __getstate__(self) -> dict[str, object]:
+        return vars(self) | {"_pool": None}
+
+    def fixed_arrays(self) -> Iterator[NDArray[Any]]:
+        """Arrays that never change."""
+        yield from self._images
 
     def add(self, image: Features) -> None:
         """Add an image; the principal components stay those of the first ones."""
-        self._pool = np.concatenate([self._pool, self._short(image.descriptors)])
-        self._sizes.append(len(image))
+        self._images.append(self._short(image.descriptors))
+        self._pool = None
 
     def votes(self, query: Features) -> Array:
         """How much the features of a query speak for each image, [images]."""
+        if self._pool is None:
+            self._pool = np.concatenate(self._images)
         likeness = self._short(query.descriptors) @ self._pool.T
-        starts = np.r_[0, np.cumsum(self._sizes)[:-1]]
+        starts = np.r_[0, np.cumsum([len(one) for one in self._images])[:-1]]
         best = np.maximum.reduceat(likeness, starts, axis=1)
         rank = min(USUAL_RANK, best.shape[1])
         usual = np.partition(best, -rank, axis=1)[:, -rank, None]

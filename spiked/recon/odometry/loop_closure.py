@@ -1,5 +1,6 @@
 """Loop closure: views that see points of much earlier views again, and the correction of the path between them."""
 
+from bisect import bisect_left
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
@@ -23,6 +24,8 @@ EVERY_PX = 10.0
 15)."""
 LOOP_SPAN_PX = 500.0
 """Image motion over which the closures of one loop may lie: their drift is taken as one."""
+OLD_SHARE = 0.2
+"""Share of a view's tracks that are older than `LEAST_APART_PX`, from which on its place is one of those before."""
 MOST_SHARED = 15
 """Tracks that two views of a loop share, at most (decision 15)."""
 COMPARED = 16
@@ -119,7 +122,7 @@ class LoopSearch:
         if view.pose is None or (not undecided and travelled_px - self._searched_px < EVERY_PX):
             return []
         found = find_by_path(self.map, self.pictures, self.index, view, self._expected(view))
-        if (features := self._add(view)) is not None and found is None:
+        if (features := self._add(view, known=found is not None or self._sees_old_tracks(view))) is not None:
             found = self._find_by_features(view, features)
         return [] if found is None else self._confirmed(found)
 
@@ -148,14 +151,24 @@ class LoopSearch:
         assert view.pose is not None
         return view.pose.carried(self._run[-1].before, self._run[-1].pose) if self._run else view.pose
 
-    def _add(self, view: TrackedView) -> Features | None:
-        """Add a view to the index; its features, if its place is kept with them."""
+    def _sees_old_tracks(self, view: TrackedView) -> bool:
+        """Whether a view is linked to what was seen long before: most of its tracks are as old."""
+        before_px = self.map.travelled_px(view.id) - LEAST_APART_PX
+        last = bisect_left(self.index.numbers, before_px, key=self.map.travelled_px)
+        if last == 0 or not len(view.ids):
+            return False
+        newest = self.map.views[self.index.numbers[last - 1]].ids.max(initial=-1)
+        return bool(np.mean(view.ids <= newest) > OLD_SHARE)
+
+    def _add(self, view: TrackedView, known: bool = False) -> Features | None:
+        """Add a view to the index; its features, if its place is kept with them: not if the place is `known`, so that
+        they grow with what the camera sees and not with time."""
         travelled_px = self.map.travelled_px(view.id)
         if travelled_px - self._searched_px < EVERY_PX:
             return None
         self._searched_px = travelled_px
         self.index.add(view)
-        if travelled_px - self._place_px < PLACE_PX:
+        if known or travelled_px - self._place_px < PLACE_PX:
             return None
         self._place_px = travelled_px
         features = place_features(self.pictures[view.id])

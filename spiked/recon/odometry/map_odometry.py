@@ -145,6 +145,8 @@ class MapOdometry:
             yield view.ids
             yield view.pixels
         yield from self.keyframe_images.held()
+        if self._keyframes is not None:
+            yield from self._keyframes.loops.index.fixed_arrays()
 
     def build_images_with(self, builder: PictureBuilder) -> None:
         """Set what builds images of keyframes anew."""

@@ -1,7 +1,9 @@
 """Places of a path: its kept views by where they were taken and by what they show."""
 
 from bisect import bisect_left
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
@@ -66,6 +68,13 @@ class PlaceIndex:
     _retrieval: Retrieval | None = None
     _learned: int = 0
     """Number of places from which the retrieval has its principal components."""
+
+    def fixed_arrays(self) -> Iterator[NDArray[Any]]:
+        """Arrays that never change."""
+        for place in self.places:
+            yield from (place.features.pixels, place.features.descriptors, place.tracks)
+        if self._retrieval is not None:
+            yield from self._retrieval.fixed_arrays()
 
     def add(self, view: TrackedView) -> None:
         """Add a view, newer than the others, that was taken elsewhere."""

@@ -106,7 +106,7 @@ def test_places_that_are_seen_again_are_kept_once(not_ended: Odometry) -> None:
 
 
 def test_a_checkpoint_writes_the_features_of_places_once(not_ended: Odometry) -> None:
-    """They are most of what grows with the path: pickled each time, they took a sixth of the tracking of a minute."""
+    """They are most of what grows with the path: pickled each time, they took much of the tracking of a minute."""
     assert not_ended._keyframes is not None
     index, once = not_ended._keyframes.loops.index, {id(array) for array in not_ended.fixed_arrays()}
     for place in index.places:

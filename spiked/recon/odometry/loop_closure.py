@@ -152,7 +152,7 @@ class LoopSearch:
         return view.pose.carried(self._run[-1].before, self._run[-1].pose) if self._run else view.pose
 
     def _sees_old_tracks(self, view: TrackedView) -> bool:
-        """Whether a view is linked to what was seen long before: most of its tracks are as old."""
+        """Whether a view is linked to what was seen long before: many of its tracks are as old."""
         before_px = self.map.travelled_px(view.id) - LEAST_APART_PX
         last = bisect_left(self.index.numbers, before_px, key=self.map.travelled_px)
         if last == 0 or not len(view.ids):

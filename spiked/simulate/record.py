@@ -89,11 +89,10 @@ def simulate(
 
     The folder, which must be new or empty, then holds NAME.dat, its sidecar NAME.json, groundtruth.tum (a pose for the
     middle of each frame), and `views` held-out noise-free pictures in views/ with their poses in views.json, evenly
-    spread over time; every other one lies beside the path, drawn by `seed` so that some frame saw each of its points,
-    if that can be had. These pictures have no distortion; of a lens with distortion, views_lens/ has pictures of the
-    same poses as the lens shows them. If the camera interpolates
-    between exact pictures, `simulation.interpolation` of the sidecar is the error of that, measured as in
-    `InterpolationError`.
+    spread over time; every other one lies beside the path, drawn by `seed` so that frames saw 0.999 of its points
+    (`coverage`, without occlusion) if that can be had. These pictures have no distortion; of a lens with distortion,
+    views_lens/ has pictures of the same poses as the lens shows them. If the camera interpolates between exact
+    pictures, `simulation.interpolation` of the sidecar is the error of that, measured as in `InterpolationError`.
     Memory does not grow with `frames`. `progress` is called with the number of frames written. Raises RecordingError
     if the folder cannot be written or holds something, and ConfigurationError for a sensor whose frames are not compact
     and LSB first.

@@ -122,5 +122,5 @@ def test_a_recording_that_ends_with_little_parallax_has_a_rough_path() -> None:
     motion = make_motion(MotionKind.ARC, Room(False, 2).stage(SENSOR.intrinsics, 0.03, 0.04), 2)
     reconstructor, error, covered = followed(motion, 600)
     status = reconstructor.status()
-    assert status.state is State.DEGRADED and "only known to about" in status.reason
+    assert status.state is State.DEGRADED and "moved sideways so little" in status.reason
     assert covered == 1 and error < 10, error

@@ -13,9 +13,11 @@ from spiked.pose import Array, exp_so3
 from spiked.recon import Options, Reconstructor
 from spiked.recon.frontend.feature_tracks import picture, white_of
 from spiked.recon.mapping.pose_steps import GaussNewton
+from spiked.recon.odometry import loop_closure
 from spiked.recon.odometry.keyframe_adjuster import LONG_FRAMES
 from spiked.recon.odometry.loop_closure import LoopSearch, find_closures
 from spiked.recon.odometry.odometry import Odometry
+from spiked.recon.odometry.place_index import PlaceIndex
 from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import SimulatedCamera
 from spiked.simulate.motion import HandShake, Stage, hand_shake
@@ -96,13 +98,22 @@ def test_loops_are_closed_while_it_runs(not_ended: Odometry, walked: tuple[Recon
     assert all(later - earlier > FRAMES / 4 for earlier, later in not_ended.closures)
 
 
-def test_places_that_are_seen_again_are_kept_once(not_ended: Odometry) -> None:
-    """Half of the views are of the way back."""
-    assert not_ended._keyframes is not None
-    index = not_ended._keyframes.loops.index
-    when = np.array([place.view.time for place in index.places])
-    there, back = (when < FRAMES / 2).sum(), (when > FRAMES / 2).sum()
-    assert there > 10 and back < 0.75 * there, (there, back)
+@pytest.mark.parametrize("found", [True, False])
+def test_a_place_that_is_seen_again_is_not_kept_twice(
+    not_ended: Odometry, found: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Places grow with what the camera sees and not with time."""
+    views, pictures = not_ended.views, not_ended.keyframe_images
+    kept = sorted(pictures)
+    search = LoopSearch(not_ended.map, pictures, PlaceIndex(not_ended.map))
+    search.add_kept(views[number] for number in kept[: len(kept) // 2])
+    numbers, places = len(search.index.numbers), len(search.index.places)
+    monkeypatch.setattr(loop_closure, "find_by_path", lambda *_, **__: object() if found else None)
+    monkeypatch.setattr(LoopSearch, "_confirmed", lambda *_: [])
+    for number in kept[len(kept) // 2 :]:
+        assert search.search(views[number]) == []
+    assert len(search.index.numbers) > numbers + 5
+    assert (len(search.index.places) == places) == found
 
 
 def test_a_checkpoint_writes_the_features_of_places_once(not_ended: Odometry) -> None:

@@ -80,6 +80,13 @@ def test_a_turning_camera_does_not_stand_still() -> None:
     assert "parallax" in said and "record again while the camera moves sideways" in said
 
 
+def test_a_turning_camera_without_a_focal_length_has_no_rough_path() -> None:
+    """Through a wrong focal length turning looks like the parallax that would do for one."""
+    turning = SimulatedCamera(SENSOR, seed=3, motion=MotionKind.ROTATION)
+    said = reason(replace(SENSOR, intrinsics=None), turning.next_frames(400))[-1]
+    assert "parallax" in said and "record again while the camera moves sideways" in said
+
+
 def test_who_holds_the_camera_is_told_what_to_do_now_and_in_the_end_what_to_do_again() -> None:
     live, final = (reason(SENSOR, stood(), live=live) for live in (True, False))
     assert any("move the camera sideways" in said for said in live[:-1])

@@ -143,7 +143,7 @@ class Mapper:
             self._add(chosen, depth[chosen], colours, stride, rotation, centre)
 
     def _adapt_white(self, rate: Image) -> None:
-        """Before the splats of a seeded view with these rates are added."""
+        """Before the splats of a seeded view with these rates are added, if there are any."""
         if len(self) == 0:
             self.white = self.shown_white = float(np.percentile(rate, WHITE_PERCENTILE))
         # Without the noise, of which the brightest of many views would have the most.
@@ -247,8 +247,11 @@ class Mapper:
 
     @property
     def loss(self) -> float | None:
-        """Mean over the views of the last weighted squared error, in units of white squared; None before any step."""
-        return float(np.mean(list(self._losses.values()))) if self._losses else None
+        """Mean over the views of the last weighted squared error, in units of the shown white squared; None before any
+        step."""
+        if not self._losses:
+            return None
+        return float(np.mean(list(self._losses.values()))) * (self.white / self.shown_white) ** 2
 
     def forget_views(self) -> None:
         """Drop what is stored for each view, after some were dropped."""

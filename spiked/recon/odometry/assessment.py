@@ -12,10 +12,10 @@ FINAL_STATE_VIEWS = 8
 """The final state is that of most of the last 8 views: one noisy view does not decide it (decision 10)."""
 
 
-def assess(sparse_map: SparseMap, status: TrackingState, path_error: float | None) -> None:
+def assess(sparse_map: SparseMap, status: TrackingState, path_error: float | None, rough: bool) -> None:
     """Recompute inliers, chi2 and state of every view with the final path and points; set the final state.
 
-    `path_error`: predicted error of the path relative to its RMS radius, if it is known.
+    `path_error`: predicted error of the path relative to its RMS radius, if it is known. `rough`: see `Initialiser`.
     """
     assessed: list[str | None] = []
     for view in sparse_map.views:
@@ -32,13 +32,13 @@ def assess(sparse_map: SparseMap, status: TrackingState, path_error: float | Non
         reasons = [reason for reason in last if reason is not None]
         common = reasons[-1] if len(reasons) > len(last) - len(reasons) else None
         status.assess(sparse_map.views[-1].time, common)
-        if why := _path_degraded_reasons(sparse_map, path_error):
+        if why := _path_degraded_reasons(sparse_map, path_error, rough):
             status.set(sparse_map.views[-1].time, State.DEGRADED, "; ".join(why))
 
 
-def _path_degraded_reasons(sparse_map: SparseMap, path_error: float | None) -> list[str]:
+def _path_degraded_reasons(sparse_map: SparseMap, path_error: float | None, rough: bool) -> list[str]:
     """Why the final path is degraded as a whole, however well each view fits."""
-    why = []
+    why = ["the camera moved sideways so little that depths are rough"] if rough else []
     if path_error is not None and path_error > WORST_PATH_ERROR:
         why.append(f"the whole path's shape is only known to about {path_error:.0%}: few tracks tie it together")
     focal, lens = sparse_map.focal, sparse_map.lens

@@ -47,6 +47,10 @@ class Initialiser:
     """Id of the first view of the next attempt."""
     _least: LeastParallax = FULL_PARALLAX
     _min_views: int = 0
+    _alone: bool = True
+    """There is no other map of views before."""
+    rough: bool = False
+    """The map was begun with `ROUGH_PARALLAX`."""
 
     def attempt(self, final: bool = False, stood: bool = True) -> bool:
         """Attempt after a new view, if there are enough of them and enough new ones; `final`: it is the last one. Views
@@ -82,8 +86,8 @@ class Initialiser:
         return True
 
     def begin_at(self, view: int) -> None:
-        """Initialise from this view on."""
-        self._start = view
+        """Initialise from this view on: those before are in another map."""
+        self._start, self._alone = view, False
 
     def last_attempt(self) -> bool:
         """Attempt after the last view; if it fails, the reason says why the recording has no path."""
@@ -93,14 +97,20 @@ class Initialiser:
         elif self.attempt(final=True):
             return True
         reason, stationary = self.status.reason, self._stationary_reason()
-        if count >= BOOT_VIEWS and stationary is None and self._rough_attempt():
-            return True
-        self.status.explain(stationary or reason)
-        return False
+        if count >= BOOT_VIEWS and stationary is None:
+            self.rough = self._rough_attempt()
+        if not self.rough:
+            self.status.explain(stationary or reason)
+        return self.rough
 
     def _rough_attempt(self) -> bool:
         """With as little parallax as tells depths at all, from the first view on that shares tracks with the newest: a
-        rough path is better than none."""
+        rough path is better than none.
+
+        Not without a focal length: turning looks like this parallax through a wrong one.
+        """
+        if not self._alone or self.map.focal is not None:
+            return False
         self._start, self._least = 0, ROUGH_PARALLAX
         return self.attempt(final=True, stood=False)
 
@@ -122,7 +132,7 @@ class Initialiser:
         common = reduce(np.intersect1d, [view.ids for view in chosen])
         pixels = np.stack([view.pixels_of(common) for view in chosen])
         views = Views(pixels, common, self.map.intrinsics)
-        if self.map.lens_known or self.map.lens is not None:
+        if self.map.lens_known or self.map.lens is not None or self._least is ROUGH_PARALLAX:
             return initialise(views, self.seed, self._least)
         known = self.map.focal is None
         result, self.map.intrinsics = try_optics(views, self.seed, self._least, focal_known=known)

@@ -1,6 +1,5 @@
 """Loop closure: views that see points of much earlier views again, and the correction of the path between them."""
 
-from bisect import bisect_left
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
@@ -24,8 +23,6 @@ EVERY_PX = 10.0
 15)."""
 LOOP_SPAN_PX = 500.0
 """Image motion over which the closures of one loop may lie: their drift is taken as one."""
-OLD_SHARE = 0.2
-"""Share of a view's tracks that are older than `LEAST_APART_PX`, from which on its place is one of those before."""
 MOST_SHARED = 15
 """Tracks that two views of a loop share, at most (decision 15)."""
 COMPARED = 16
@@ -122,7 +119,7 @@ class LoopSearch:
         if view.pose is None or (not undecided and travelled_px - self._searched_px < EVERY_PX):
             return []
         found = find_by_path(self.map, self.pictures, self.index, view, self._expected(view))
-        if (features := self._add(view, known=found is not None or self._sees_old_tracks(view))) is not None:
+        if (features := self._add(view, known=found is not None)) is not None:
             found = self._find_by_features(view, features)
         return [] if found is None else self._confirmed(found)
 
@@ -150,15 +147,6 @@ class LoopSearch:
         """Where a view should be, by the path, and by the undecided closures before it."""
         assert view.pose is not None
         return view.pose.carried(self._run[-1].before, self._run[-1].pose) if self._run else view.pose
-
-    def _sees_old_tracks(self, view: TrackedView) -> bool:
-        """Whether a view is linked to what was seen long before: many of its tracks are as old."""
-        before_px = self.map.travelled_px(view.id) - LEAST_APART_PX
-        last = bisect_left(self.index.numbers, before_px, key=self.map.travelled_px)
-        if last == 0 or not len(view.ids):
-            return False
-        newest = self.map.views[self.index.numbers[last - 1]].ids.max(initial=-1)
-        return bool(np.mean(view.ids <= newest) > OLD_SHARE)
 
     def _add(self, view: TrackedView, known: bool = False) -> Features | None:
         """Add a view to the index; its features, if its place is kept with them: not if the place is `known`, so that

@@ -239,11 +239,12 @@ class MapOdometry:
         `stop` and `save`: see `PathAdjuster.finish`.
         """
         if self.state is State.BOOT and self._initialiser.last_attempt():
+            self._adjust_keyframes_if_long()
             self._adjuster.adjust()
         self._end_second_map(stop, save)
         self._adjuster.finish(stop, save)
         self.path_error = self._adjuster.path_error()
-        assess(self._map, self._status, self.path_error)
+        assess(self._map, self._status, self.path_error, self._initialiser.rough)
 
     def _end_second_map(self, stop: Callable[[], bool], save: Callable[[], None]) -> None:
         """Where another map was begun, decide which one the path is of."""

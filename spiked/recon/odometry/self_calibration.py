@@ -9,6 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from spiked.distortion import Distortion, LensModel
 from spiked.errors import ConfigurationError
@@ -27,6 +28,8 @@ from spiked.sensor import Intrinsics
 
 FIELDS_OF_VIEW_DEG = (60.0, 42.0, 80.0, 30.0, 100.0)
 """Horizontal fields of view tried, the likeliest first."""
+FIELD_TOLERANCE_DEG = 0.25
+"""Of the field of view through which turning leaves the least parallax."""
 FIRST_DEG = FIELDS_OF_VIEW_DEG[0]
 """Field of view assumed until one was estimated."""
 REFINEMENT_ITERATIONS, REFINEMENT_TOLERANCE = 30, 1e-4
@@ -132,8 +135,7 @@ def try_optics(
     starts = [views]
     if not focal_known:
         starts = [replace(views, intrinsics=_with_field(views.intrinsics, fov)) for fov in FIELDS_OF_VIEW_DEG]
-        # A wrong focal length turns rotation into apparent parallax: the smallest parallax of all trials counts.
-        turning = min(parallax_px(one) for one in starts)
+        turning = _least_parallax_px(views)
         if turning < least.px:
             reason = f"parallax {turning:.1f} px is below {least.px:g} for any focal length"
             return InitialisationResult(None, reason, [], views.ids, needs_motion=True), views.intrinsics
@@ -149,6 +151,20 @@ def try_optics(
     if bent is None or bent.cost > FIRST_LENS_RATIO * straight.cost or corner_px(bent.intrinsics) < LEAST_LENS_PX:
         return straight.result, straight.intrinsics
     return bent.result, bent.intrinsics
+
+
+def _least_parallax_px(views: Views) -> float:
+    """Parallax through the focal length that leaves the least: a wrong one turns rotation into apparent parallax."""
+
+    def left_px(fov_deg: float) -> float:
+        return parallax_px(replace(views, intrinsics=_with_field(views.intrinsics, fov_deg)))
+
+    fields = sorted(FIELDS_OF_VIEW_DEG)
+    trials = [left_px(fov) for fov in fields]
+    best = int(np.argmin(trials))
+    around = fields[max(best - 1, 0)], fields[min(best + 1, len(fields) - 1)]
+    found = minimize_scalar(left_px, bounds=around, method="bounded", options={"xatol": FIELD_TOLERANCE_DEG})
+    return min(trials[best], float(found.fun))
 
 
 @dataclass(frozen=True)

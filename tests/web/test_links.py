@@ -23,10 +23,12 @@ def test_a_copied_link_shows_the_same_view_later(
 ) -> None:
     page = visit(f"{studied.address}?page=scene", viewport=viewport, touch=touch)
     until(lambda: shown_version(page) > 0, "a scene is on the canvas")
+    before = still(page)
     page.get_by_role("button", name="Top", exact=True).click()
     until(lambda: "camera=" in address(page), "the view is in the address")
     page.get_by_role("checkbox", name="Grid").uncheck()
     page.get_by_role("radio", name="Speed").check()
+    until(lambda: psnr_db(picture(page), before) < 30, "the new view is drawn")
     seen = still(page)
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     page.get_by_role("button", name="Copy link").click()

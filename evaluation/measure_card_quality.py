@@ -21,6 +21,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 from measure_card import serving
+from measure_live import FLAGS
 
 from spiked.client import Spiked
 from spiked.recording import open_recording
@@ -30,7 +31,6 @@ from virtual_card import virtual_card
 
 SPIKED = Path(sys.executable).with_name("spiked")
 PATIENCE_S = 1800.0
-FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 SETTLES_MS = 20_000
 """Until a scene is fetched and drawn by software."""
 SHOWN = ("coverage", "ate_percent", "rpe_r_deg", "psnr_db", "worst_psnr_db", "ssim")

@@ -52,6 +52,13 @@ def test_held_out_views_have_no_distortion(tmp_path: Path) -> None:
     bent, plain = (tmp_path / folder for folder in ("bent", "plain"))
     for name in ("00.png", "02.png"):  # those beside the path are drawn from what each camera saw
         assert (cv2.imread(str(bent / "views" / name)) == cv2.imread(str(plain / "views" / name))).all()
+    views = json.loads((bent / "views.json").read_text())
+    camera = SimulatedCamera(Sensor(96, 64, 20_000.0, intrinsics=Intrinsics(90, 90, 48, 32)))
+    for view in views["views"][1::2]:
+        pose = np.array(view["c2w"])
+        expected = np.clip(camera.view(pose[:3, :3], pose[:3, 3]) / views["gain"], 0, 1)
+        shown = cv2.imread(str(bent / view["file"]), cv2.IMREAD_UNCHANGED) / 255
+        assert np.abs(shown - expected).max() < 0.5 / 255 + 1e-6
     assert (bent / "groundtruth.tum").read_bytes() == (plain / "groundtruth.tum").read_bytes()
     assert (bent / "simulated.dat").read_bytes() != (plain / "simulated.dat").read_bytes()
     assert "distortion" not in json.loads((plain / "simulated.json").read_text())["intrinsics"]

@@ -176,6 +176,7 @@ class Client:
             raise ConnectionError(f"umockdev sent command {command}, which this server does not know")
 
     def _done(self, result: int, error: int = 0) -> None:
+        self.node.show()  # first: the process may poll as soon as it has its answer
         self.connection.sendall(_MESSAGE.pack(_DONE, result & (1 << 64) - 1, error))
 
     def _ioctl(self, request: int, argument: int) -> int | None:
@@ -316,7 +317,7 @@ class Node:
         self._fifo = os.open(fifo, os.O_RDWR | os.O_NONBLOCK)
         fcntl.fcntl(self._fifo, _F_SETPIPE_SZ, 4096)
         self._readable = True
-        self._show()
+        self.show()
 
     def in_flight_bytes(self) -> int:
         """What usbfs counts against its limit."""
@@ -341,7 +342,7 @@ class Node:
                 pass
             client.answer_waiting()
         self.camera.make_room(self.room_bytes())
-        self._show()
+        self.show()
 
     def room_bytes(self) -> int:
         """What the camera can send into the bulk transfers in flight."""
@@ -395,7 +396,7 @@ class Node:
             client.completed.append(urb)
         client.pending.clear()
 
-    def _show(self) -> None:
+    def show(self) -> None:
         """Make the node writable when there is something to reap, or the device is gone."""
         ready = self.gone or any(client.completed for client in self.clients)
         if ready and not self._readable:

@@ -85,3 +85,15 @@ def test_a_path_that_never_returns_has_the_longer_map(frames: np.ndarray) -> Non
         remark = reconstructor.odometry.remark
         assert remark is not None and "belong to a second map" in remark and "have no pose" in remark
         assert score(reconstructor, end)[1] < 3
+
+
+def test_a_recording_may_end_when_the_second_map_has_no_view_yet(frames: np.ndarray) -> None:
+    reconstructor = Reconstructor(SENSOR, Options(steps=0))
+    at = 0
+    while reconstructor.odometry._second is None:
+        feed(reconstructor, frames, at, at + BLOCK)
+        at += BLOCK
+        assert at < 3000
+    assert len(reconstructor.odometry._second.views) == len(reconstructor.odometry.views)
+    reconstructor.odometry.end()
+    assert sum(view.pose is not None for view in reconstructor.odometry.views) > 100

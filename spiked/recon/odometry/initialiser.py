@@ -58,7 +58,8 @@ class Initialiser:
 
         Returns whether the map was initialised: then all views from the first of the attempt on have poses.
         """
-        self._move_start(stood)
+        if self._start < len(self.map.views):
+            self._move_start(stood)
         views = self.map.views[self._start :]
         count, time = len(views), self.map.views[-1].time
         advice = MOVE_NOW if self.live and not final else MOVE_AGAIN

@@ -247,6 +247,24 @@ def test_tracks_are_placed_where_their_rays_meet() -> None:
         _bundle.triangulate(rotations, centres, view + 1, track, pixels, *lens, 5, 0.5, 2.0, found)
 
 
+def test_depths_of_little_parallax_are_not_biased() -> None:
+    """2,000 points 5 away, 2.5 px of parallax over 8 views, tracks off by 0.15 px: the point nearest to the rays lies
+    5 % too near."""
+    rng, count, views, focal_px = np.random.default_rng(1), 2000, 8, 350.0
+    points = np.stack([rng.uniform(-2, 2, count), rng.uniform(-1, 1, count), np.full(count, 5.0)], 1)
+    centres = np.zeros((views, 3))
+    centres[:, 0] = np.linspace(0, 2.5 / focal_px * 5.0, views)
+    view, track = (g.ravel() for g in np.meshgrid(np.arange(views), np.arange(count), indexing="ij"))
+    local = points[track] - centres[view]
+    pixels = focal_px * local[:, :2] / local[:, 2:] + (200, 125) + rng.normal(0, 0.15, (len(view), 2))
+    rotations, lens = np.repeat(np.eye(3)[None], views, 0), (focal_px, focal_px, 200.0, 125.0)
+    found = np.full((count, 3), np.nan)
+    _bundle.triangulate(rotations, centres, view, track, pixels, *lens, 5, 0.1, 2.0, found)
+    assert np.isfinite(found).all()
+    assert np.median(found[:, 2]) == pytest.approx(5.0, rel=0.01)
+    assert 1 / np.mean(1 / found[:, 2]) == pytest.approx(5.0, rel=0.01)
+
+
 def test_results_are_never_written_to_a_copy() -> None:
     edges = edges_with(np.zeros((H, W)), np.uint8)
     for out in (np.empty((H, W)), np.empty((H, 2 * W), np.float32)[:, ::2]):

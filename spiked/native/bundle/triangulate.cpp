@@ -1,4 +1,6 @@
-// Triangulation of tracks: the point nearest to the rays of all its observations.
+// Triangulation of tracks: the point of least reprojection error, from the one nearest to the rays of all observations.
+// That one alone is biased towards the cameras: distances from rays are the smaller the nearer the point is
+// (R. Hartley and P. Sturm, "Triangulation", 1997).
 #include <nanobind/stl/optional.h>
 
 #include <algorithm>
@@ -16,6 +18,8 @@ namespace {
 
 constexpr double kDiagonal = 1e-12;                  // added to the diagonal of a matrix that may be singular
 constexpr double kThirdOfTurn = 2.0943951023931953;  // rad
+constexpr int kSteps = 3;                            // Gauss-Newton steps
+constexpr double kMostStep = 0.3;                    // of the distance from the last camera, in one step
 
 // Sums of I - d d^T over unit rays d, and of the same times the centres that they start from.
 struct Rays {
@@ -24,6 +28,10 @@ struct Rays {
     int64_t count = 0;
     std::array<double, 3> position = {};
     double worst = 0;  // px
+    // Of the reprojection errors by the position.
+    std::array<double, 6> hessian = {};
+    std::array<double, 3> gradient = {};
+    double distance = 0;  // from the last camera
 
     void add(const double* d, const double* c) {
         const double along = d[0] * c[0] + d[1] * c[1] + d[2] * c[2];
@@ -37,14 +45,44 @@ struct Rays {
         ++count;
     }
 
-    void solve() {
-        const double a = xx + kDiagonal, b = yy + kDiagonal, c = zz + kDiagonal;
-        const double aa = b * c - yz * yz, ab = xz * yz - xy * c, ac = xy * yz - xz * b;
-        const double bb = a * c - xz * xz, bc = xy * xz - a * yz, cc = a * b - xy * xy;
-        const double scale = 1 / (a * aa + xy * ab + xz * ac);
-        position = {scale * (aa * right[0] + ab * right[1] + ac * right[2]),
-                    scale * (ab * right[0] + bb * right[1] + bc * right[2]),
-                    scale * (ac * right[0] + bc * right[1] + cc * right[2])};
+    void solve() { position = solved({xx + kDiagonal, xy, xz, yy + kDiagonal, yz, zz + kDiagonal}, right); }
+
+    void add_error(const Projection& projection) {
+        if (!projection.in_front) return;
+        for (int k = 0; k < 2; ++k) {
+            const double* row = projection.by_point[k];
+            int n = 0;
+            for (int i = 0; i < 3; ++i) {
+                for (int j = i; j < 3; ++j) hessian[n++] += row[i] * row[j];
+                gradient[i] += row[i] * projection.error[k];
+            }
+        }
+        distance = std::hypot(projection.ray[0], projection.ray[1], projection.ray[2]);
+    }
+
+    // One Gauss-Newton step of the position.
+    void step() {
+        const double diagonal = kDiagonal * (hessian[0] + hessian[3] + hessian[5]);
+        hessian[0] += diagonal;
+        hessian[3] += diagonal;
+        hessian[5] += diagonal;
+        const std::array<double, 3> move = solved(hessian, gradient);
+        const double length = std::hypot(move[0], move[1], move[2]), most = kMostStep * distance;
+        const double share = std::isfinite(length) ? (length > most ? most / length : 1) : 0;
+        for (int i = 0; i < 3 && share > 0; ++i) position[i] -= share * move[i];
+        hessian = {};
+        gradient = {};
+    }
+
+    // Solves a symmetric system; `m` is its upper triangle by rows.
+    static std::array<double, 3> solved(const std::array<double, 6>& m, const std::array<double, 3>& right) {
+        const double a = m[0], ab_ = m[1], ac_ = m[2], b = m[3], bc_ = m[4], c = m[5];
+        const double aa = b * c - bc_ * bc_, ab = ac_ * bc_ - ab_ * c, ac = ab_ * bc_ - ac_ * b;
+        const double bb = a * c - ac_ * ac_, bc = ab_ * ac_ - a * bc_, cc = a * b - ab_ * ab_;
+        const double scale = 1 / (a * aa + ab_ * ab + ac_ * ac);
+        return {scale * (aa * right[0] + ab * right[1] + ac * right[2]),
+                scale * (ab * right[0] + bb * right[1] + bc * right[2]),
+                scale * (ac * right[0] + bc * right[1] + cc * right[2])};
     }
 
     // The sum of squared sines of the angles between the rays and their mean direction: the least eigenvalue, in closed
@@ -99,10 +137,20 @@ void triangulate(const Array<const double, 3>& rotations, const Array<const doub
         sums[index_of[id]].add(ray, centres.data() + 3 * view.data()[m]);
     }
     for (Rays& rays : sums) rays.solve();
+    const auto projected = [&](size_t m, const Rays& rays) {
+        const Pose pose = {rotations.data() + 9 * view.data()[m], centres.data() + 3 * view.data()[m]};
+        return project(k, pose, rays.position.data(), pixels.data() + 2 * m);
+    };
+    for (int n = 0; n < kSteps; ++n) {
+        for (const size_t m : used) {
+            Rays& rays = sums[index_of[track.data()[m]]];
+            rays.add_error(projected(m, rays));
+        }
+        for (Rays& rays : sums) rays.step();
+    }
     for (const size_t m : used) {
         Rays& rays = sums[index_of[track.data()[m]]];
-        const Pose pose = {rotations.data() + 9 * view.data()[m], centres.data() + 3 * view.data()[m]};
-        const Projection projection = project(k, pose, rays.position.data(), pixels.data() + 2 * m);
+        const Projection projection = projected(m, rays);
         const double error = std::hypot(projection.error[0], projection.error[1]);
         rays.worst = std::max(rays.worst, projection.in_front && error < max_error_px ? error : max_error_px);
     }

@@ -13,8 +13,10 @@ from spiked.recon.odometry.background import Background
 def test_the_result_is_waited_for() -> None:
     go = threading.Event()
     work = Background(lambda stop: go.wait() and 7)
+    assert not work.done
     go.set()
     assert work.result() == 7 and work.result() == 7
+    assert work.done and deepcopy(work).done
 
 
 def test_an_error_reaches_the_thread_that_waits() -> None:

@@ -49,6 +49,19 @@ def test_a_lens_is_found_while_keyframes_are_adjusted() -> None:
     assert found is not None and found.coefficients[:2] == pytest.approx((-0.3, 0.1), abs=0.02)
 
 
+def test_a_live_camera_does_not_wait_for_the_search() -> None:
+    adjuster = keyframes(Intrinsics(PINHOLE.fx, PINHOLE.fy, PINHOLE.cx, PINHOLE.cy, LENS))
+    adjuster.live = True
+    assert adjuster.due
+    adjuster.adjust()
+    search = adjuster._lens_search
+    assert search is not None
+    search.result()
+    assert adjuster.map.lens is None
+    adjuster.adjust()
+    assert adjuster.map.lens is not None and adjuster._lens_search is None
+
+
 def test_no_lens_is_found_in_keyframes_of_a_pinhole_camera() -> None:
     adjuster = keyframes(PINHOLE)
     adjuster.adjust()

@@ -60,3 +60,12 @@ def test_every_eighth_view_with_a_pose_is_a_keyframe() -> None:
         view.pose = None if number == KEYFRAME_EVERY else STILL
         relocaliser.remember(view, texture(1))
     assert sorted(relocaliser.keyframes) == [0, 2 * KEYFRAME_EVERY]
+
+
+def test_views_far_apart_are_keyframes_whatever_their_numbers() -> None:
+    relocaliser = Relocaliser(SparseMap(K), most_motion_px=24.0)
+    for number in range(7):
+        view = lost(number)
+        view.pose, view.motion_px = STILL, 10.0
+        relocaliser.remember(view, texture(1))
+    assert sorted(relocaliser.keyframes) == [0, 3, 6]

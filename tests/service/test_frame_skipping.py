@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.rows import CaptureState, Grade, JobState, Plan
-from spiked_service.workers.frame_skipping import LatestFrames, next_window
+from spiked_service.workers.frame_skipping import LatestFrames, may_map, next_window
 from waiting import until
 
 from spiked.recording import RecordingWriter
@@ -40,6 +40,12 @@ def test_a_pause_is_caught_up_with_in_bounded_steps() -> None:
         lags.append(now - at)
     assert lags[-1] < 1000
     assert next(n for n, lag in enumerate(lags) if lag < 1000) < 30
+
+
+def test_the_map_gets_a_step_only_if_the_tracks_outlast_it() -> None:
+    assert may_map(0, None, RATE_HZ) and may_map(0, 0.02, RATE_HZ) and may_map(600, 0.005, RATE_HZ)
+    assert not may_map(0, 0.05, RATE_HZ)  # 20 px in the time of a step
+    assert not may_map(600, 0.02, RATE_HZ) and not may_map(900, 0.0, RATE_HZ)
 
 
 def blocks(writer: RingWriter, first: int, count: int) -> None:

@@ -20,6 +20,23 @@ _LATE_S = 0.2
 """Lateness at which the second `REACH_PX` applies; in between, the reach is interpolated."""
 
 
+STEP_S = 0.02
+"""Time of a step of the map, about."""
+STEP_REACH_PX, PUNCTUAL_S = 10.0, 0.04
+"""Image motion, and lateness, up to which the tracker waits for a step of the map."""
+LONGEST_UNMAPPED_S = 1.0
+"""Time after which the map gets a step anyway."""
+
+
+def may_map(late_frames: int, speed_px: float | None, rate_hz: float) -> bool:
+    """Whether a tracker so many frames behind the camera can wait for a step of the map.
+
+    `speed_px` is the image motion in pixels a frame, None if unknown.
+    """
+    late_s = late_frames / rate_hz
+    return late_s < PUNCTUAL_S and (late_s + STEP_S) * rate_hz * (speed_px or 0.0) < STEP_REACH_PX
+
+
 def next_window(at: int, newest: int, count: int, speed_px: float | None, rate_hz: float) -> int:
     """First frame of the next window of `count` frames, at or after frame `at`.
 

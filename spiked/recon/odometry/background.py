@@ -17,7 +17,7 @@ class Background(Generic[Result]):
         self._work = work
         self._stop = threading.Event()
         self._outcome: list[Result | BaseException] = []
-        self._thread = threading.Thread(target=self._run, name="path adjustment", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="path adjustment")
         self._thread.start()
 
     def _run(self) -> None:
@@ -26,6 +26,11 @@ class Background(Generic[Result]):
                 self._outcome.append(self._work(self._stop.is_set))
         except BaseException as error:  # raised again by `result`, on the thread that waits for it
             self._outcome.append(error)
+
+    @property
+    def done(self) -> bool:
+        """The work has ended: `result` does not wait."""
+        return not self._thread.is_alive()
 
     def stop(self) -> None:
         """Let the work end early."""
@@ -49,6 +54,11 @@ class _Done(Background[Result]):
 
     def __init__(self, result: Result) -> None:
         self._result = result
+
+    @property
+    def done(self) -> bool:
+        """See `Background`."""
+        return True
 
     def stop(self) -> None:
         """Nothing is left to be ended."""

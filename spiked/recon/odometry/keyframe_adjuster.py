@@ -29,10 +29,13 @@ LONG_FRAMES, LONG_VIEWS = 12_000, 1000
 15)."""
 KEYFRAME_PX = 4.0
 """Image motion from one keyframe to the next: 10 px triple the error, 2 px do not lower it (decision 15)."""
-LEAST_MOTION_PX = 2.0
-"""Image motion between views whose images are kept, at least."""
+LEAST_MOTION_PX, MOST_MOTION_PX = 2.0, 24.0
+"""Image motion between views whose images are kept, at least and at most."""
 WINDOW_KEYFRAMES, FIXED_KEYFRAMES = 60, 10
 """Newest keyframes that are adjusted while tracking, and those before them that fix the gauge (decision 15)."""
+WINDOW_PX, LEAST_WINDOW = 480.0, 16
+"""Image motion that the free ones of these span at most, but for so many: of a live camera's views, which lie far
+apart, fewer suffice, and the tracker must not stop for long."""
 ADJUST_EVERY = 8
 """New keyframes from one adjustment to the next (decision 15)."""
 REFERENCE_KEYFRAMES = 60
@@ -58,8 +61,9 @@ FINAL_SCALE_PX = 0.1
 where their surroundings lie at several depths (decision 15)."""
 WINDOW_ITERATIONS, LOOP_ITERATIONS, FINAL_ITERATIONS = 4, 4, 12
 """Most iterations of an adjustment in the window, after a loop and at the end."""
-LENS_KEYFRAMES = 120
-"""Newest keyframes in which a distortion is looked for that nobody stated: 480 px of image motion."""
+LENS_KEYFRAMES, LENS_PX, LEAST_LENS_KEYFRAMES = 120, 960.0, 40
+"""Newest keyframes in which a distortion is looked for that nobody stated: 480 px of image motion, and at most twice
+that, but for so many."""
 LENS_GROWTH = 1.5
 """Factor of the number of keyframes from one look to the next."""
 MOST_LOG_SCALE = 0.3
@@ -96,6 +100,10 @@ class KeyframeAdjuster:
     """Number of keyframes at the last adjustment."""
     _linked: dict[int, LoopClosure] = field(default_factory=dict)
     """Closures by id of the later view."""
+    live: bool = False
+    """Results of other threads are taken once they are there: a camera does not wait for them."""
+    _lens_search: Background[bool] | None = None
+    """Search for a distortion that runs: whether there is one."""
     _whole: Background[MapBundle] | None = None
     """Adjustment of all keyframes that runs."""
     _whole_due: float = 0.0
@@ -137,7 +145,8 @@ class KeyframeAdjuster:
         del final
         self._adjusted = len(self.keyframes)
         self._take_whole()
-        recent = [view for view in self.keyframes[-WINDOW_KEYFRAMES - FIXED_KEYFRAMES :] if view.pose is not None]
+        free = self._newest(WINDOW_KEYFRAMES, WINDOW_PX, LEAST_WINDOW)
+        recent = [view for view in self.keyframes[-free - FIXED_KEYFRAMES :] if view.pose is not None]
         if len(recent) <= FIXED_KEYFRAMES + 2:
             return
         first, first_free = recent[0].id, recent[FIXED_KEYFRAMES].id
@@ -150,35 +159,51 @@ class KeyframeAdjuster:
         fixed = np.array([view.id < first_free for view in made.views])
         made.bundle.optimise(WINDOW_ITERATIONS, SCALE_PX, fixed, TOLERANCE)
         self._take(made, self.map.views[first:])
-        if len(self.keyframes) >= max(LENS_KEYFRAMES, LENS_GROWTH * self._looked):
-            self._look_for_distortion()
+        self._look_for_distortion()
         self._adjust_whole_if_due()
 
-    def _look_for_distortion(self) -> None:
+    def _newest(self, most: int, most_px: float, least: int) -> int:
+        """Number of newest keyframes, up to `most`, that span at most this image motion, or `least`."""
+        travelled_px = [self.map.travelled_px(view.id) for view in self.keyframes[-most:]]
+        return max(sum(px >= travelled_px[-1] - most_px for px in travelled_px), least)
+
+    def _look_for_distortion(self, now: bool = False) -> None:
+        """Look for a distortion in the newest keyframes if it is time to, on another thread.
+
+        Of a live camera its answer is taken at a later adjustment, once it is there, unless it is to be `now`.
+        """
+        count = len(self.keyframes)
+        due = count > self._looked if now else count >= max(LENS_KEYFRAMES, LENS_GROWTH * self._looked)
+        if due and self._lens_search is None and not self.map.lens_known and self.map.lens is None:
+            self._looked = count
+            if (sample := self._newest_for_lens()) is not None:
+                self._lens_search = Background(lambda stop: _distorted(sample) is not None)
+        if self._lens_search is not None and (now or not self.live or self._lens_search.done):
+            found, self._lens_search = self._lens_search.result(), None
+            if found:
+                self._take_distortion()
+
+    def _newest_for_lens(self) -> MapBundle | None:
+        """A bundle of the keyframes in which a distortion is looked for; None if they are too few."""
+        newest = self._newest(LENS_KEYFRAMES, LENS_PX, LEAST_LENS_KEYFRAMES)
+        recent = [view for view in self.keyframes[-newest:] if view.pose is not None]
+        if len(recent) <= FIXED_KEYFRAMES or (made := self.map.bundle(recent)) is None:
+            return None
+        made.bundle.free = self.map.free_optics
+        return made
+
+    def _take_distortion(self) -> None:
         """Let the lens be estimated from now on if the newest keyframes show one that nobody stated.
 
         They and the views after them follow at once, the path before them with the next adjustment of all keyframes.
         """
-        self._looked = len(self.keyframes)
-        if self.map.lens_known or self.map.lens is not None or self._distorted() is None:
-            return
         self._take_whole(now=True)
-        if (made := self._distorted()) is None:
+        if (sample := self._newest_for_lens()) is None or (made := _distorted(sample)) is None:
             return
         _, self.map.lens = estimates(made.bundle)
         self.map.take_optics(made.bundle)
         self._take(made, self.map.views[made.views[0].id :])
         self._open, self._whole_due = True, 0.0
-
-    def _distorted(self) -> MapBundle | None:
-        """The newest keyframes, adjusted with the distortion that they show; None if they show none."""
-        recent = [view for view in self.keyframes[-LENS_KEYFRAMES:] if view.pose is not None]
-        if len(recent) <= FIXED_KEYFRAMES or (made := self.map.bundle(recent)) is None:
-            return None
-        made.bundle.free = self.map.free_optics
-        made.bundle.optimise(WINDOW_ITERATIONS, SCALE_PX, None, TOLERANCE)
-        found = find_distortion(made.bundle)
-        return None if found is None else replace(made, bundle=found)
 
     def close_loops(self, view: TrackedView) -> list[LoopClosure]:
         """Search the newest view, whose image is kept, for places seen before, and close the loops that are certain."""
@@ -230,8 +255,12 @@ class KeyframeAdjuster:
 
     def _take_whole(self, now: bool = False) -> None:
         """Take the result of the adjustment of all keyframes if it is due, or `now`."""
-        if self._whole is None or (len(self.keyframes) < self._whole_due and not now):
+        if self._whole is None:
             return
+        if not now and (not self._whole.done if self.live else len(self.keyframes) < self._whole_due):
+            return
+        if self.live:
+            self._whole.stop()
         made, self._whole = self._whole.result(), None
         self._whole_due = WHOLE_GROWTH * len(self.keyframes)
         self._take(made, self.map.views)
@@ -250,8 +279,8 @@ class KeyframeAdjuster:
         if self._whole is not None and stop():
             self._whole.stop()
         self._take_whole(now=True)
-        if len(self.keyframes) > self._looked and not stop():
-            self._look_for_distortion()
+        if not stop():
+            self._look_for_distortion(now=True)
         while self._loop_rounds < LOOP_ROUNDS and not stop():
             found = find_closures(self.map, self.pictures, self.loops.index)
             closures = spread_drift(self.map, found)
@@ -327,6 +356,13 @@ class KeyframeAdjuster:
                 fit = fit_pose(self.map, view, view.pose)
                 if fit.lost_reason() is None:
                     fit.store(view)
+
+
+def _distorted(sample: MapBundle) -> MapBundle | None:
+    """Keyframes adjusted with the distortion that they show; None if they show none."""
+    sample.bundle.optimise(WINDOW_ITERATIONS, SCALE_PX, None, TOLERANCE)
+    found = find_distortion(sample.bundle)
+    return None if found is None else replace(sample, bundle=found)
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ from spiked.sensor import LEAST_DEPTH, Intrinsics
 
 LEAST_APART_PX = 300.0
 """Image motion between two views of a loop, at least: nearer ones share tracks (decision 15)."""
-EVERY_PX = 10.0
+EVERY_PX, LIVE_EVERY_PX = 10.0, 40.0
 """Image motion from one view in which loops are searched to the next: a camera that stands still adds none (decision
-15)."""
+15). A live camera does not wait for a search of 10 to 40 ms."""
 LOOP_SPAN_PX = 500.0
 """Image motion over which the closures of one loop may lie: their drift is taken as one."""
 MOST_SHARED = 15
@@ -97,6 +97,7 @@ class LoopSearch:
     pictures: Mapping[int, Picture]
     """Images of the kept views by id."""
     index: PlaceIndex
+    every_px: float = EVERY_PX
     _searched_px: float = -np.inf
     """Image motion up to the newest view that was searched, and up to the newest place with features."""
     _place_px: float = -np.inf
@@ -104,9 +105,9 @@ class LoopSearch:
     """Closures of views in a row that agree."""
 
     @classmethod
-    def of(cls, sparse_map: SparseMap, pictures: Mapping[int, Picture]) -> "LoopSearch":
+    def of(cls, sparse_map: SparseMap, pictures: Mapping[int, Picture], every_px: float = EVERY_PX) -> "LoopSearch":
         """On the kept views so far, among which there are no loops."""
-        made = cls(sparse_map, pictures, PlaceIndex(sparse_map))
+        made = cls(sparse_map, pictures, PlaceIndex(sparse_map), every_px)
         made.add_kept(sparse_map.views[number] for number in sorted(pictures))
         return made
 
@@ -116,7 +117,7 @@ class LoopSearch:
         if self._run and travelled_px - self.map.travelled_px(self._run[-1].later.id) > RUN_PX:
             self._run = []
         undecided = 0 < len(self._run) < AGREEING_VIEWS
-        if view.pose is None or (not undecided and travelled_px - self._searched_px < EVERY_PX):
+        if view.pose is None or (not undecided and travelled_px - self._searched_px < self.every_px):
             return []
         found = find_by_path(self.map, self.pictures, self.index, view, self._expected(view))
         if (features := self._add(view, known=found is not None)) is not None:
@@ -152,7 +153,7 @@ class LoopSearch:
         """Add a view to the index; its features, if its place is kept with them: not if the place is `known`, so that
         they grow with what the camera sees and not with time."""
         travelled_px = self.map.travelled_px(view.id)
-        if travelled_px - self._searched_px < EVERY_PX:
+        if travelled_px - self._searched_px < self.every_px:
             return None
         self._searched_px = travelled_px
         self.index.add(view)

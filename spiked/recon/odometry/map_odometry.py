@@ -15,9 +15,15 @@ from spiked.recon.frontend.track_timestamps import TrackTimestamps
 from spiked.recon.odometry.assessment import assess
 from spiked.recon.odometry.global_adjuster import GlobalAdjuster
 from spiked.recon.odometry.initialiser import Initialiser
-from spiked.recon.odometry.keyframe_adjuster import LEAST_MOTION_PX, LONG_FRAMES, LONG_VIEWS, KeyframeAdjuster
+from spiked.recon.odometry.keyframe_adjuster import (
+    LEAST_MOTION_PX,
+    LONG_FRAMES,
+    LONG_VIEWS,
+    MOST_MOTION_PX,
+    KeyframeAdjuster,
+)
 from spiked.recon.odometry.keyframe_pictures import KeyframePictures, PictureBuilder
-from spiked.recon.odometry.loop_closure import LoopSearch
+from spiked.recon.odometry.loop_closure import EVERY_PX, LIVE_EVERY_PX, LoopSearch
 from spiked.recon.odometry.path_adjuster import PathAdjuster
 from spiked.recon.odometry.pose_tracker import LOCAL_BA_EVERY, PoseTracker
 from spiked.recon.odometry.relocaliser import Relocaliser
@@ -46,8 +52,9 @@ class MapOdometry:
         live: bool = False,
         pictures: KeyframePictures | None = None,
     ) -> None:
-        """focal: set where the focal length is to be estimated; live: reasons advise how to move the camera now;
-        pictures: where images of keyframes are held."""
+        """focal: set where the focal length is to be estimated; live: reasons advise how to move the camera now,
+        and views do not wait for other threads; pictures: where images of keyframes are held."""
+        self._live = live
         self._map = SparseMap(intrinsics, focal, lens_known=intrinsics.distortion is not None)
         self._status = TrackingState()
         self._tracks = Tracks()
@@ -205,13 +212,16 @@ class MapOdometry:
             return
         posed = self._map.posed()
         if posed and (len(posed) >= LONG_VIEWS or posed[-1].time - posed[0].time >= LONG_FRAMES):
-            self._adjust_keyframes(LoopSearch.of(self._map, self.keyframe_images))
+            self._adjust_keyframes(self._loop_search())
+
+    def _loop_search(self) -> LoopSearch:
+        return LoopSearch.of(self._map, self.keyframe_images, LIVE_EVERY_PX if self._live else EVERY_PX)
 
     def _adjust_keyframes(self, loops: LoopSearch) -> None:
         """Adjust keyframes from now on, if that is not done yet."""
         if self._keyframes is None:
-            self._relocaliser.least_motion_px = LEAST_MOTION_PX
-            self._keyframes = KeyframeAdjuster(self._map, self.keyframe_images, loops)
+            self._relocaliser.least_motion_px, self._relocaliser.most_motion_px = LEAST_MOTION_PX, MOST_MOTION_PX
+            self._keyframes = KeyframeAdjuster(self._map, self.keyframe_images, loops, live=self._live)
             self._adjuster = self._tracker.adjuster = self._keyframes
 
     def _track(

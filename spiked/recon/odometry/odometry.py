@@ -16,7 +16,7 @@ from spiked.recon.frontend.feature_tracks import Picture
 from spiked.recon.frontend.photon_counts import PhotonCounts
 from spiked.recon.frontend.spike_intervals import SpikeIntervals
 from spiked.recon.odometry.keyframe_pictures import KeyframePictures, PictureBuilder
-from spiked.recon.odometry.loop_closure import LoopClosure, LoopSearch
+from spiked.recon.odometry.loop_closure import LoopClosure
 from spiked.recon.odometry.map_odometry import MapOdometry
 from spiked.recon.odometry.pnp import PnPResult, fit_pose
 from spiked.recon.odometry.second_map import SECOND_MAP_VIEWS, Meeting, join, unposed
@@ -42,7 +42,7 @@ class Odometry(MapOdometry):
     ) -> None:
         """See `MapOdometry`."""
         super().__init__(intrinsics, seed, focal, live, pictures)
-        self._seed, self._live = seed, live
+        self._seed = seed
         self._lost_views = 0
         """Lost views in a row."""
         self._second: Odometry | None = None
@@ -102,7 +102,7 @@ class Odometry(MapOdometry):
         second._map.reserve(len(self.points))
         second._initialiser.begin_at(len(self.views))
         second._tracks.next_id, second._tracks.far = self._tracks.next_id, self._tracks.far
-        loops = LoopSearch.of(self._map, self.keyframe_images) if self._keyframes is None else self._keyframes.loops
+        loops = self._loop_search() if self._keyframes is None else self._keyframes.loops
         self._second, self._second_begin = second, len(self.views)
         self._meeting = Meeting(self._map, loops, self.keyframe_images)
 

@@ -11,7 +11,13 @@ from spiked.recon.odometry.initialisation import SCALE_PX
 from spiked.recon.odometry.path_adjuster import PathAdjuster
 from spiked.recon.odometry.pnp import LOST_CHI2, MIN_POINTS, WORST_CHI2, WORST_INLIERS, PnPResult, fit_pose
 from spiked.recon.odometry.relocaliser import Relocaliser
-from spiked.recon.odometry.sparse_map import Pose, SparseMap, TrackedView
+from spiked.recon.odometry.sparse_map import (
+    TRIANGULATION_MIN_FAR_VIEWS,
+    TRIANGULATION_MIN_VIEWS,
+    Pose,
+    SparseMap,
+    TrackedView,
+)
 from spiked.recon.odometry.template_warps import template_warps
 from spiked.recon.odometry.tracking_state import State, TrackingState
 
@@ -19,6 +25,9 @@ RECENT_VIEWS = 48
 """Newest views from which tracks are triangulated between global adjustments: it bounds the time of one call."""
 TRIANGULATE_EVERY, LOCAL_BA_EVERY = 4, 8
 """Views between triangulations and between local bundle adjustments."""
+FAR_PX = 8.0
+"""Image motion to a view, where frames were skipped, from which on tracks are triangulated in every view and from fewer
+of them: the camera may leave what is known within a few."""
 PREDICTED_LENGTHS = 4
 """Lengths of the newest view over which its motion is taken to go on, for the templates of tracks."""
 PREDICTION_VIEWS = 40
@@ -77,7 +86,13 @@ class PoseTracker:
         """Triangulate tracks from the newest views."""
         recent = self.map.views[-RECENT_VIEWS:]
         older = [view for view in self.adjuster.reference_views if view.id < recent[0].id]
-        self.map.triangulate(older + recent)
+        least = TRIANGULATION_MIN_FAR_VIEWS if self._far else TRIANGULATION_MIN_VIEWS
+        self.map.triangulate(older + recent, least)
+
+    @property
+    def _far(self) -> bool:
+        """Frames were skipped, and the newest view lies far from the one before."""
+        return self.tracks.far and self.map.views[-1].motion_px > FAR_PX
 
     def _known(self, newest: int) -> list[TrackedView]:
         """The last two views with a pose, or one: if possible of the `newest` views."""
@@ -92,7 +107,7 @@ class PoseTracker:
     def _extend_map(self, view: TrackedView, fit: PnPResult) -> None:
         """Triangulate and adjust after the newest view got its pose, then update the state."""
         count = len(self.map.views)
-        if count % TRIANGULATE_EVERY == 0:
+        if count % TRIANGULATE_EVERY == 0 or self._far:
             self.triangulate_recent()
         # New points are triangulated from few views: a large residual counts only after a local adjustment.
         off = fit.chi2 > WORST_CHI2 and fit.inliers > WORST_INLIERS

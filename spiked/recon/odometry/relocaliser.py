@@ -39,13 +39,16 @@ class Relocaliser:
     """Images of the keyframes by view id."""
     least_motion_px: float = 0.0
     """Image motion from one keyframe to the next, at least: with more than 0 a camera at rest adds none."""
+    most_motion_px: float = np.inf
+    """Image motion after which a view is a keyframe whatever its number: views of a live camera may lie far apart."""
     _moved_px: float = 0.0
     """Image motion since the newest keyframe."""
 
     def remember(self, view: TrackedView, picture: Picture) -> bool:
         """Keep the image of a view with a pose if it is a keyframe; returns whether it is."""
         self._moved_px += view.moved_px
-        if view.pose is not None and view.id % KEYFRAME_EVERY == 0 and self._moved_px >= self.least_motion_px:
+        due = view.id % KEYFRAME_EVERY == 0 and self._moved_px >= self.least_motion_px
+        if view.pose is not None and (due or self._moved_px >= self.most_motion_px):
             self.keyframes[view.id] = picture
             self._moved_px = 0.0
             return True

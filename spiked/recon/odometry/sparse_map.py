@@ -19,6 +19,8 @@ from spiked.spline import Waypoints
 
 TRIANGULATION_MIN_VIEWS, TRIANGULATION_MIN_SPREAD_PX, TRIANGULATION_MAX_ERROR_PX = 5, 0.5, 2.0
 """Triangulated if seen >= 5 times, ray spread >= 0.5 px, max reprojection error 2 px."""
+TRIANGULATION_MIN_FAR_VIEWS = 3
+"""The same of views far apart: of a new place a live camera sees few."""
 TRIANGULATION_MIN_SPREAD_NOISES = 3.0
 """Ray spread that a triangulation needs, over the noise of the tracks."""
 STILL_SHARE = 0.1
@@ -194,8 +196,8 @@ class SparseMap:
         local = (self.points[view.ids] - pose.centre) @ pose.rotation
         return np.asarray(np.linalg.norm(self.intrinsics.project(local) - view.pixels, axis=1))
 
-    def triangulate(self, views: Sequence[TrackedView]) -> None:
-        """Triangulate tracks without a point from those of the views that have a pose."""
+    def triangulate(self, views: Sequence[TrackedView], least_views: int = TRIANGULATION_MIN_VIEWS) -> None:
+        """Triangulate tracks without a point, seen by `least_views`, from those of the views that have a pose."""
         posed = [(view, view.pose) for view in views if view.pose is not None]
         if not posed:
             return
@@ -211,7 +213,7 @@ class SparseMap:
             k.fy,
             k.cx,
             k.cy,
-            TRIANGULATION_MIN_VIEWS,
+            least_views,
             max(TRIANGULATION_MIN_SPREAD_PX, TRIANGULATION_MIN_SPREAD_NOISES * self.noise_px),
             TRIANGULATION_MAX_ERROR_PX,
             self.points,

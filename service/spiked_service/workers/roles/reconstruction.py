@@ -27,7 +27,7 @@ from spiked_service.results.mosaic_by_pixels import by_pixels
 from spiked_service.results.pinned_map import PinnedMap
 from spiked_service.results.recording_feed import pieces
 from spiked_service.workers.channel import WorkerChannel
-from spiked_service.workers.frame_skipping import LATE_FRAMES, LatestFrames, next_window
+from spiked_service.workers.frame_skipping import LATE_FRAMES, LONGEST_UNMAPPED_S, LatestFrames, may_map, next_window
 from spiked_service.workers.messages import ReconstructionCommand
 from spiked_service.workers.progress_reporter import ProgressReporter
 
@@ -40,10 +40,6 @@ _UNPACED_FRAMES = 32
 """Frames between two times of mapping, of a source that can block."""
 _UNPACED_MAPPING_S = 0.3
 """Mapping time after every `_UNPACED_FRAMES` frames of a source that can block."""
-_PUNCTUAL_S = 0.04
-"""Lateness up to which the mapper runs after every window of a skipping tracker, ..."""
-_MOST_UNMAPPED = 4
-"""... and the number of windows after which it runs otherwise."""
 _SKIPPING_MAPPING_S = 0.01
 """Mapping time between two windows of a skipping tracker: one or two steps."""
 _LIVE_NICE = 5
@@ -251,7 +247,7 @@ def _track_latest(latest: LatestFrames, work: _Work, command: ReconstructionComm
     zero, stop = command.first_frame, command.stop_frame
     reconstructor = work.reconstructor
     rate_hz = reconstructor.sensor.frame_rate_hz
-    unmapped = 0
+    mapped_s = time.monotonic()
     while not work.channel.leave.is_set() and (stop is None or latest.at < stop):
         count = reconstructor.latest_frames
         first = next_window(latest.at, newest() + zero, count, reconstructor.speed_px, rate_hz)
@@ -271,10 +267,11 @@ def _track_latest(latest: LatestFrames, work: _Work, command: ReconstructionComm
                 end = _within(begin, begin + len(frames), zero, stop)[1]
                 if end - begin > SEARCH_FRAMES:
                     work.track_latest(begin - zero, frames[: end - begin], newest)
-                unmapped += 1
-                if newest() + zero - end < _PUNCTUAL_S * rate_hz or unmapped >= _MOST_UNMAPPED:
-                    unmapped = 0
+                late = newest() + zero - end
+                overdue = time.monotonic() - mapped_s > LONGEST_UNMAPPED_S
+                if overdue or may_map(late, reconstructor.speed_px, rate_hz):
                     reconstructor.improve(_SKIPPING_MAPPING_S)
+                    mapped_s = time.monotonic()
         work.reporter.progress(reconstructor.status())
     return latest.skipped
 

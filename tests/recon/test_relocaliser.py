@@ -46,6 +46,17 @@ def test_a_view_shifted_by_a_tenth_of_the_image_is_found() -> None:
     assert np.abs(view.pixels - sparse_map.views[0].pixels_of(view.ids) - [-32, 8]).max() < 0.5
 
 
+def test_older_keyframes_are_tried_in_turn() -> None:
+    sparse_map, relocaliser = known_map(texture(1))
+    first = sparse_map.views[0]
+    for number in range(1, 15):
+        sparse_map.views.append(TrackedView(number, 8.0, 16, first.ids, first.pixels, 0.0, State.TRACK, STILL))
+        relocaliser.keyframes[number] = texture(number + 1)
+    relocaliser.older_tried = 4
+    found = [relocaliser.find(lost(15), texture(number)) is not None for number in (5, 5, 5, 14, 14)]
+    assert found == [False, True, False, True, True]  # the fifth, in its turn; one of the newest, always
+
+
 def test_a_foreign_view_is_not_found_and_not_changed() -> None:
     _, relocaliser = known_map(texture(1))
     view = lost()

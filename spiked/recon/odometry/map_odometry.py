@@ -26,7 +26,7 @@ from spiked.recon.odometry.keyframe_pictures import KeyframePictures, PictureBui
 from spiked.recon.odometry.loop_closure import EVERY_PX, LIVE_EVERY_PX, LoopSearch
 from spiked.recon.odometry.path_adjuster import PathAdjuster
 from spiked.recon.odometry.pose_tracker import LOCAL_BA_EVERY, PoseTracker
-from spiked.recon.odometry.relocaliser import Relocaliser
+from spiked.recon.odometry.relocaliser import LIVE_OLDER_KEYFRAMES, Relocaliser
 from spiked.recon.odometry.self_calibration import EstimatedLens, Focal
 from spiked.recon.odometry.sparse_map import Pose, SparseMap, TrackedView
 from spiked.recon.odometry.tracking_state import State, TrackingState
@@ -63,7 +63,11 @@ class MapOdometry:
         self._adjuster: PathAdjuster = GlobalAdjuster(self._map)
         self._keyframes: KeyframeAdjuster | None = None
         """The adjuster of a long path."""
-        self._relocaliser = Relocaliser(self._map, KeyframePictures() if pictures is None else pictures)
+        self._relocaliser = Relocaliser(
+            self._map,
+            KeyframePictures() if pictures is None else pictures,
+            older_tried=LIVE_OLDER_KEYFRAMES if live else None,
+        )
         self._tracker = PoseTracker(self._map, self._status, self._tracks, self._relocaliser, self._adjuster)
         self.path_error: float | None = None
         """Predicted error of the finished path relative to its RMS radius; None before the end."""

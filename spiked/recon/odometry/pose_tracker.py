@@ -28,7 +28,7 @@ TRIANGULATE_EVERY, LOCAL_BA_EVERY = 4, 8
 FAR_PX = 8.0
 """Image motion to a view, where frames were skipped, from which on tracks are triangulated in every view and from fewer
 of them: the camera may leave what is known within a few."""
-PREDICTED_LENGTHS = 4
+PREDICTED_LENGTHS = 16
 """Lengths of the newest view over which its motion is taken to go on, for the templates of tracks."""
 PREDICTION_VIEWS = 40
 """Newest views in which posed ones are sought to predict the next pose."""

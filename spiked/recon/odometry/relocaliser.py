@@ -16,6 +16,8 @@ KEYFRAME_EVERY = 8
 """Every eighth view is a keyframe, if it has a pose."""
 NEWEST_KEYFRAMES, OLDER_KEYFRAMES = 3, 12
 """Keyframes tried: the newest, and about so many of the older ones, evenly spaced."""
+LIVE_OLDER_KEYFRAMES = 4
+"""Of these, those tried in a view of a live camera, in turn: a search takes 3 ms, and more views come meanwhile."""
 RELOCALISED_CHI2, RELOCALISED_INLIERS = 4.0, 0.6
 """Relocalisation needs points within twice their noise: blurred views match much by chance (decision 10)."""
 MAX_RETURN_PX = 0.5
@@ -41,6 +43,9 @@ class Relocaliser:
     """Image motion from one keyframe to the next, at least: with more than 0 a camera at rest adds none."""
     most_motion_px: float = np.inf
     """Image motion after which a view is a keyframe whatever its number: views of a live camera may lie far apart."""
+    older_tried: int | None = None
+    """Older keyframes tried in one view, if not all: the others are tried in those after it."""
+    _next_older: int = 0
     _moved_px: float = 0.0
     """Image motion since the newest keyframe."""
 
@@ -95,6 +100,10 @@ class Relocaliser:
         """
         numbers = sorted(self.keyframes)
         older = numbers[:-NEWEST_KEYFRAMES][:: max(1, len(numbers) // OLDER_KEYFRAMES)]
+        if self.older_tried is not None and older:
+            begin = self._next_older % len(older)
+            older = (older[begin:] + older[:begin])[: self.older_tried]
+            self._next_older = begin + self.older_tried
         for number in reversed(numbers[-NEWEST_KEYFRAMES:] + older):
             key = self.map.views[number]
             ids, pixels = self.map.known_tracks(key)

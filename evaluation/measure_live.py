@@ -154,7 +154,7 @@ def measure(recording: Path, truth: Path | None, seconds: float, steps: int, wit
             jobs = http.get("reconstructions", params={"capture_id": capture_id}).json()["items"]
             job = jobs[0]
             version, path = path_now(http, job["id"], job["poses"])
-            timeline = http.get(f"reconstructions/{job['id']}/timeline", params={"points": 500}).json()
+            timeline = http.get(f"reconstructions/{job['id']}/timeline", params={"points": 10_000}).json()
             page = told()
             page.pop("waited", None)
         while capture["recording"] is None and capture["state"] not in ("complete", "failed"):

@@ -1,13 +1,15 @@
 """Work on another thread ends with its result or its error, when it is told to, and in copies."""
 
+import os
 import pickle
+import sys
 import threading
 from collections.abc import Callable
 from copy import deepcopy
 
 import pytest
 
-from spiked.recon.odometry.background import Background
+from spiked.recon.odometry.background import BEHIND_NICE, Background
 
 
 def test_the_result_is_waited_for() -> None:
@@ -36,6 +38,17 @@ def test_it_ends_when_it_is_told() -> None:
     work = Background(until)
     work.stop()
     assert work.result() == "ended"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere threads have the priority of their process")
+def test_a_thread_behind_another_has_less_priority() -> None:
+    def niceness(stop: Callable[[], bool]) -> int:
+        return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+
+    own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+    assert Background(niceness).result() == own
+    assert Background(niceness, behind=True).result() == min(own + BEHIND_NICE, 19)
+    assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == own
 
 
 def test_copies_have_the_result_and_no_thread() -> None:

@@ -1,5 +1,7 @@
 """Work on another thread whose result is taken later, at a point that does not depend on how long it took."""
 
+import os
+import sys
 import threading
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -8,19 +10,28 @@ from spiked.recon.blas import one_blas_thread
 
 Result = TypeVar("Result")
 
+BEHIND_NICE = 10
+"""Niceness of a thread behind another, beside that of the other."""
+
 
 class Background(Generic[Result]):
     """A function that runs on a thread of its own."""
 
-    def __init__(self, work: Callable[[Callable[[], bool]], Result]) -> None:
-        """`work` gets a function that tells whether it is to end early."""
-        self._work = work
+    def __init__(self, work: Callable[[Callable[[], bool]], Result], behind: bool = False) -> None:
+        """`work` gets a function that tells whether it is to end early.
+
+        `behind`: the thread has less priority than the one that began it, on Linux.
+        """
+        self._work, self._behind = work, behind
         self._stop = threading.Event()
         self._outcome: list[Result | BaseException] = []
         self._thread = threading.Thread(target=self._run, name="path adjustment")
         self._thread.start()
 
     def _run(self) -> None:
+        if self._behind and sys.platform == "linux":  # where priorities are those of threads
+            thread = threading.get_native_id()
+            os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + BEHIND_NICE)
         try:
             with one_blas_thread():
                 self._outcome.append(self._work(self._stop.is_set))

@@ -50,6 +50,8 @@ adjustments."""
 WHOLE_KEYFRAMES = 1000
 """Keyframes that are adjusted together, at most: time grows with the cube of their number where a path goes through the
 same places again and again. Of more, these are spread evenly (decision 15)."""
+LIVE_WHOLE_KEYFRAMES = 400
+"""The same while a live camera is tracked: the tracker shares the cores with the adjustment."""
 WHOLE_GROWTH = 1.5
 """Growth of the number of keyframes from one adjustment of all of them while tracking to the next: their cost over a
 recording stays in proportion to its length."""
@@ -177,7 +179,7 @@ class KeyframeAdjuster:
         if due and self._lens_search is None and not self.map.lens_known and self.map.lens is None:
             self._looked = count
             if (sample := self._newest_for_lens()) is not None:
-                self._lens_search = Background(lambda stop: _distorted(sample) is not None)
+                self._lens_search = Background(lambda stop: _distorted(sample) is not None, behind=self.live)
         if self._lens_search is not None and (now or not self.live or self._lens_search.done):
             found, self._lens_search = self._lens_search.result(), None
             if found:
@@ -210,9 +212,12 @@ class KeyframeAdjuster:
         closures = self.loops.search(view)
         if not closures:
             return []
+        drifted = max(closure.correction_px(self.map.intrinsics) for closure in closures) > SPREAD_PX
+        if drifted and self.live and self._whole is not None and not self._whole.done:
+            return []  # the views that follow find the loop again, when the path is adjusted
         self._link(closures)
         self._open = True
-        if max(closure.correction_px(self.map.intrinsics) for closure in closures) > SPREAD_PX:
+        if drifted:
             self._take_whole(now=True)
             spread_drift(self.map, closures)
             self.loops.closed()
@@ -241,7 +246,8 @@ class KeyframeAdjuster:
         """Begin to adjust all keyframes if loops were closed, and the path has grown enough since the last time."""
         if not self._open or self._whole is not None or len(self.keyframes) < self._whole_due:
             return
-        if (made := self.map.bundle(self._all_chosen())) is None:
+        most = LIVE_WHOLE_KEYFRAMES if self.live else WHOLE_KEYFRAMES
+        if (made := self.map.bundle(self._all_chosen(most))) is None:
             return
         found = made  # for the function: not None
         first = np.arange(len(made.views)) < 1
@@ -250,7 +256,7 @@ class KeyframeAdjuster:
             banded_bundle.optimise(found.bundle, LOOP_ITERATIONS, FINAL_SCALE_PX, first, TOLERANCE, stop)
             return found
 
-        self._open, self._whole = False, Background(work)
+        self._open, self._whole = False, Background(work, behind=self.live)
         self._whole_due = len(self.keyframes) * (1 + 1 / TAKEN_AFTER)
 
     def _take_whole(self, now: bool = False) -> None:
@@ -265,10 +271,10 @@ class KeyframeAdjuster:
         self._whole_due = WHOLE_GROWTH * len(self.keyframes)
         self._take(made, self.map.views)
 
-    def _all_chosen(self) -> list[TrackedView]:
-        """All keyframes, or `WHOLE_KEYFRAMES` of them, and the views of closed loops."""
+    def _all_chosen(self, most: int = WHOLE_KEYFRAMES) -> list[TrackedView]:
+        """All keyframes, or at most so many of them, and the views of closed loops."""
         posed = [view for view in self.keyframes if view.pose is not None]
-        chosen = {posed[row].id: posed[row] for row in evenly(len(posed), WHOLE_KEYFRAMES)}
+        chosen = {posed[row].id: posed[row] for row in evenly(len(posed), most)}
         for closure in self._linked.values():
             chosen |= {closure.earlier.id: closure.earlier, closure.later.id: closure.later}
         return _in_order(chosen)

@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -56,3 +57,19 @@ def test_copies_have_the_result_and_no_thread() -> None:
     copy, stored = deepcopy(work), pickle.loads(pickle.dumps(work))
     assert copy.result() == stored.result() == [1, 2]
     assert deepcopy(copy).result() == [1, 2]
+
+
+def test_it_does_not_keep_a_program_from_ending() -> None:
+    program = """
+from spiked.recon.odometry.background import Background
+
+def work(stop):
+    while not stop():
+        pass
+    print("told to end")
+
+Background(work)
+raise SystemExit(3)
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (3, "told to end\n", "")

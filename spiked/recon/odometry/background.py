@@ -1,4 +1,7 @@
-"""Work on another thread whose result is taken later, at a point that does not depend on how long it took."""
+"""Work on another thread whose result is taken later.
+
+Of a recording at a point that does not depend on how long it took, of a live camera once it is there.
+"""
 
 import os
 import sys
@@ -29,14 +32,18 @@ class Background(Generic[Result]):
         self._thread.start()
 
     def _run(self) -> None:
-        if self._behind and sys.platform == "linux":  # where priorities are those of threads
-            thread = threading.get_native_id()
-            os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + BEHIND_NICE)
         try:
+            if self._behind and sys.platform == "linux":  # where priorities are those of threads
+                thread = threading.get_native_id()
+                os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + BEHIND_NICE)
             with one_blas_thread():
-                self._outcome.append(self._work(self._stop.is_set))
+                self._outcome.append(self._work(self._is_over))
         except BaseException as error:  # raised again by `result`, on the thread that waits for it
             self._outcome.append(error)
+
+    def _is_over(self) -> bool:
+        """It was stopped, or the program ends."""
+        return self._stop.is_set() or not threading.main_thread().is_alive()
 
     @property
     def done(self) -> bool:

@@ -104,8 +104,8 @@ class KeyframeAdjuster:
     """Closures by id of the later view."""
     live: bool = False
     """Results of other threads are taken once they are there: a camera does not wait for them."""
-    _lens_search: Background[bool] | None = None
-    """Search for a distortion that runs: whether there is one."""
+    _lens_search: Background[MapBundle | None] | None = None
+    """Search for a distortion that runs."""
     _whole: Background[MapBundle] | None = None
     """Adjustment of all keyframes that runs."""
     _whole_due: float = 0.0
@@ -165,7 +165,10 @@ class KeyframeAdjuster:
         self._adjust_whole_if_due()
 
     def _newest(self, most: int, most_px: float, least: int) -> int:
-        """Number of newest keyframes, up to `most`, that span at most this image motion, or `least`."""
+        """Number of newest keyframes, up to `most`; of a live camera those that span at most this image motion, or
+        `least`."""
+        if not self.live:
+            return most
         travelled_px = [self.map.travelled_px(view.id) for view in self.keyframes[-most:]]
         return max(sum(px >= travelled_px[-1] - most_px for px in travelled_px), least)
 
@@ -174,16 +177,22 @@ class KeyframeAdjuster:
 
         Of a live camera its answer is taken at a later adjustment, once it is there, unless it is to be `now`.
         """
+        self._take_lens_search(now)
         count = len(self.keyframes)
         due = count > self._looked if now else count >= max(LENS_KEYFRAMES, LENS_GROWTH * self._looked)
-        if due and self._lens_search is None and not self.map.lens_known and self.map.lens is None:
-            self._looked = count
-            if (sample := self._newest_for_lens()) is not None:
-                self._lens_search = Background(lambda stop: _distorted(sample) is not None, behind=self.live)
-        if self._lens_search is not None and (now or not self.live or self._lens_search.done):
-            found, self._lens_search = self._lens_search.result(), None
-            if found:
-                self._take_distortion()
+        if not due or self._lens_search is not None or self.map.lens_known or self.map.lens is not None:
+            return
+        self._looked = count
+        if (sample := self._newest_for_lens()) is not None:
+            self._lens_search = Background(lambda stop: _distorted(sample), behind=self.live)
+            self._take_lens_search(now)
+
+    def _take_lens_search(self, now: bool) -> None:
+        if self._lens_search is None or (self.live and not now and not self._lens_search.done):
+            return
+        found, self._lens_search = self._lens_search.result(), None
+        if found is not None:
+            self._take_distortion(found)
 
     def _newest_for_lens(self) -> MapBundle | None:
         """A bundle of the keyframes in which a distortion is looked for; None if they are too few."""
@@ -194,14 +203,19 @@ class KeyframeAdjuster:
         made.bundle.free = self.map.free_optics
         return made
 
-    def _take_distortion(self) -> None:
-        """Let the lens be estimated from now on if the newest keyframes show one that nobody stated.
+    def _take_distortion(self, made: MapBundle) -> None:
+        """Let the lens be estimated from now on that keyframes show, adjusted with it.
 
         They and the views after them follow at once, the path before them with the next adjustment of all keyframes.
         """
-        self._take_whole(now=True)
-        if (sample := self._newest_for_lens()) is None or (made := _distorted(sample)) is None:
-            return
+        if self._whole is not None and self.live:
+            self._whole.stop()
+            self._whole = None  # it knows of no lens
+        elif self._whole is not None:
+            self._take_whole(now=True)
+            if (sample := self._newest_for_lens()) is None or (again := _distorted(sample)) is None:
+                return
+            made = again
         _, self.map.lens = estimates(made.bundle)
         self.map.take_optics(made.bundle)
         self._take(made, self.map.views[made.views[0].id :])
@@ -214,7 +228,8 @@ class KeyframeAdjuster:
             return []
         drifted = max(closure.correction_px(self.map.intrinsics) for closure in closures) > SPREAD_PX
         if drifted and self.live and self._whole is not None and not self._whole.done:
-            return []  # the views that follow find the loop again, when the path is adjusted
+            self.loops.forget()  # the views that follow find the loop again, when the path is adjusted
+            return []
         self._link(closures)
         self._open = True
         if drifted:
@@ -265,10 +280,12 @@ class KeyframeAdjuster:
             return
         if not now and (not self._whole.done if self.live else len(self.keyframes) < self._whole_due):
             return
-        if self.live:
+        cut_short = self.live and not self._whole.done
+        if cut_short:
             self._whole.stop()
         made, self._whole = self._whole.result(), None
-        self._whole_due = WHOLE_GROWTH * len(self.keyframes)
+        self._open |= cut_short
+        self._whole_due = 0.0 if cut_short else WHOLE_GROWTH * len(self.keyframes)
         self._take(made, self.map.views)
 
     def _all_chosen(self, most: int = WHOLE_KEYFRAMES) -> list[TrackedView]:

@@ -140,6 +140,10 @@ class LoopSearch:
         for view in views:
             self._add(view)
 
+    def forget(self) -> None:
+        """The newest closures are not applied: the path is about to change, and they are to be found again."""
+        self._run = []
+
     def closed(self) -> None:
         """The path was corrected by the newest closures."""
         self._run = [replace(one, before=one.pose) for one in self._run]

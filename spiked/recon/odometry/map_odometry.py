@@ -68,7 +68,7 @@ class MapOdometry:
             KeyframePictures() if pictures is None else pictures,
             older_tried=LIVE_OLDER_KEYFRAMES if live else None,
         )
-        self._tracker = PoseTracker(self._map, self._status, self._tracks, self._relocaliser, self._adjuster)
+        self._tracker = PoseTracker(self._map, self._status, self._tracks, self._relocaliser, self._adjuster, live)
         self.path_error: float | None = None
         """Predicted error of the finished path relative to its RMS radius; None before the end."""
 
@@ -224,7 +224,9 @@ class MapOdometry:
     def _adjust_keyframes(self, loops: LoopSearch) -> None:
         """Adjust keyframes from now on, if that is not done yet."""
         if self._keyframes is None:
-            self._relocaliser.least_motion_px, self._relocaliser.most_motion_px = LEAST_MOTION_PX, MOST_MOTION_PX
+            self._relocaliser.least_motion_px = LEAST_MOTION_PX
+            if self._live:
+                self._relocaliser.most_motion_px = MOST_MOTION_PX
             self._keyframes = KeyframeAdjuster(self._map, self.keyframe_images, loops, live=self._live)
             self._adjuster = self._tracker.adjuster = self._keyframes
 

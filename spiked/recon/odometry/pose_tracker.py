@@ -28,7 +28,7 @@ TRIANGULATE_EVERY, LOCAL_BA_EVERY = 4, 8
 FAR_PX = 8.0
 """Image motion to a view, where frames were skipped, from which on tracks are triangulated in every view and from fewer
 of them: the camera may leave what is known within a few."""
-PREDICTED_LENGTHS = 16
+PREDICTED_LENGTHS, LIVE_PREDICTED_LENGTHS = 4, 16
 """Lengths of the newest view over which its motion is taken to go on, for the templates of tracks."""
 PREDICTION_VIEWS = 40
 """Newest views in which posed ones are sought to predict the next pose."""
@@ -49,6 +49,8 @@ class PoseTracker:
     tracks: Tracks
     relocaliser: Relocaliser
     adjuster: PathAdjuster
+    live: bool = False
+    """The camera does not wait: its views may lie far apart."""
 
     def track(self, picture: Picture) -> None:
         """Estimate the pose of the newest view, then extend and adjust the map."""
@@ -78,7 +80,8 @@ class PoseTracker:
         wanted = self.adjuster.newest_keyframe is not None or self.map.intrinsics.distortion is not None
         if not wanted or newest is None or newest.pose is None:
             return NO_WARPS
-        if time - newest.time > PREDICTED_LENGTHS * newest.length:
+        lengths = LIVE_PREDICTED_LENGTHS if self.live else PREDICTED_LENGTHS
+        if time - newest.time > lengths * newest.length:
             return NO_WARPS
         return template_warps(self.map, self.tracks, predict(self._known(PREDICTION_VIEWS), time))
 
@@ -91,8 +94,8 @@ class PoseTracker:
 
     @property
     def _far(self) -> bool:
-        """Frames were skipped, and the newest view lies far from the one before."""
-        return self.tracks.far and self.map.views[-1].motion_px > FAR_PX
+        """The camera is live, frames were skipped, and the newest view lies far from the one before."""
+        return self.live and self.tracks.far and self.map.views[-1].motion_px > FAR_PX
 
     def _known(self, newest: int) -> list[TrackedView]:
         """The last two views with a pose, or one: if possible of the `newest` views."""

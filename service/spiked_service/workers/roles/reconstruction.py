@@ -254,6 +254,7 @@ def _track_latest(latest: LatestFrames, work: _Work, command: ReconstructionComm
         latest.track_latest(first, count)
         while (item := latest.take(_WAIT_S)) is None and not work.channel.leave.is_set():
             reconstructor.improve(_SPARE_S)
+            mapped_s = time.monotonic()
         match item:
             case End():
                 break

@@ -197,12 +197,12 @@ def test_a_copy_of_the_last_adjustment_ends_like_it(
 
 
 def test_the_map_corrects_a_path_that_is_interpolated(walked: tuple[Reconstructor, Trajectory]) -> None:
-    """1.154 to 1.142 % ATE with 300 steps. While points were triangulated with a bias, 1.33 to 1.10."""
+    """1.33 to 1.10 % ATE with 300 steps."""
     reconstructor, truth = walked
     before = _ate_percent(reconstructor, truth)
     reconstructor.finish()
     after = _ate_percent(reconstructor, truth)
-    assert after < min(before, 1.2)
+    assert after < 0.95 * before
 
 
 def test_an_alignment_of_many_views_takes_some_of_them(

@@ -1,6 +1,6 @@
-// Triangulation of tracks: the point of least reprojection error, from the one nearest to the rays of all observations.
-// That one alone is biased towards the cameras: distances from rays are the smaller the nearer the point is
-// (R. Hartley and P. Sturm, "Triangulation", 1997).
+// Triangulation of tracks: the point nearest to the rays of all observations, moved by Gauss-Newton steps to that of
+// least reprojection error. Without them it is biased towards the cameras: distances from rays are the smaller the
+// nearer the point is (R. Hartley and P. Sturm, "Triangulation", 1997).
 #include <nanobind/stl/optional.h>
 
 #include <algorithm>
@@ -18,7 +18,6 @@ namespace {
 
 constexpr double kDiagonal = 1e-12;                  // added to the diagonal of a matrix that may be singular
 constexpr double kThirdOfTurn = 2.0943951023931953;  // rad
-constexpr int kSteps = 3;                            // Gauss-Newton steps
 constexpr double kMostStep = 0.3;                    // of the distance from the last camera, in one step
 
 // Sums of I - d d^T over unit rays d, and of the same times the centres that they start from.
@@ -101,7 +100,7 @@ void triangulate(const Array<const double, 3>& rotations, const Array<const doub
                  const Array<const int64_t, 1>& view, const Array<const int64_t, 1>& track,
                  const Array<const double, 2>& pixels, double fx, double fy, double cx, double cy, int64_t min_views,
                  double min_spread_px, double max_error_px, const Array<double, 2>& points,
-                 const std::optional<Array<const double, 1>>& lens) {
+                 const std::optional<Array<const double, 1>>& lens, int steps) {
     const size_t count = view.shape(0), views = centres.shape(0);
     if (rotations.shape(0) != views || rotations.shape(1) != 3 || rotations.shape(2) != 3 || centres.shape(1) != 3 ||
         track.shape(0) != count || pixels.shape(0) != count || pixels.shape(1) != 2 || points.shape(1) != 3) {
@@ -141,7 +140,7 @@ void triangulate(const Array<const double, 3>& rotations, const Array<const doub
         const Pose pose = {rotations.data() + 9 * view.data()[m], centres.data() + 3 * view.data()[m]};
         return project(k, pose, rays.position.data(), pixels.data() + 2 * m);
     };
-    for (int n = 0; n < kSteps; ++n) {
+    for (int n = 0; n < steps; ++n) {
         for (const size_t m : used) {
             Rays& rays = sums[index_of[track.data()[m]]];
             rays.add_error(projected(m, rays));
@@ -168,12 +167,14 @@ void bind_triangulate(nb::module_& m) {
     m.def("triangulate", &triangulate, nb::arg("rotations"), nb::arg("centres"), nb::arg("view"), nb::arg("track"),
           nb::arg("pixels"), nb::arg("fx"), nb::arg("fy"), nb::arg("cx"), nb::arg("cy"), nb::arg("min_views"),
           nb::arg("min_spread_px"), nb::arg("max_error_px"), nb::arg("points").noconvert(),
-          nb::arg("lens") = nb::none(),
+          nb::arg("lens") = nb::none(), nb::arg("steps") = 0,
           "Fills those of `points` [P, 3] that are NaN from the observations of posed views: observation m is of "
           "`track`\n"
           "[m] in `view` [m]. A track is triangulated if at least `min_views` views saw it, its rays spread by more "
           "than\n"
-          "`min_spread_px`, and its largest reprojection error is less than `max_error_px`.");
+          "`min_spread_px`, and its largest reprojection error is less than `max_error_px`. It is moved by `steps` "
+          "Gauss-Newton "
+          "steps of these errors.");
 }
 
 }  // namespace spiked

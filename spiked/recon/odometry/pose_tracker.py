@@ -25,6 +25,8 @@ RECENT_VIEWS = 48
 """Newest views from which tracks are triangulated between global adjustments: it bounds the time of one call."""
 TRIANGULATE_EVERY, LOCAL_BA_EVERY = 4, 8
 """Views between triangulations and between local bundle adjustments."""
+LIVE_STEPS = 3
+"""Gauss-Newton steps of a live camera's triangulation: without them it is biased towards the camera (decision 62)."""
 FAR_PX = 8.0
 """Image motion to a view, where frames were skipped, from which on tracks are triangulated in every view and from fewer
 of them: the camera may leave what is known within a few."""
@@ -90,7 +92,7 @@ class PoseTracker:
         recent = self.map.views[-RECENT_VIEWS:]
         older = [view for view in self.adjuster.reference_views if view.id < recent[0].id]
         least = TRIANGULATION_MIN_FAR_VIEWS if self._far else TRIANGULATION_MIN_VIEWS
-        self.map.triangulate(older + recent, least)
+        self.map.triangulate(older + recent, least, LIVE_STEPS if self.live else 0)
 
     @property
     def _far(self) -> bool:

@@ -196,8 +196,11 @@ class SparseMap:
         local = (self.points[view.ids] - pose.centre) @ pose.rotation
         return np.asarray(np.linalg.norm(self.intrinsics.project(local) - view.pixels, axis=1))
 
-    def triangulate(self, views: Sequence[TrackedView], least_views: int = TRIANGULATION_MIN_VIEWS) -> None:
-        """Triangulate tracks without a point, seen by `least_views`, from those of the views that have a pose."""
+    def triangulate(
+        self, views: Sequence[TrackedView], least_views: int = TRIANGULATION_MIN_VIEWS, steps: int = 0
+    ) -> None:
+        """Triangulate tracks without a point, seen by `least_views`, from those of the views that have a pose: nearest
+        to their rays, then by Gauss-Newton `steps` of the reprojection error."""
         posed = [(view, view.pose) for view in views if view.pose is not None]
         if not posed:
             return
@@ -218,6 +221,7 @@ class SparseMap:
             TRIANGULATION_MAX_ERROR_PX,
             self.points,
             **k.lens(),
+            steps=steps,
         )
 
     def bundle(self, views: list[TrackedView]) -> MapBundle | None:

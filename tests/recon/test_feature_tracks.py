@@ -258,9 +258,11 @@ def test_depths_of_little_parallax_are_not_biased() -> None:
     local = points[track] - centres[view]
     pixels = focal_px * local[:, :2] / local[:, 2:] + (200, 125) + rng.normal(0, 0.15, (len(view), 2))
     rotations, lens = np.repeat(np.eye(3)[None], views, 0), (focal_px, focal_px, 200.0, 125.0)
-    found = np.full((count, 3), np.nan)
+    found, nearest = np.full((2, count, 3), np.nan)
+    _bundle.triangulate(rotations, centres, view, track, pixels, *lens, 5, 0.1, 2.0, nearest)
     _bundle.triangulate(rotations, centres, view, track, pixels, *lens, 5, 0.1, 2.0, found, steps=3)
     assert np.isfinite(found).all()
+    assert np.median(nearest[:, 2]) == pytest.approx(0.95 * 5.0, rel=0.01)
     assert np.median(found[:, 2]) == pytest.approx(5.0, rel=0.01)
     assert 1 / np.mean(1 / found[:, 2]) == pytest.approx(5.0, rel=0.01)
 

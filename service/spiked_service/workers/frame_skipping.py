@@ -18,11 +18,9 @@ _STRIDE_S = 0.05
 """Time over which the motion model predicts, about."""
 _LATE_S = 0.2
 """Lateness at which the second `REACH_PX` applies; in between, the reach is interpolated."""
-
-
-STEP_S = 0.02
+_STEP_S = 0.02
 """Time of a step of the map, about."""
-STEP_REACH_PX, PUNCTUAL_S = 10.0, 0.04
+_STEP_REACH_PX, _PUNCTUAL_S = 10.0, 0.04
 """Image motion, and lateness, up to which the tracker waits for a step of the map."""
 LONGEST_UNMAPPED_S = 1.0
 """Time after which the map gets a step anyway."""
@@ -34,7 +32,7 @@ def may_map(late_frames: int, speed_px: float | None, rate_hz: float) -> bool:
     `speed_px` is the image motion in pixels a frame, None if unknown.
     """
     late_s = late_frames / rate_hz
-    return late_s < PUNCTUAL_S and (late_s + STEP_S) * rate_hz * (speed_px or 0.0) < STEP_REACH_PX
+    return late_s < _PUNCTUAL_S and (late_s + _STEP_S) * rate_hz * (speed_px or 0.0) < _STEP_REACH_PX
 
 
 def next_window(at: int, newest: int, count: int, speed_px: float | None, rate_hz: float) -> int:

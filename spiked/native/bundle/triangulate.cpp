@@ -59,26 +59,25 @@ struct Rays {
         distance = std::hypot(projection.ray[0], projection.ray[1], projection.ray[2]);
     }
 
-    // One Gauss-Newton step of the position.
+    // One Gauss-Newton step of the position; none where the errors do not determine one.
     void step() {
         const double diagonal = kDiagonal * (hessian[0] + hessian[3] + hessian[5]);
-        hessian[0] += diagonal;
-        hessian[3] += diagonal;
-        hessian[5] += diagonal;
+        for (const int i : {0, 3, 5}) hessian[i] += diagonal;
         const std::array<double, 3> move = solved(hessian, gradient);
-        const double length = std::hypot(move[0], move[1], move[2]), most = kMostStep * distance;
-        const double share = std::isfinite(length) ? (length > most ? most / length : 1) : 0;
-        for (int i = 0; i < 3 && share > 0; ++i) position[i] -= share * move[i];
         hessian = {};
         gradient = {};
+        const double length = std::hypot(move[0], move[1], move[2]), most = kMostStep * distance;
+        if (!std::isfinite(length)) return;
+        const double share = length > most ? most / length : 1;
+        for (int i = 0; i < 3; ++i) position[i] -= share * move[i];
     }
 
-    // Solves a symmetric system; `m` is its upper triangle by rows.
+    // Solves a symmetric system, by cofactors; `m` is its upper triangle by rows.
     static std::array<double, 3> solved(const std::array<double, 6>& m, const std::array<double, 3>& right) {
-        const double a = m[0], ab_ = m[1], ac_ = m[2], b = m[3], bc_ = m[4], c = m[5];
-        const double aa = b * c - bc_ * bc_, ab = ac_ * bc_ - ab_ * c, ac = ab_ * bc_ - ac_ * b;
-        const double bb = a * c - ac_ * ac_, bc = ab_ * ac_ - a * bc_, cc = a * b - ab_ * ab_;
-        const double scale = 1 / (a * aa + ab_ * ab + ac_ * ac);
+        const auto [xx, xy, xz, yy, yz, zz] = m;
+        const double aa = yy * zz - yz * yz, ab = xz * yz - xy * zz, ac = xy * yz - xz * yy;
+        const double bb = xx * zz - xz * xz, bc = xy * xz - xx * yz, cc = xx * yy - xy * xy;
+        const double scale = 1 / (xx * aa + xy * ab + xz * ac);
         return {scale * (aa * right[0] + ab * right[1] + ac * right[2]),
                 scale * (ab * right[0] + bb * right[1] + bc * right[2]),
                 scale * (ac * right[0] + bc * right[1] + cc * right[2])};

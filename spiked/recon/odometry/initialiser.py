@@ -58,7 +58,7 @@ class Initialiser:
 
         Returns whether the map was initialised: then all views from the first of the attempt on have poses.
         """
-        if self._start < len(self.map.views):
+        if self._start < len(self.map.views):  # a second map may have no view yet
             self._move_start(stood)
         views = self.map.views[self._start :]
         count, time = len(views), self.map.views[-1].time

@@ -70,11 +70,15 @@ class Path(Protocol):
 @final
 @dataclass(frozen=True)
 class Waypoints:
-    """Poses at increasing `times` [n] (frames), and even turns and ways from each to the next."""
+    """Poses at increasing `times` [n] (frames), and even turns and ways from each to the next.
+
+    `smooth`: cubic curves go through them instead.
+    """
 
     times: Array
     rotations: Array
     centres: Array
+    smooth: bool = False
 
     @property
     def begin(self) -> float:
@@ -89,7 +93,29 @@ class Waypoints:
     def poses(self, times: ArrayLike) -> tuple[Array, Array]:
         """See `Path.poses`; at rest beyond both ends."""
         at = np.clip(np.asarray(times, float), self.begin, self.end)
-        return interpolate_rotations(self.times, self.rotations, at), _interpolate_linear(self.times, self.centres, at)
+        rotations = interpolate_rotations(self.times, self.rotations, at)
+        centres = _interpolate_linear(self.times, self.centres, at)
+        if self.smooth and len(self.times) > 2:
+            turned, moved = self._bent(at)
+            rotations, centres = exp_so3(turned) @ rotations, centres + moved
+        return rotations, centres
+
+    def _bent(self, at: Array) -> tuple[Array, Array]:
+        """What the smooth path turns and moves beyond the straight one, [m, 3] each: cubic Hermite segments, their
+        speeds from the pose before to the one after. A space that is much longer than its neighbours is straight.
+
+        A pose has an influence over two spaces to each side. Turns from one pose to the next are taken to be small.
+        """
+        turns = log_so3(self.rotations[1:] @ self.rotations[:-1].swapaxes(1, 2))
+        steps = np.concatenate([turns, np.diff(self.centres, axis=0)], 1)
+        spaces = np.diff(self.times)[:, None]
+        speeds = np.concatenate([[steps[0] / spaces[0]], (steps[1:] + steps[:-1]) / (spaces[1:] + spaces[:-1])])
+        speeds = np.concatenate([speeds, [steps[-1] / spaces[-1]]])
+        row = np.searchsorted(self.times, at, side="right").clip(1, len(self.times) - 1) - 1
+        u = (at - self.times[row])[:, None] / spaces[row]
+        first, last = (speeds[row + end] * spaces[row] - steps[row] for end in (0, 1))
+        bent = u * (1 - u) * ((1 - u) * first - u * last)
+        return bent[:, :3], bent[:, 3:]
 
     def bend(self, times: ArrayLike, rotation: Array, centre: Array) -> "Waypoints":
         """The path with poses perturbed: R <- Exp(rotation) R, c <- c + centre; both [m, 3] at increasing `times` [m],

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from spiked.pose import exp_so3, log_so3
-from spiked.spline import DENSE_KNOTS, Spline
+from spiked.spline import DENSE_KNOTS, Spline, Waypoints
 
 
 def wavy(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -48,3 +48,49 @@ def test_a_path_of_a_minute_at_20_khz_is_fitted() -> None:
     got_rotations, got_centres = spline.poses(times[::1000])
     np.testing.assert_allclose(got_centres, centres[::1000], atol=1e-5)
     np.testing.assert_allclose(got_rotations, rotations[::1000], atol=1e-5)
+
+
+def trembling(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A hand at 8 Hz, in frames of 20 kHz."""
+    phase = 2 * np.pi * 8 / 20_000 * times
+    turns = np.stack([0.01 * np.sin(phase), 0.01 * np.cos(phase), 1e-4 * times], 1)
+    return exp_so3(turns), np.stack([0.02 * np.cos(phase), 0.01 * np.sin(2 * phase), 1e-4 * times], 1)
+
+
+def test_smooth_waypoints_follow_a_hand_that_trembles() -> None:
+    rng = np.random.default_rng(0)
+    known = np.cumsum(rng.uniform(200, 500, 60))
+    between = np.arange(known[2], known[-3], 37.0)
+    rotations, centres = trembling(between)
+    errors = []
+    for smooth in (False, True):
+        path = Waypoints(known, *trembling(known), smooth)
+        for got, given in zip(path.poses(known), trembling(known), strict=True):
+            np.testing.assert_allclose(got, given, atol=1e-9)
+        got_rotations, got_centres = path.poses(between)
+        turned = np.linalg.norm(log_so3(got_rotations @ rotations.swapaxes(1, 2)), axis=1)
+        errors.append((np.sqrt((turned**2).mean()), np.sqrt(((got_centres - centres) ** 2).sum(1).mean())))
+    straight, curved = errors
+    assert curved[0] < straight[0] / 1.6 and curved[1] < straight[1] / 1.6
+
+
+def test_smooth_waypoints_are_about_straight_over_a_long_space() -> None:
+    """Views of a few frames in a row, each a little off, then one much later: their speed says nothing about it."""
+    rng = np.random.default_rng(0)
+    known = np.concatenate([np.arange(0.0, 320, 16), np.arange(6000.0, 9000, 300)])
+    rotations, centres = trembling(np.full(len(known), 10.0))
+    rotations = exp_so3(rng.normal(0, 1e-3, (len(known), 3))) @ rotations
+    path, straight = (Waypoints(known, rotations, centres, smooth) for smooth in (True, False))
+    inside = np.linspace(305, 5999, 50)
+    turned = log_so3(path.poses(inside)[0] @ straight.poses(inside)[0].swapaxes(1, 2))
+    assert 0 < np.abs(turned).max() < 3e-3
+
+
+def test_few_smooth_waypoints_are_a_path() -> None:
+    for count in (1, 2, 3, 4):
+        known = 300.0 * np.arange(count)
+        rotations, centres = trembling(known)
+        path = Waypoints(known, rotations, centres, smooth=True)
+        got = path.poses([-50.0, known[-1] / 2, known[-1] + 50])
+        assert np.isfinite(got[0]).all() and np.isfinite(got[1]).all()
+        np.testing.assert_allclose(got[1][[0, 2]], centres[[0, -1]], atol=1e-9)

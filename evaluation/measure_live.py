@@ -4,8 +4,8 @@
 
 The recording is replayed at its own rate as a camera that does not wait, recorded, and reconstructed. Once a second the
 memory of every process is read: what is resident, without the ring, which they share. `--page` opens the scene page in
-Chromium and measures the time between its pictures and what it fetches. The path is the version that is the newest
-when the capture stops.
+Chromium and measures the time between its pictures and what it fetches. Scored are the version that is the newest when
+the capture stops, with the poses of views alone, and the last one before all frames are gone through once more.
 """
 
 import argparse
@@ -151,10 +151,14 @@ def measure(recording: Path, truth: Path | None, seconds: float, steps: int, wit
                 if capture["state"] not in ("starting", "waiting", "streaming"):
                     break
             stopped_s = time.monotonic() - begun_s
-            jobs = http.get("reconstructions", params={"capture_id": capture_id}).json()["items"]
-            job = jobs[0]
-            version, path = path_now(http, job["id"], job["poses"])
+            job = http.get("reconstructions", params={"capture_id": capture_id}).json()["items"][0]
+            path = path_now(http, job["id"], job["poses"])[1]
+            at_stop = scored(path, truth, frames, whole.sensor.frame_rate_hz)
             timeline = http.get(f"reconstructions/{job['id']}/timeline", params={"points": 10_000}).json()
+            while (job := http.get(f"reconstructions/{job['id']}").json())["live"] and job["state"] == "running":
+                time.sleep(0.1)
+            adjusted_s = time.monotonic() - begun_s - stopped_s
+            version, path = path_now(http, job["id"], job["poses"])
             page = told()
             page.pop("waited", None)
         while capture["recording"] is None and capture["state"] not in ("complete", "failed"):
@@ -163,16 +167,6 @@ def measure(recording: Path, truth: Path | None, seconds: float, steps: int, wit
         versions = http.get(f"reconstructions/{job['id']}/versions").json()["items"]
         memory.end()
     flat_from_s = stopped_s - min(FLAT_S, 2 / 3 * stopped_s)
-    score = None
-    if truth is not None:
-        known = Trajectory.read_tum(truth)
-        within = known.times_s < frames / whole.sensor.frame_rate_hz
-        step = max(1, frames // SAMPLED_POSES)
-        some = np.flatnonzero(within)[step // 2 :: step]
-        known = Trajectory(known.times_s[some], known.rotations[some], known.centres[some])
-        rows = path.nearest(known.times_s, step / whole.sensor.frame_rate_hz)
-        score = score_trajectory(truth=known, estimate=path, frame_rate_hz=whole.sensor.frame_rate_hz / (2 * step))
-        score = {"ate_percent": score.errors and score.errors.ate_percent, "near": float((rows >= 0).mean())}
     recorded = capture["recording"] or {}
     return {
         "frames": frames,
@@ -180,19 +174,36 @@ def measure(recording: Path, truth: Path | None, seconds: float, steps: int, wit
         "capture": {name: capture[name] for name in ("state", "reason", "counters")},
         "recording": {name: recorded.get(name) for name in ("frames", "lost", "lost_by_cause")},
         "at_stop": {
+            "score": at_stop,
+            "closures": len(timeline["closures"]),
+            "states": {state: timeline["state"].count(state) for state in set(timeline["state"])},
+        },
+        "last_live_version": {
+            "after_stop_s": round(adjusted_s, 1),
             "version": version,
             "poses_of_version": versions[-1]["poses"] if versions else 0,
             "path_to_s": float(path.times_s[-1]),
             "state": job["tracking_state"],
             "reason": job["reason"],
             "splats": job["splats"],
-            "score": score,
-            "closures": len(timeline["closures"]),
-            "states": {state: timeline["state"].count(state) for state in set(timeline["state"])},
+            "score": scored(path, truth, frames, whole.sensor.frame_rate_hz),
         },
         "page": page,
         "memory_MB": {name: flat(seen, flat_from_s, stopped_s) for name, seen in memory.bytes.items()},
     }
+
+
+def scored(path: Trajectory, truth: Path | None, frames: int, rate_hz: float) -> dict[str, float | None] | None:
+    """ATE, and the share of the frames that have a pose."""
+    if truth is None:
+        return None
+    known = Trajectory.read_tum(truth)
+    step = max(1, frames // SAMPLED_POSES)
+    some = np.flatnonzero(known.times_s < frames / rate_hz)[step // 2 :: step]
+    known = Trajectory(known.times_s[some], known.rotations[some], known.centres[some])
+    rows = path.nearest(known.times_s, step / rate_hz)
+    score = score_trajectory(truth=known, estimate=path, frame_rate_hz=rate_hz / (2 * step))
+    return {"ate_percent": score.errors and score.errors.ate_percent, "near": float((rows >= 0).mean())}
 
 
 def flat(seen: list[tuple[float, int]], from_s: float, to_s: float) -> dict[str, float]:

@@ -18,7 +18,7 @@ from spiked.sensor import Sensor
 __all__ = ["Trajectory", "colmap_camera", "colmap_lines", "kitti_lines", "nerfstudio_lines", "tum_lines", "tum_tables"]
 
 BRIDGED_S = 0.03
-"""Longest time between views over which the path is interpolated: hand tremor has about 10 Hz."""
+"""Longest time between poses over which a path is interpolated, and to the nearest one: hand tremor has about 10 Hz."""
 _LINES = 16_384
 """Lines of text in memory at a time."""
 

@@ -26,7 +26,7 @@ from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.settings.settings import NOT_SETTINGS, Settings
 from spiked_service.workers import backoff, frame_skipping
 
-from spiked import trajectory
+from spiked.recon import view_tracking
 from spiked.recon.frontend import feature_tracks, windowing
 from spiked.recon.mapping import mapper, pyramid, render_requests
 from spiked.recon.mapping.densification import DensifyStrategy
@@ -377,7 +377,7 @@ CLAIMS: tuple[Claim, ...] = (
     ("operations.md", "s or {} MiB", lambda: writer.MOST_BACKLOG_BYTES // MIB),
     ("operations.md", "is {:,} frames behind it", lambda: frame_skipping.LATE_FRAMES),
     ("operations.md", "({:.0f} to {:.0f} pixels)", lambda: frame_skipping.REACH_PX),
-    ("operations.md", "no more than {:.0f} ms apart", lambda: 1000 * trajectory.BRIDGED_S),
+    ("operations.md", "no more than {:.0f} ms apart", lambda: 1000 * view_tracking.BRIDGED_S),
     ("service-figures.md", "the {:,} events that are remembered", lambda: bus.HISTORY),
     ("service-figures.md", "All threads share {} heaps", lambda: {2: "two"}[malloc.ARENAS]),
     ("recordings.md", "{} bytes of header, then {} bytes an entry", lambda: (index.HEADER_BYTES, index.ENTRY_BYTES)),

@@ -51,6 +51,7 @@ class Reconstructor:
         Raises ConfigurationError when poses are given without intrinsics.
         """
         self.options = options = options or Options()
+        self._live = live
         _check(sensor, options)
         intrinsics = sensor.intrinsics or Intrinsics.from_fov(sensor.width, sensor.height, FIRST_DEG)
         focal = Focal(intrinsics, np.inf) if sensor.intrinsics is None else None
@@ -144,7 +145,7 @@ class Reconstructor:
     def track_latest(self, first_frame: int, frames: NDArray[np.uint8]) -> None:
         """Skip backlog: track one view in the middle of stored frames, uint8 [n, frame_bytes], not those before.
 
-        For tracking that cannot keep up with the camera. Over up to `trajectory.BRIDGED_S` the path is interpolated.
+        For tracking that cannot keep up with the camera. Over up to `view_tracking.BRIDGED_S` the path is interpolated.
         """
         with self._log.measure("tracking"), one_blas_thread():
             self._after_tracking(self._tracker.track_latest(first_frame, frames))
@@ -174,8 +175,16 @@ class Reconstructor:
             if self._refinement.optics_moved:
                 self.trainer.restart(self.odometry.intrinsics)
             self._stage = "mapping"
-            self.trainer.train_live(path, self._tracker.points, until)
+            self.trainer.train_live(path, self.odometry.points, until, behind=self._live)
         self._log.note(self.trainer.mapper.loss)
+
+    def sweep_behind(self) -> None:
+        """Seed splats from a view that another thread has swept: `improve` for a tracker without time to map."""
+        if not self.trainer.sweep_due or self._refinement.optics_moved:
+            return
+        with self._log.measure("mapping"):
+            if (path := self._refinement.mappable_path) is not None:
+                self.trainer.sweep_behind(path, self.odometry.points)
 
     def finish(
         self,
@@ -188,8 +197,8 @@ class Reconstructor:
 
         If the steps of the options take longer than `budget_s`, the schedule is compressed to fewer steps. Stops when
         `cancelled` returns true, with the map of that moment; the loops of a long path may then be open. If there is a
-        live map, the first `progress` call of the refinement precedes any change of it. `save` is called wherever a
-        checkpoint can be taken: `finish` of its reconstructor goes on from there.
+        live map, the first `progress` call of the refinement precedes any change of it, but that it follows the path.
+        `save` is called wherever a checkpoint can be taken: `finish` of its reconstructor goes on from there.
         """
         deadline = np.inf if budget_s is None else time.perf_counter() + budget_s
         self.expect(self.frames)
@@ -199,19 +208,11 @@ class Reconstructor:
             if progress is not None:
                 progress(self.status())
 
-        def stop() -> bool:
-            return cancelled() or time.perf_counter() > deadline
-
-        def saved() -> None:
-            self._time_left.ended(self.odometry.end_left, self.odometry.long)
-            save()
-            tell()
-
         if not self.tracking_ended:
+            self.end_tracking(progress, lambda: cancelled() or time.perf_counter() > deadline, save)
             with self._log.measure("tracking"):
-                self._end_tracking(stop, saved)
-            if not stop():  # otherwise loops may be open
-                self._tracker.ended = True
+                self._after_tracking(self._tracker.choose_views(self.camera.intrinsics.fx))
+            if self._tracker.ended:
                 save()
         with self._log.measure("refining"):
             if self._refinement.mappable_path is not None:
@@ -220,13 +221,32 @@ class Reconstructor:
         self._stage = "done"
         tell()
 
-    def _end_tracking(self, stop: Callable[[], bool], save: Callable[[], None]) -> None:
-        with one_blas_thread():
+    def end_tracking(
+        self,
+        progress: Callable[[Status], None] | None = None,
+        cancelled: Callable[[], bool] = lambda: False,
+        save: Callable[[], None] = lambda: None,
+        preliminary: bool = False,
+    ) -> None:
+        """Track the buffered frames, close the loops and adjust the whole path: what `finish` begins with, and no more
+        can be fed. The arguments are those of `finish`; `tracking_ended` unless cancelled. `preliminary`: with fewer
+        keyframes and iterations, for a path that is soon computed again.
+        """
+
+        def saved() -> None:
+            self._time_left.ended(self.odometry.end_left, self.odometry.long)
+            save()
+            if progress is not None:
+                progress(self.status())
+
+        with self._log.measure("tracking"), one_blas_thread():
             self._after_tracking(self._tracker.flush())
-            self._tracker.end(stop, save)
-        self._after_tracking(self._tracker.choose_views(self.camera.intrinsics.fx))
-        self._time_left.ended(0.0, self.odometry.long)
-        self._tracker.warn_of_path()
+            self._tracker.end(cancelled, saved, preliminary)
+            self._time_left.ended(0.0, self.odometry.long)
+            self._tracker.warn_of_path()
+        if self.path is not None:
+            self.trainer.carry(self.path)
+        self._tracker.ended = not cancelled()  # otherwise loops may be open
 
     @property
     def failure(self) -> str | None:

@@ -1,5 +1,6 @@
 """The views of a recording: one record each, by id."""
 
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -197,6 +198,10 @@ class ViewStore:
     def spread(ids: Sequence[int], count: int) -> list[int]:
         """At most `count` of these ids, evenly spread."""
         return [ids[i] for i in evenly(len(ids), count)]
+
+    def at(self, time: float) -> ViewRecord:
+        """The record of the view at, or the last one before, a time in frames."""
+        return self._records[max(bisect_right(self._records, time, key=lambda record: record.time) - 1, 0)]
 
     def nearest(self, time: float) -> int | None:
         """Id of the kept view nearest to a time in frames; None without views."""

@@ -24,10 +24,12 @@ from spiked.recon.view_choice import choose
 from spiked.recon.view_store import ViewStore
 from spiked.sensor import Intrinsics, Response, Sensor
 from spiked.spline import Path, Waypoints
-from spiked.trajectory import BRIDGED_S
 
 KEYFRAME_SHARE = 0.125
 """Share of `Options.memory_mb` for the images of keyframes: a byte a pixel, while those of views take three or more."""
+BRIDGED_S = 0.1
+"""Longest time between tracked views, where frames were skipped, over which the path is interpolated. A hand differs
+from it by 0.06, 0.2 and 0.6 % of the walk's radius over 30, 50 and 100 ms (decision 63)."""
 LEAST_VIEWS = 10
 """Views with a pose that a map needs."""
 
@@ -115,10 +117,10 @@ class ViewTracker:
         """Track the frames that are buffered, the last ones; returns whether images of views were dropped."""
         return self._track_all(self.windows.flush())
 
-    def end(self, stop: Callable[[], bool], save: Callable[[], None]) -> None:
-        """After `flush`: adjust the whole path. `stop` and `save`: see `Odometry.end`."""
+    def end(self, stop: Callable[[], bool], save: Callable[[], None], preliminary: bool = False) -> None:
+        """After `flush`: adjust the whole path. The arguments: see `Odometry.end`."""
         if self.given is None:
-            self.odometry.end(stop, save)
+            self.odometry.end(stop, save, preliminary)
             self._waypoints = -1, None  # the views have moved
         else:
             self.unit = self.given.end(self.odometry, self.frames)

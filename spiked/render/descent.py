@@ -50,6 +50,10 @@ class Descent:
         fit.adam = self.adam
         return fit
 
+    def replace(self, scene: Scene) -> None:
+        """Go on with the same splats elsewhere: their moments stay."""
+        self._scene = scene
+
     def join(self, splats: Scene) -> None:
         """Add splats, without moments."""
         self._scene = self.scene.join(splats)
@@ -90,6 +94,12 @@ class DeviceDescent(Descent):
         """See `Descent.adopt`."""
         super().adopt(scene)
         self._device, self._behind = None, False
+
+    def replace(self, scene: Scene) -> None:
+        """See `Descent.replace`."""
+        self._fetch()
+        super().replace(scene)
+        self._device = None
 
     @property
     def scene(self) -> Scene:

@@ -10,7 +10,7 @@ from copy import deepcopy
 
 import pytest
 
-from spiked.recon.odometry.background import BEHIND_NICE, Background
+from spiked.recon.background import BEHIND_NICE, Background
 
 
 def test_the_result_is_waited_for() -> None:
@@ -61,7 +61,7 @@ def test_copies_have_the_result_and_no_thread() -> None:
 
 def test_it_does_not_keep_a_program_from_ending() -> None:
     program = """
-from spiked.recon.odometry.background import Background
+from spiked.recon.background import Background
 
 def work(stop):
     while not stop():

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import spiked.native._dense as _dense
 
-from spiked.recon.mapping.plane_sweep import PosedImage, sweep
+from spiked.recon.mapping.depth_sweeps import _filled
+from spiked.recon.mapping.plane_sweep import PosedImage, Sweep, sweep
 from spiked.sensor import Intrinsics
 
 K = Intrinsics(120.0, 120.0, 80.0, 50.0)
@@ -59,3 +60,22 @@ def test_what_a_picture_did_not_see_counts_as_unsure() -> None:
     total = np.ones((1, 3), np.float32)
     _dense.add_cost(warped, np.zeros((1, 3), np.float32), np.full((1, 3), 2, np.float32), 4.0, 2.5, total)
     np.testing.assert_array_equal(total, [[3, 3.5, 5]])
+
+
+@pytest.mark.parametrize("size", [(400, 250), (1280, 720)])
+def test_landmarks_fill_what_a_sweep_leaves_uncertain(size: tuple[int, int]) -> None:
+    width, height = size
+    intrinsics = Intrinsics.from_fov(width, height, 60)
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform(0, [width / 4, height / 4], (100, 2))  # in one corner, on a plane
+    local = intrinsics.unproject(pixels) * (4 + pixels[:, :1] / width)
+    confidence = np.zeros((height, width), np.float32)
+    confidence[:, -10:] = 1
+    swept = Sweep(np.full((height, width), 0.7, np.float32), confidence)
+    filled = _filled(swept, np.concatenate([local, [[0, 0, -3.0], [100, 0, 1.0]]]), intrinsics)
+    depth = 1 / filled.inverse_depth
+    assert depth[:, -10:] == pytest.approx(1 / 0.7, rel=1e-5)
+    assert depth[20, 20] == pytest.approx(4.05, rel=0.02)
+    assert np.isfinite(depth).all() and depth[:, :-10].min() > 3.9 and depth[:, :-10].max() < 4.4
+    outside = np.array([[100.0, 0, 1.0]])
+    assert _filled(swept, outside, intrinsics) is swept

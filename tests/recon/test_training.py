@@ -173,6 +173,6 @@ def test_white_rises_with_the_brightest_view_and_the_unit_stays(mosaic: Mosaic |
     depth = np.full((100, 160), 2.0, np.float32)
     noise = np.random.default_rng(0).normal(0, 0.02, (100, 160)).astype(np.float32)
     for brightness, white in [(0.1, 0.15), (0.12, 0.15), (0.3, 0.32), (0.2, 0.32)]:
-        view = SimpleNamespace(rate=brightness + noise)
+        view = SimpleNamespace(rate=brightness + noise, time=0.0)
         mapper.seed_view(view, np.eye(3), np.zeros(3), depth)  # type: ignore[arg-type]
         assert mapper.white == pytest.approx(0.15, rel=0.05) and mapper.shown_white == pytest.approx(white, rel=0.05)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.store.rows import CaptureState, Grade, JobState, Plan
-from spiked_service.workers.frame_skipping import LatestFrames, may_map, next_window
+from spiked_service.workers.frame_skipping import LatestFrames, may_map, may_sweep, next_window
 from waiting import until
 
 from spiked.recording import RecordingWriter
@@ -43,9 +43,14 @@ def test_a_pause_is_caught_up_with_in_bounded_steps() -> None:
 
 
 def test_the_map_gets_a_step_only_if_the_tracks_outlast_it() -> None:
-    assert may_map(0, None, RATE_HZ) and may_map(0, 0.02, RATE_HZ) and may_map(600, 0.005, RATE_HZ)
-    assert not may_map(0, 0.05, RATE_HZ)  # 20 px in the time of a step
-    assert not may_map(600, 0.02, RATE_HZ) and not may_map(900, 0.0, RATE_HZ)
+    assert may_map(0, None, RATE_HZ) and may_map(0, 0.009, RATE_HZ) and may_map(600, 0.003, RATE_HZ)
+    assert not may_map(0, 0.02, RATE_HZ)  # 8 px in the time of a step
+    assert not may_map(600, 0.009, RATE_HZ) and not may_map(900, 0.0, RATE_HZ)
+
+
+def test_a_sweep_begins_unless_the_tracker_is_far_behind() -> None:
+    assert may_sweep(0, 0.05) and may_sweep(700, 0.02)
+    assert not may_sweep(800, 0.02) and not may_sweep(1000, None)
 
 
 def blocks(writer: RingWriter, first: int, count: int) -> None:

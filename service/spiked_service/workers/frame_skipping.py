@@ -20,8 +20,10 @@ _LATE_S = 0.2
 """Lateness at which the second `REACH_PX` applies; in between, the reach is interpolated."""
 _STEP_S = 0.02
 """Time of a step of the map, about."""
-_STEP_REACH_PX, _PUNCTUAL_S = 10.0, 0.04
+_STEP_REACH_PX, _PUNCTUAL_S = 4.0, 0.04
 """Image motion, and lateness, up to which the tracker waits for a step of the map."""
+_SWEEP_REACH_PX = 15.0
+"""Image motion behind the camera up to which a sweep for depth begins: it takes some of the cores."""
 LONGEST_UNMAPPED_S = 1.0
 """Time after which the map gets a step anyway."""
 
@@ -33,6 +35,14 @@ def may_map(late_frames: int, speed_px: float | None, rate_hz: float) -> bool:
     """
     late_s = late_frames / rate_hz
     return late_s < _PUNCTUAL_S and (late_s + _STEP_S) * rate_hz * (speed_px or 0.0) < _STEP_REACH_PX
+
+
+def may_sweep(late_frames: int, speed_px: float | None) -> bool:
+    """Whether a tracker so many frames behind the camera can share the cores with a sweep for depth.
+
+    `speed_px` is the image motion in pixels a frame, None if unknown.
+    """
+    return speed_px is not None and late_frames * speed_px < _SWEEP_REACH_PX
 
 
 def next_window(at: int, newest: int, count: int, speed_px: float | None, rate_hz: float) -> int:

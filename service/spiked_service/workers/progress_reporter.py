@@ -120,6 +120,8 @@ class ProgressReporter:
 
     def frames_skipped(self, skipped: int) -> None:
         """Publish the live result of a capture that is reconstructed again from its recording."""
+        self.tracked(None)
+        self._timeline.closed(self._reconstructor.closures())
         self._least_poses = 0
         status = self._reconstructor.status()
         self._publish(status, every_frame=True)

@@ -11,6 +11,7 @@ from spiked.calibration import Calibration
 from spiked.pose import Array
 from spiked.recon.frontend.demosaic import fill_mosaic
 from spiked.recon.frontend.windowing import View
+from spiked.recon.mapping.carrying import Homes, Places
 from spiked.recon.mapping.loss import RateLoss, WarpedChargeLoss
 from spiked.recon.mapping.options import MapOptions
 from spiked.recon.mapping.photometric import Nuisances
@@ -78,6 +79,7 @@ class Mapper:
         self.extent = 1.0
         """Size of the map in units of that of a short path, see `MapOptions.extent_px`."""
         self.steps = 0
+        self.homes = Homes()
         self._most_log_scale = np.inf
         self._charge_error: Image = np.zeros((1, 1), np.float32)
         self._rng = np.random.default_rng(seed)
@@ -129,7 +131,7 @@ class Mapper:
         v, u = chosen
         depth = np.asarray(1 / swept.sweep.inverse_depth[v, u], np.float32)
         colours = fill_mosaic(rate, self.channels)[v, u]
-        self._add(chosen, depth, colours, stride, swept.rotation, swept.centre)
+        self._add(chosen, depth, colours, stride, swept.rotation, swept.centre, swept.view.time)
         return len(u)
 
     def seed_view(self, view: View, rotation: Array, centre: Array, depth: Image) -> None:
@@ -140,7 +142,7 @@ class Mapper:
         chosen = seeding.pixels(np.ones(rate.shape, bool), stride, self.cap)
         if chosen is not None:
             colours = fill_mosaic(rate, self.channels)[chosen]
-            self._add(chosen, depth[chosen], colours, stride, rotation, centre)
+            self._add(chosen, depth[chosen], colours, stride, rotation, centre, view.time)
 
     def _adapt_white(self, rate: Image) -> None:
         """Before the splats of a seeded view with these rates are added, if there are any."""
@@ -161,16 +163,28 @@ class Mapper:
         apart_px: float,
         rotation: Array,
         centre: Array,
+        home: float | None,
     ) -> None:
-        """Add round splats at rows and columns of an image that are `apart_px` apart, at the depths [N]."""
+        """Add round splats at rows and columns of an image that are `apart_px` apart, at the depths [N]; `home` is the
+        time of its view."""
         v, u = pixels
         at, deviation_px = np.stack([u + 0.5, v + 0.5], 1), self.options.seeding.size * apart_px
         intrinsics = self.camera.intrinsics
         self.descent.join(isotropic_splats(intrinsics, at, depth, colours, deviation_px, rotation, centre))
+        self.homes.add(len(u), home)
 
     def adopt(self, scene: Scene) -> None:
         """Go on with another scene."""
         self.descent.adopt(scene)
+        self.homes = Homes(len(scene))
+
+    def carry(self, chosen: NDArray[np.bool_], places: Places) -> None:
+        """Move the splats of the `chosen` homes to where these are now, by the `places` of all of them."""
+        self.descent.replace(self.homes.carry(self.scene, chosen, places))
+
+    def leave(self, chosen: NDArray[np.bool_]) -> None:
+        """Remove the splats of the `chosen` homes."""
+        self._remove(self.homes.splats(chosen))
 
     def level(self, coarse: float) -> Level:
         """The pyramid level for a coarseness from 0 (full size) to 1 (smallest)."""
@@ -279,7 +293,7 @@ class Mapper:
             size = (self.camera.width, self.camera.height)
             error = cv2.resize(self._charge_error, size, interpolation=cv2.INTER_LINEAR)
         seen = fill_mosaic(view.rate, self.channels) if request.warp is None else image.values
-        self._replace(error, seen, image.depth, rotation, centre)
+        self._replace(error, seen, image.depth, rotation, centre, view.time)
 
     def densify_replay(self, replay: Replay) -> None:
         """Add splats where the map differs most from what another map shows."""
@@ -288,9 +302,11 @@ class Mapper:
         error = replay.target(shown).values - shown
         # What a grey map lacks of the brightness is added to each colour.
         seen = replay.values if shown.ndim == image.ndim else np.maximum(image + error[..., None], 0)
-        self._replace(error, seen, replay.depth, replay.rotation, replay.centre)
+        self._replace(error, seen, replay.depth, replay.rotation, replay.centre, None)
 
-    def _replace(self, error: Image, seen: Image, depth: Image, rotation: Array, centre: Array) -> None:
+    def _replace(
+        self, error: Image, seen: Image, depth: Image, rotation: Array, centre: Array, home: float | None
+    ) -> None:
         """Remove dead splats and add others where `error` is large, of the colours and depths of images [H, W]."""
         strategy = self.options.densification
         dead = strategy.dead(self.descent.opacity_logits)
@@ -300,7 +316,7 @@ class Mapper:
             return
         v, u = chosen
         colours = seen.reshape(*seen.shape[:2], -1)[v, u]
-        self._add(chosen, np.where(depth > 0, depth, 1.0)[v, u], colours, 1.0, rotation, centre)
+        self._add(chosen, np.where(depth > 0, depth, 1.0)[v, u], colours, 1.0, rotation, centre, home)
 
     def limit_sizes(self) -> None:
         """Let no splat grow beyond what `options.pruning` allows in a scene of the present size."""
@@ -315,6 +331,7 @@ class Mapper:
         """Remove splats, [N]."""
         if chosen.any():
             self.descent.select(~chosen)
+            self.homes.select(~chosen)
 
     def render(self, rotation: Array, centre: Array) -> Image:
         """Render the map from a pose: radiance [H, W, C]."""

@@ -80,10 +80,12 @@ def sweep(
     noise: Image,
     pixels: int = SWEPT_PIXELS,
     threads: int | None = None,
+    step_px: float = PLANE_STEP_PX,
 ) -> Sweep:
     """Inverse depth of `reference` between `near_far` (inverse depths: largest, smallest). `noise` [H, W] is the
     standard deviation of a difference between two images. Images of more than about `pixels` pixels are swept at a
-    fraction of their size. Threads default to the usable cores; the result does not depend on their number."""
+    fraction of their size; planes are `step_px` of these pixels apart. Threads default to the usable cores; the result
+    does not depend on their number."""
     height, width = reference.image.shape
     fraction = max(1, round(float(np.sqrt(height * width / pixels))))
     if fraction > 1:
@@ -95,13 +97,14 @@ def sweep(
             np.asarray(_shrunk(noise, fraction) / fraction, np.float32),
             height * width,
             threads,
+            step_px,
         )
         size = (width, height)
         return Sweep(*(cv2.resize(image, size).astype(np.float32) for image in (small.inverse_depth, small.confidence)))
     k = intrinsics.matrix()
     baseline = max(np.linalg.norm(o.centre - reference.centre) for o in others)
     largest, smallest = near_far
-    planes = int(np.clip((largest - smallest) * intrinsics.fx * baseline / PLANE_STEP_PX, MIN_PLANES, MAX_PLANES))
+    planes = int(np.clip((largest - smallest) * intrinsics.fx * baseline / step_px, MIN_PLANES, MAX_PLANES))
     inverse = np.linspace(smallest, largest, planes, dtype=np.float32)
     weight = np.ascontiguousarray(1 / np.maximum(noise, 1e-6), np.float32)
     cost = np.empty((planes, height, width), np.float32)

@@ -40,8 +40,6 @@ class Seeding:
 
     views: int = 11
     """Views swept at the start of a refinement (decision 8)."""
-    neighbours: int = 5
-    """Views compared with each swept view."""
     nearest: float = 1.3
     """Inverse depth of the nearest plane over the upper one of `DEPTH_PERCENTILES`."""
     farthest: float = 0.5
@@ -63,6 +61,8 @@ class Seeding:
     """A live map of more views is seeded again as the path grows."""
     live_share: float = 0.3
     """Share of the path, in time, that has to be new since the last seeding of a live map."""
+    live_px: float = 60.0
+    """Image motion from one seeding of a live map to the next where views are far apart."""
 
     def due(self, times: Sequence[float], seeded_at: float) -> bool:
         """Whether to seed a live map again, with views at `times` and the last seeding in the view at `seeded_at`."""

@@ -1,18 +1,20 @@
 """Training of the map: which view each step takes, how it is rendered, and which views are swept for depth."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from spiked.calibration import Calibration
 from spiked.pose import Array
-from spiked.recon.frontend.windowing import View, luminance
+from spiked.recon.background import Background
+from spiked.recon.frontend.windowing import View
+from spiked.recon.mapping.carrying import Places
+from spiked.recon.mapping.depth_sweeps import DepthSweeps, PosedViews
 from spiked.recon.mapping.loss import Comparison, LossName
 from spiked.recon.mapping.mapper import Mapper
 from spiked.recon.mapping.options import MapOptions
-from spiked.recon.mapping.plane_sweep import SWEPT_PIXELS, PosedImage, Sweep, neighbours, sweep
 from spiked.recon.mapping.pyramid import Level, Target
 from spiked.recon.mapping.render_requests import RenderPlanner, RenderRequest
 from spiked.recon.mapping.seeding import SweptView
@@ -21,14 +23,9 @@ from spiked.render import Camera
 from spiked.render.splats import RenderedImage
 from spiked.sensor import LEAST_DEPTH, Image, Intrinsics, Response, Sensor
 from spiked.spline import Path, Waypoints
-from spiked.undistortion import Undistortion, widest_undistortion
 
-QUICK_SWEEP = 4
-"""Divisor of the swept pixels where views are far apart: 0.1 s, short enough not to lose a fast camera."""
-SWEPT_SIDES = 2.5
-"""Longest side of undistorted images that are swept, in widths of the sensor."""
-UNKNOWN_NOISE = 1e6
-"""Deviation of pixels outside of the image, in spikes a frame: they weigh nothing."""
+CARRIED_PX = 1.5
+"""Motion of a view, in px, from which on its splats are carried: it takes 20 ms."""
 VERSION_STEPS = 20
 """Steps from one version of the map to the next."""
 
@@ -88,6 +85,11 @@ class MapTrainer:
             self.sensor = replace(self.sensor, intrinsics=intrinsics)
             self.planner.camera = replace(self.camera, intrinsics=intrinsics)
         self.mapper = Mapper(self.sensor, self.camera, self.options, self._seed, self.threads, self._calibration)
+        self._sweeps = DepthSweeps(self.camera, self.sensor.mosaic, self.views, self.options.seeding)
+        self._sweeping: Background[SweptView] | None = None
+        """The sweep that runs on another thread."""
+        self._swept_px = -np.inf
+        """Image motion of the path when that was begun."""
         self._queue: list[int] = []
         self._seeded_at = -np.inf
         """Time in frames of the view that was seeded last."""
@@ -114,73 +116,70 @@ class MapTrainer:
         self.reshuffle()
         self.mapper.forget_views()
 
-    def seed(self, path: Path, points: Array, ids: list[int], quick: bool = False) -> None:
+    def seed(self, path: Path, points: Array, ids: list[int]) -> None:
         """Sweep the depth of views and seed splats where the map is empty.
 
-        points [N, 3] are landmarks, whose depths give the range of the sweep; quick: sweep small images.
+        points [N, 3] are landmarks, whose depths give the range of the sweep.
         """
+        posed = self._posed(path)
+        works = (self._sweeps.prepare(posed, posed.ids.index(one), points, threads=self.threads) for one in ids)
+        self._plant([work() for work in works if work is not None], (self.options.seeding.sure, 0.0))
+
+    def _sweep_now(self, path: Path, points: Array) -> None:
+        """As `sweep_behind`, on this thread."""
+        self._swept_px = self.views.travelled_px
+        work = self._prepare_quick(path, points, self.threads)
+        self._plant([] if work is None else [work()])
+
+    def sweep_behind(self, path: Path, points: Array) -> None:
+        """Seed the view that another thread has swept, and let it sweep a recent one if the camera has moved on.
+
+        points [tracks, 3] are those of all tracks by id, NaN where unknown.
+        """
+        if self._sweeping is not None and self._sweeping.done:
+            swept, self._sweeping = self._sweeping.result(), None
+            (rotation,), (centre,) = path.poses([swept.view.time])
+            self.carry(path)
+            self._plant([replace(swept, rotation=rotation, centre=centre)])
+            self.carry(path)
+        if self._sweeping is not None or not self.sweep_due:
+            return
+        self._swept_px = self.views.travelled_px
+        if (work := self._prepare_quick(path, points, threads=1)) is not None:
+            sweep_it = work
+            self._sweeping = Background(lambda stop: sweep_it(), behind=True)
+
+    def _prepare_quick(self, path: Path, points: Array, threads: int | None) -> Callable[[], SweptView] | None:
+        """A quick sweep of a recent view, with others on both sides of it."""
+        posed = self._posed(path)
+        row = len(posed.ids) - 3
+        seen = points[self.views[posed.ids[row]].tracked.ids]
+        return self._sweeps.prepare_quick(posed, row, seen[np.isfinite(seen[:, 0])], threads)
+
+    def _posed(self, path: Path) -> PosedViews:
+        ids = self.views.mappable(path)
+        return PosedViews(ids, *path.poses([self.views[i].time for i in ids]))
+
+    @property
+    def sweep_due(self) -> bool:
+        """Whether `sweep_behind` has something to do."""
+        if self._sweeping is not None:
+            return self._sweeping.done
+        moved_px = self.views.travelled_px - self._swept_px
+        return len(self.mapper) > 0 and moved_px > self.options.seeding.live_px
+
+    def _plant(self, swept: list[SweptView], surer: tuple[float, ...] = (0.0,)) -> None:
+        """Seed splats from swept views where the map is empty, first where the depth is `surer`."""
+        begins = len(self.mapper) == 0
         self.mapper.extent = self.extent
-        begins, mappable = len(self.mapper) == 0, self.views.mappable(path)
-        poses = path.poses([self.views[i].time for i in mappable])
-        found = [self._sweep(mappable, *poses, mappable.index(view_id), points, quick) for view_id in ids]
-        swept = [one for one in found if one is not None]
-        for one in swept:
-            self.mapper.seed(one, self.options.seeding.sure)
-        for one in swept:
-            self.mapper.seed(one)
+        for least in surer:
+            for one in swept:
+                self.mapper.seed(one, least)
         if swept:
             self.planner.depth, self._seeded_at = swept[-1].depth, swept[-1].view.time
         if swept and begins:
             self.mapper.depth = float(np.median([one.depth for one in swept]))
         self.version += 1
-
-    def _sweep(
-        self, ids: list[int], rotations: Array, centres: Array, row: int, points: Array, quick: bool
-    ) -> SweptView | None:
-        """The depth of view `ids[row]`, compared with others of `ids`; None if too few points are in front of it.
-
-        rotations [V, 3, 3] and centres [V, 3] are the poses of `ids`, camera to world.
-        """
-        seeding, view = self.options.seeding, self.views.image(ids[row])
-        depths = (points - centres[row]) @ rotations[row][:, 2]
-        planes = seeding.planes(depths)
-        if planes is None:
-            return None
-
-        lens = None
-        if self.camera.intrinsics.distortion is not None:  # the sweep's warps are homographies
-            lens = widest_undistortion(self.camera.intrinsics, self.camera.width, self.camera.height, SWEPT_SIDES)
-
-        def posed(at: int) -> PosedImage:
-            image = luminance(self.views.image(ids[at]).rate, self.sensor.mosaic)
-            image = image if lens is None else lens.straighten(image, np.nan)
-            return PosedImage(image, rotations[at], centres[at])
-
-        others = [posed(at) for at in neighbours(centres, rotations[:, :, 2], row, seeding.neighbours)]
-        pixels = SWEPT_PIXELS // QUICK_SWEEP if quick else SWEPT_PIXELS
-        noise = seeding.noise * view.deviation
-        if lens is None:
-            swept = sweep(posed(row), others, self.camera.intrinsics, planes, noise, pixels, self.threads)
-        else:
-            swept = self._sweep_straight(lens, posed(row), others, planes, noise, pixels)
-        return SweptView(view, rotations[row], centres[row], float(np.median(depths[depths > 0])), swept)
-
-    def _sweep_straight(
-        self,
-        lens: Undistortion,
-        reference: PosedImage,
-        others: list[PosedImage],
-        planes: tuple[float, float],
-        noise: Image,
-        pixels: int,
-    ) -> Sweep:
-        """A sweep of undistorted images, bent again. Pixels outside of the reference say nothing."""
-        known = np.isfinite(reference.image)
-        filled = replace(reference, image=np.where(known, reference.image, np.float32(0)))
-        straight = np.where(known, lens.straighten(noise), np.float32(UNKNOWN_NOISE))
-        pixels = round(pixels * known.size / noise.size)
-        swept = sweep(filled, others, lens.straight, planes, straight, pixels, self.threads)
-        return Sweep(lens.bend(swept.inverse_depth), lens.bend(np.where(known, swept.confidence, np.float32(0))))
 
     def shown(self, view_id: int) -> View:
         """The image of a view as the map is fitted to it."""
@@ -254,15 +253,41 @@ class MapTrainer:
         depths = local[inside, 2]
         return float(np.percentile(depths, self.options.pruning.near_percentile)) if len(depths) else 0.0
 
-    def train_live(self, path: Path, points: Array, until: float) -> None:
-        """Seed recent views if needed, then take steps until that time of `time.perf_counter`."""
+    def train_live(self, path: Path, points: Array, until: float, behind: bool) -> None:
+        """Seed recent views if needed, then take steps until that time of `time.perf_counter`.
+
+        points [tracks, 3] are those of all tracks by id, NaN where unknown; `behind`: another thread may sweep.
+        """
         ids, quick = self.views.mappable(path), isinstance(path, Waypoints)
-        if len(self.mapper) == 0:
-            self.seed(path, points, [ids[len(ids) // 2]], quick)
+        if quick:
+            self.carry(path)
+        if quick and (len(self.mapper) == 0 or (self.sweep_due and not behind)):
+            self._sweep_now(path, points)
+        elif len(self.mapper) == 0:
+            self.seed(path, points, [ids[len(ids) // 2]])
+        elif quick:
+            self.sweep_behind(path, points)
         elif self.options.seeding.due([self.views[i].time for i in ids], self._seeded_at):
-            self.seed(path, points, [ids[-3]], quick)
+            self.seed(path, points, [ids[-3]])
         while time.perf_counter() < until:
             self.step(path, 1.0, self.options.schedule.live_coarseness(self.mapper.steps), 0.0)
+        if quick:
+            self.carry(path)
+
+    def carry(self, path: Path) -> None:
+        """Move splats with the views they were seeded from, where the path has moved since: a closed loop does not tear
+        the map. Those of views that have lost their pose are removed."""
+        mapper, homes = self.mapper, self.mapper.homes
+        views = [self.views.at(time).tracked for time in homes.times]
+        places = Places(*path.poses(homes.times), np.array([view.scale for view in views]))
+        homes.note(places)
+        lost = np.array([view.rotation is None for view in views], bool)
+        far = homes.places.moved_px(places, self.camera.intrinsics.fx, mapper.depth) > CARRIED_PX
+        if lost.any():
+            mapper.leave(lost)
+        if (far := far & ~lost).any():
+            mapper.carry(far, places)
+            self.version += 1
 
     def stale(self, path: Path) -> bool:
         """Whether the path moved since the map was fitted to it, see `Schedule.stale_px`: such a map would bias the

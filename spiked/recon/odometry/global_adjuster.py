@@ -124,7 +124,12 @@ class GlobalAdjuster:
                     view.pose, view.state = None, State.LOST
             effort = FULL_EFFORT
 
-    def finish(self, stop: Callable[[], bool] = lambda: False, save: Callable[[], None] = lambda: None) -> None:
+    def finish(
+        self,
+        stop: Callable[[], bool] = lambda: False,
+        save: Callable[[], None] = lambda: None,
+        preliminary: bool = False,
+    ) -> None:
         """The last adjustments: estimated optics may need several. Ends after one if `stop` is true. They are
         one piece: `save` is not called."""
         del save

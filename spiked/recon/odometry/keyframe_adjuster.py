@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spiked.pose import Array
+from spiked.recon.background import Background
 from spiked.recon.frontend.feature_tracks import Picture
 from spiked.recon.odometry import banded_bundle
-from spiked.recon.odometry.background import Background
 from spiked.recon.odometry.initialisation import SCALE_PX
 from spiked.recon.odometry.loop_closure import LoopClosure, LoopSearch, find_closures, spread_drift
+from spiked.recon.odometry.path_adjuster import PathAdjuster
 from spiked.recon.odometry.pnp import fit_pose
 from spiked.recon.odometry.self_calibration import estimates, find_distortion
 from spiked.recon.odometry.sparse_map import MapBundle, Pose, SparseMap, TrackedView
@@ -50,8 +51,9 @@ adjustments."""
 WHOLE_KEYFRAMES = 1000
 """Keyframes that are adjusted together, at most: time grows with the cube of their number where a path goes through the
 same places again and again. Of more, these are spread evenly (decision 15)."""
-LIVE_WHOLE_KEYFRAMES = 400
-"""The same while a live camera is tracked: the tracker shares the cores with the adjustment."""
+LIVE_WHOLE_KEYFRAMES = 250
+"""The same while a live camera is tracked, as the tracker shares the cores with the adjustment, and for a preliminary
+path."""
 WHOLE_GROWTH = 1.5
 """Growth of the number of keyframes from one adjustment of all of them while tracking to the next: their cost over a
 recording stays in proportion to its length."""
@@ -80,8 +82,8 @@ TOLERANCE = 1e-3
 
 
 @dataclass
-class KeyframeAdjuster:
-    """Keyframes of a long path and their adjustment; a `PathAdjuster`."""
+class KeyframeAdjuster(PathAdjuster):
+    """Keyframes of a long path and their adjustment."""
 
     map: SparseMap
     pictures: Mapping[int, Picture]
@@ -288,16 +290,23 @@ class KeyframeAdjuster:
         self._whole_due = 0.0 if cut_short else WHOLE_GROWTH * len(self.keyframes)
         self._take(made, self.map.views)
 
-    def _all_chosen(self, most: int = WHOLE_KEYFRAMES) -> list[TrackedView]:
-        """All keyframes, or at most so many of them, and the views of closed loops."""
+    def _all_chosen(self, most: int) -> list[TrackedView]:
+        """All keyframes, or `most` of them spread evenly, and the views of closed loops."""
         posed = [view for view in self.keyframes if view.pose is not None]
         chosen = {posed[row].id: posed[row] for row in evenly(len(posed), most)}
         for closure in self._linked.values():
             chosen |= {closure.earlier.id: closure.earlier, closure.later.id: closure.later}
         return _in_order(chosen)
 
-    def finish(self, stop: Callable[[], bool] = lambda: False, save: Callable[[], None] = lambda: None) -> None:
+    def finish(
+        self,
+        stop: Callable[[], bool] = lambda: False,
+        save: Callable[[], None] = lambda: None,
+        preliminary: bool = False,
+    ) -> None:
         """Close loops and adjust all keyframes; every view follows. See `PathAdjuster.finish` about the arguments."""
+        most = LIVE_WHOLE_KEYFRAMES if preliminary else WHOLE_KEYFRAMES
+        loop_iterations = FINAL_ITERATIONS if preliminary else LOOP_ITERATIONS  # fewer keyframes converge slowly
         self._choose()
         if self._whole is not None and stop():
             self._whole.stop()
@@ -309,26 +318,22 @@ class KeyframeAdjuster:
             closures = spread_drift(self.map, found)
             if closures or (self._open and self._loop_rounds == 0):
                 self._link(closures)
-                self._adjust_all(LOOP_ITERATIONS, stop)
+                self._adjust_all(loop_iterations, most, stop)
                 self._loop_rounds += 1
             else:
                 self._loop_rounds = LOOP_ROUNDS
-            self._save_unless(stop, save)
+            if not stop():  # otherwise the round is not done
+                save()
         while self._final_rounds < FINAL_ROUNDS and not stop():
             self._final_rounds += 1
-            self._adjust_all(FINAL_ITERATIONS, stop, refit_all=self._final_rounds == FINAL_ROUNDS)
-            self.map.triangulate(self._all_chosen())
-            self._save_unless(stop, save)
+            self._adjust_all(FINAL_ITERATIONS, most, stop, refit_all=self._final_rounds == FINAL_ROUNDS)
+            self.map.triangulate(self._all_chosen(most))
+            if not stop():
+                save()
 
-    @staticmethod
-    def _save_unless(stop: Callable[[], bool], save: Callable[[], None]) -> None:
-        """A round that was stopped early is not done."""
-        if not stop():
-            save()
-
-    def _adjust_all(self, iterations: int, stop: Callable[[], bool], refit_all: bool = False) -> None:
-        """Adjust all keyframes and their points; all other views follow, see `_take`."""
-        keyframes = self._all_chosen()
+    def _adjust_all(self, iterations: int, most: int, stop: Callable[[], bool], refit_all: bool = False) -> None:
+        """Adjust all keyframes, or `most`, and their points; all other views follow, see `_take`."""
+        keyframes = self._all_chosen(most)
         if len(keyframes) <= 2 or (made := self.map.bundle(keyframes)) is None:
             return
         made.bundle.free = self.map.free_optics
@@ -336,14 +341,6 @@ class KeyframeAdjuster:
         banded_bundle.optimise(made.bundle, iterations, FINAL_SCALE_PX, first, TOLERANCE, stop)
         self.map.take_optics(made.bundle)
         self._take(made, self.map.views, refit_all)
-
-    def path_error(self) -> float | None:
-        """Not predicted for long paths."""
-        return None
-
-    def information(self) -> Array | None:
-        """None: there is no spline."""
-        return None
 
     def _choose(self) -> None:
         """Make views keyframes that are far enough from the newest one."""
@@ -371,6 +368,8 @@ class KeyframeAdjuster:
         moved = np.flatnonzero((row_of >= 0) & np.isfinite(self.map.points[:, 0]))
         self.map.points[moved] = motion.points(row_of[moved], self.map.points[moved])
         adjusted = {view.id for view in made.views}
+        for view in {view.id: view for view in [*made.views, *followers]}.values():
+            view.scale *= motion.scale(view.id)
         for view in followers:
             if view.pose is None or view.id in adjusted:
                 continue
@@ -426,6 +425,10 @@ class _Motion:
     def row(self, number: int) -> int:
         """The keyframe that a view moves with: the one before it."""
         return max(int(np.searchsorted(self.ids, number, side="right")) - 1, 0)
+
+    def scale(self, number: int) -> float:
+        """Growth of the lengths around a view."""
+        return float(self.scales[self.row(number)])
 
     def points(self, rows: NDArray[np.int64], points: Array) -> Array:
         """Points [n, 3] moved with their keyframes [n]."""

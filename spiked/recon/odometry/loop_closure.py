@@ -278,6 +278,7 @@ def spread_drift(sparse_map: SparseMap, found: list[LoopClosure]) -> list[LoopCl
             seen[view.ids] += 1
             part = drift.part(float(shares[view.id]))
             view.pose = Pose(part.rotation @ view.pose.rotation, part.points(view.pose.centre))
+            view.scale *= part.scale
     steps = np.round(DRIFT_STEPS * places / np.maximum(seen, 1)).astype(np.int64)
     for step in np.unique(steps).tolist():
         chosen = steps == step

@@ -143,8 +143,11 @@ class MapOdometry:
         return self._adjuster.end_left
 
     def waypoints(self) -> Waypoints | None:
-        """The path interpolated between views with a pose; None before the bootstrap."""
-        return self._map.waypoints()
+        """The path interpolated between views with a pose; None before the bootstrap.
+
+        Those of a live camera lie further apart than a hand that trembles moves evenly.
+        """
+        return self._map.waypoints(smooth=self._live)
 
     def information(self) -> Array | None:
         """Inverse covariance [6 knots, 6 knots] of `spline`, see `GlobalAdjuster.information`."""
@@ -249,20 +252,25 @@ class MapOdometry:
         self._map.reserve(self._tracks.next_id)
         return view
 
-    def end(self, stop: Callable[[], bool] = lambda: False, save: Callable[[], None] = lambda: None) -> None:
+    def end(
+        self,
+        stop: Callable[[], bool] = lambda: False,
+        save: Callable[[], None] = lambda: None,
+        preliminary: bool = False,
+    ) -> None:
         """After the last view: a last bootstrap attempt if needed, then the final global adjustment.
 
-        `stop` and `save`: see `PathAdjuster.finish`.
+        The arguments are those of `PathAdjuster.finish`.
         """
         if self.state is State.BOOT and self._initialiser.last_attempt():
             self._adjust_keyframes_if_long()
             self._adjuster.adjust()
-        self._end_second_map(stop, save)
-        self._adjuster.finish(stop, save)
+        self._end_second_map(stop, save, preliminary)
+        self._adjuster.finish(stop, save, preliminary)
         self.path_error = self._adjuster.path_error()
         assess(self._map, self._status, self.path_error, self._initialiser.rough)
 
-    def _end_second_map(self, stop: Callable[[], bool], save: Callable[[], None]) -> None:
+    def _end_second_map(self, stop: Callable[[], bool], save: Callable[[], None], preliminary: bool) -> None:
         """Where another map was begun, decide which one the path is of."""
 
     def end_with_path(self, spline: Spline, middle: float) -> float | None:

@@ -170,13 +170,15 @@ class Odometry(MapOdometry):
         self._second = self._meeting = None
         self._lost_views = 0
 
-    def _end_second_map(self, stop: Callable[[], bool], save: Callable[[], None]) -> None:
+    def _end_second_map(self, stop: Callable[[], bool], save: Callable[[], None], preliminary: bool) -> None:
         if self._second is not None:
-            self._end_second(self._second, stop, save)
+            self._end_second(self._second, stop, save, preliminary)
 
-    def _end_second(self, second: "Odometry", stop: Callable[[], bool], save: Callable[[], None]) -> None:
+    def _end_second(
+        self, second: "Odometry", stop: Callable[[], bool], save: Callable[[], None], preliminary: bool
+    ) -> None:
         """No known place was seen again: the path is that of the map that spans more time."""
-        second.end(stop, save)
+        second.end(stop, save, preliminary)
         views = [view for view in second.views[self._second_begin :] if view.pose is not None]
         ours = self._map.posed()
         self._second = self._meeting = None

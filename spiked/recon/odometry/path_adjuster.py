@@ -41,12 +41,20 @@ class PathAdjuster(Protocol):
     def adjust(self, final: bool = True) -> None:
         """Adjust what is due; without `final`, with less effort where that suffices."""
 
-    def finish(self, stop: Callable[[], bool] = lambda: False, save: Callable[[], None] = lambda: None) -> None:
+    def finish(
+        self,
+        stop: Callable[[], bool] = lambda: False,
+        save: Callable[[], None] = lambda: None,
+        preliminary: bool = False,
+    ) -> None:
         """The last adjustment, of the whole path. On a long path it ends soon after `stop` becomes true: loops may then
-        be open. `save` is called wherever a copy of the adjuster goes on with the same result."""
+        be open. `save` is called wherever a copy of the adjuster goes on with the same result; `preliminary`: with less
+        effort where the path is long."""
 
     def path_error(self) -> float | None:
-        """Predicted error of the path relative to its RMS radius; None if it is not predicted."""
+        """Predicted error of the path relative to its RMS radius; None if it is not predicted, as of long paths."""
+        return None
 
     def information(self) -> Array | None:
         """Inverse covariance [6 knots, 6 knots] of `spline`; None without one."""
+        return None

@@ -79,6 +79,8 @@ class TrackedView:
     """Squared median residual over the expected one; 1 if the noise explains it."""
     sigma_px: float | None = None
     """Predicted standard deviation of the pose, as image displacement at the median depth."""
+    scale: float = 1.0
+    """Lengths around it over those when it got its pose: adjustments and closed loops change them."""
 
     @property
     def rotation(self) -> Array | None:
@@ -257,10 +259,10 @@ class SparseMap:
             if view.pose is not None:
                 view.pose = Pose(view.pose.rotation, view.pose.centre / unit)
 
-    def waypoints(self) -> Waypoints | None:
-        """The path interpolated between views with a pose; None with fewer than two."""
+    def waypoints(self, smooth: bool = False) -> Waypoints | None:
+        """The path interpolated between views with a pose, see `Waypoints`; None with fewer than two."""
         posed = [(view.time, view.pose) for view in self.views if view.pose is not None]
         if len(posed) < 2:
             return None
         rotations, centres = np.stack([p.rotation for _, p in posed]), np.stack([p.centre for _, p in posed])
-        return Waypoints(np.array([time for time, _ in posed]), rotations, centres)
+        return Waypoints(np.array([time for time, _ in posed]), rotations, centres, smooth)

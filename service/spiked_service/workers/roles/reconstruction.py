@@ -27,7 +27,14 @@ from spiked_service.results.mosaic_by_pixels import by_pixels
 from spiked_service.results.pinned_map import PinnedMap
 from spiked_service.results.recording_feed import pieces
 from spiked_service.workers.channel import WorkerChannel
-from spiked_service.workers.frame_skipping import LATE_FRAMES, LONGEST_UNMAPPED_S, LatestFrames, may_map, next_window
+from spiked_service.workers.frame_skipping import (
+    LATE_FRAMES,
+    LONGEST_UNMAPPED_S,
+    LatestFrames,
+    may_map,
+    may_sweep,
+    next_window,
+)
 from spiked_service.workers.messages import ReconstructionCommand
 from spiked_service.workers.progress_reporter import ProgressReporter
 
@@ -61,11 +68,13 @@ def run_reconstruction(command: ReconstructionCommand, channel: WorkerChannel) -
         with RingReader.attach(command.ring, policy, "reconstruction", command.first_frame) as reader:
             work = _begin(command, reader.geometry.sensor, channel)
             skipped = _follow(reader, work, command)
-            if skipped and command.recorded:
-                work.reporter.frames_skipped(skipped)
-                return
-            if skipped and work.reconstructor.status().state is State.BOOT and not channel.stop.is_set():
+            pathless = work.reconstructor.status().state is State.BOOT
+            if skipped and not command.recorded and pathless and not channel.stop.is_set():
                 work = _track_ring_again(reader, work, command)
+        if skipped and command.recorded:
+            work.adjust_path()
+            work.reporter.frames_skipped(skipped)
+            return
     else:
         assert command.recording is not None, "a command has a ring or a recording"
         os.nice(_OFFLINE_NICE)  # live captures have priority
@@ -106,6 +115,15 @@ class _Work:
     def track_latest(self, first: int, frames: NDArray[np.uint8], newest: Callable[[], int]) -> None:
         self.reconstructor.track_latest(first, frames)
         self.reporter.tracked(newest() - first - len(frames))
+
+    def adjust_path(self) -> None:
+        """Close the loops of a path that is computed again from the recording, unless the worker is to stop."""
+        leave, stop = self.channel.leave, self.channel.stop
+        if self.reconstructor.path is not None:
+            os.nice(_OFFLINE_NICE - _LIVE_NICE)
+            self.reconstructor.end_tracking(
+                self.reporter.progress, lambda: leave.is_set() or stop.is_set(), preliminary=True
+            )
 
     def finish(self) -> None:
         """Refine, publish and report the end, unless the worker is to exit: then the job restarts later."""
@@ -273,6 +291,8 @@ def _track_latest(latest: LatestFrames, work: _Work, command: ReconstructionComm
                 if overdue or may_map(late, reconstructor.speed_px, rate_hz):
                     reconstructor.improve(_SKIPPING_MAPPING_S)
                     mapped_s = time.monotonic()
+                elif may_sweep(late, reconstructor.speed_px):
+                    reconstructor.sweep_behind()
         work.reporter.progress(reconstructor.status())
     return latest.skipped
 

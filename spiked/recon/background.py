@@ -28,7 +28,7 @@ class Background(Generic[Result]):
         self._work, self._behind = work, behind
         self._stop = threading.Event()
         self._outcome: list[Result | BaseException] = []
-        self._thread = threading.Thread(target=self._run, name="path adjustment")
+        self._thread = threading.Thread(target=self._run, name="background")
         self._thread.start()
 
     def _run(self) -> None:

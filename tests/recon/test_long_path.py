@@ -91,6 +91,27 @@ def test_a_long_path_is_followed_and_its_loop_closed(walked: tuple[Reconstructor
     assert isinstance(told, list) and len(told) == len(odometry.closures)
 
 
+def test_views_know_how_lengths_around_them_have_grown(
+    not_ended: Odometry, walked: tuple[Reconstructor, Trajectory]
+) -> None:
+    """By the depths of the points that they see, before the last adjustments and after them."""
+    before, after = not_ended.map, walked[0].odometry.map
+    known = np.isfinite(before.points[:, 0]) & np.isfinite(after.points[: len(before.points), 0])
+    grown, told = [], []
+    for old, new in zip(before.views, after.views, strict=False):
+        ids = old.ids[known[old.ids]]
+        if old.pose is None or new.pose is None or len(ids) < 20:
+            continue
+        depths = ((m.points[ids] - v.pose.centre) @ v.pose.rotation[:, 2] for m, v in ((before, old), (after, new)))
+        first, last = depths
+        good = (first > 0) & (last > 0)
+        grown.append(float(np.median(last[good] / first[good])))
+        told.append(new.scale / old.scale)
+    errors = np.abs(np.log(np.array(told) / grown))
+    assert len(grown) > 100 and np.ptp(grown) > 0.005
+    assert np.median(errors) < 0.3 * np.ptp(np.log(grown)) and np.percentile(errors, 95) < 0.02
+
+
 def test_loops_are_closed_while_it_runs(not_ended: Odometry, walked: tuple[Reconstructor, Trajectory]) -> None:
     """The camera is back half-way between the turn and the end; what is closed later is closed at once as well."""
     assert len(not_ended.closures) >= 3

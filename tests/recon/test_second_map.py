@@ -87,6 +87,18 @@ def test_a_path_that_never_returns_has_the_longer_map(frames: np.ndarray) -> Non
         assert score(reconstructor, end)[1] < 3
 
 
+def test_splats_of_a_map_that_is_given_up_are_removed(frames: np.ndarray) -> None:
+    reconstructor = Reconstructor(SENSOR, Options(steps=0), live=True)
+    feed(reconstructor, frames, 0, 1400)
+    reconstructor.improve(0.01)
+    assert len(reconstructor.trainer.mapper) > 100
+    feed(reconstructor, frames, 1400, 5200)
+    reconstructor.end_tracking()
+    assert reconstructor.odometry.remark is not None
+    assert reconstructor.odometry.views[0].pose is None and len(reconstructor.trajectory()) > 0
+    assert len(reconstructor.trainer.mapper) == 0
+
+
 def test_a_recording_may_end_when_the_second_map_has_no_view_yet(frames: np.ndarray) -> None:
     reconstructor = Reconstructor(SENSOR, Options(steps=0))
     at = 0

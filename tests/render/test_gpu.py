@@ -190,7 +190,7 @@ def test_rasterisers_in_several_threads(device: str) -> None:
 
 
 def test_descent_on_the_device(device: str) -> None:
-    """Steps, splats added and removed, and a checkpoint: the scene is that of the CPU."""
+    """Steps, splats moved, added and removed, and a checkpoint: the scene is that of the CPU."""
     case = Case("three colours")
     rates = (1e-3, 2e-3, 3e-3, 4e-2, 5e-3)
     limits, rng = SizeLimits(float(np.log(0.1)), 0.04, (0.1, -0.2, -1.0)), np.random.default_rng(8)
@@ -201,6 +201,10 @@ def test_descent_on_the_device(device: str) -> None:
     for turn in range(8):
         slopes = rng.normal(size=case.d_values.shape).astype(np.float32)
         for i, rasteriser in enumerate(rasterisers):
+            if turn == 2:  # the same splats elsewhere
+                moved = _copy(fits[i].scene)
+                moved.means += np.float32(0.01)
+                fits[i].replace(moved)
             if turn == 3:
                 fits[i].join(more)
             if turn == 5:

@@ -6,6 +6,7 @@ B-spline of the knots' centres. Degree 3 for smooth motion, degree 1 where motio
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol, final
 
 import numpy as np
@@ -106,16 +107,21 @@ class Waypoints:
 
         A pose has an influence over two spaces to each side. Turns from one pose to the next are taken to be small.
         """
-        turns = log_so3(self.rotations[1:] @ self.rotations[:-1].swapaxes(1, 2))
-        steps = np.concatenate([turns, np.diff(self.centres, axis=0)], 1)
-        spaces = np.diff(self.times)[:, None]
-        speeds = np.concatenate([[steps[0] / spaces[0]], (steps[1:] + steps[:-1]) / (spaces[1:] + spaces[:-1])])
-        speeds = np.concatenate([speeds, [steps[-1] / spaces[-1]]])
+        spaces, steps, speeds = self._steps
         row = np.searchsorted(self.times, at, side="right").clip(1, len(self.times) - 1) - 1
         u = (at - self.times[row])[:, None] / spaces[row]
         first, last = (speeds[row + end] * spaces[row] - steps[row] for end in (0, 1))
         bent = u * (1 - u) * ((1 - u) * first - u * last)
         return bent[:, :3], bent[:, 3:]
+
+    @cached_property
+    def _steps(self) -> tuple[Array, Array, Array]:
+        """Spaces [n - 1, 1] from each pose to the next, turns with ways [n - 1, 6], and speeds [n, 6] at the poses."""
+        turns = log_so3(self.rotations[1:] @ self.rotations[:-1].swapaxes(1, 2))
+        steps = np.concatenate([turns, np.diff(self.centres, axis=0)], 1)
+        spaces = np.diff(self.times)[:, None]
+        inner = (steps[1:] + steps[:-1]) / (spaces[1:] + spaces[:-1])
+        return spaces, steps, np.concatenate([steps[:1] / spaces[:1], inner, steps[-1:] / spaces[-1:]])
 
     def bend(self, times: ArrayLike, rotation: Array, centre: Array) -> "Waypoints":
         """The path with poses perturbed: R <- Exp(rotation) R, c <- c + centre; both [m, 3] at increasing `times` [m],

@@ -230,7 +230,7 @@ class Reconstructor:
     ) -> None:
         """Track the buffered frames, close the loops and adjust the whole path: what `finish` begins with, and no more
         can be fed. The arguments are those of `finish`; `tracking_ended` unless cancelled. `preliminary`: with fewer
-        keyframes and iterations, for a path that is soon computed again.
+        keyframes, for a path that is soon computed again.
         """
 
         def saved() -> None:

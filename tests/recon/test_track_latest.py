@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from waiting import until
 
 from spiked.evaluate import score_trajectory
 from spiked.pose import exp_so3
@@ -14,7 +15,6 @@ from spiked.sensor import Intrinsics, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
 from spiked.spline import Waypoints
 from spiked.trajectory import Trajectory
-from tests.waiting import until
 
 FRAMES, EVERY = 6000, 240
 MAPPED = 20
@@ -87,10 +87,14 @@ def test_a_live_map_grows_by_sweeps_on_another_thread(live: Reconstructor) -> No
 
 def test_a_sweep_is_not_planted_in_a_map_that_was_begun_anew(live: Reconstructor) -> None:
     trainer = live.trainer
+    until(lambda: trainer._sweeping is None or trainer._sweeping.done, "the last sweep has ended")
     trainer._swept_px = -np.inf
-    live.sweep_behind()
-    live.sweep_behind()
+    live.sweep_behind()  # takes that, and begins another
+    sweeping = trainer._sweeping
+    assert sweeping is not None
+    until(lambda: sweeping.done, "the sweep has ended")
     trainer.restart()
+    live.sweep_behind()
     assert len(trainer.mapper) == 0 and not trainer.sweep_due
 
 

@@ -120,13 +120,17 @@ class ProgressReporter:
 
     def frames_skipped(self, skipped: int) -> None:
         """Publish the live result of a capture that is reconstructed again from its recording."""
-        self.tracked(None)
-        self._timeline.closed(self._reconstructor.closures())
-        self._least_poses = 0
-        status = self._reconstructor.status()
+        status = self._end()
         self._publish(status, every_frame=True)
         self._send_status(status)
         self._channel.send(FramesSkipped(frames=status.frames, skipped=skipped))
+
+    def _end(self) -> Status:
+        """The status after the last frame: timeline and next version have all of the path."""
+        self.tracked(None)
+        self._timeline.closed(self._reconstructor.closures())
+        self._least_poses = 0
+        return self._reconstructor.status()
 
     def refine(self) -> None:
         """Mark the start of the refinement; its result is compared with the version before it."""
@@ -139,10 +143,7 @@ class ProgressReporter:
 
     def last(self, cut_short: bool) -> None:
         """Publish the final state, or an earlier version again if that is better."""
-        self.tracked(None)
-        self._timeline.closed(self._reconstructor.closures())
-        self._least_poses = 0
-        status = self._reconstructor.status()
+        status = self._end()
         self._note_progress(status)
         self._publish(status, tolerance=0.0, every_frame=True)
         shown = self._best(cut_short)

@@ -108,10 +108,9 @@ class DepthSweeps:
         work = self.prepare(posed, row, seen, QUICK, threads)
         if work is None:
             return None
-        sweep_it = work
 
         def fill() -> SweptView:
-            swept = sweep_it()
+            swept = work()
             local = (seen - swept.centre) @ swept.rotation
             return replace(swept, sweep=_filled(swept.sweep, local, self.camera.intrinsics))
 

@@ -146,8 +146,7 @@ class MapTrainer:
             return
         self._swept_px = self.views.travelled_px
         if (work := self._prepare_quick(path, points, threads=1)) is not None:
-            sweep_it = work
-            self._sweeping = Background(lambda stop: sweep_it(), behind=True)
+            self._sweeping = Background(lambda stop: work(), behind=True)
 
     def _prepare_quick(self, path: Path, points: Array, threads: int | None) -> Callable[[], SweptView] | None:
         """A quick sweep of a recent view, with others on both sides of it."""

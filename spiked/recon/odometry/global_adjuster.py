@@ -131,8 +131,8 @@ class GlobalAdjuster:
         preliminary: bool = False,
     ) -> None:
         """The last adjustments: estimated optics may need several. Ends after one if `stop` is true. They are
-        one piece: `save` is not called."""
-        del save
+        one piece, whatever is `preliminary`: `save` is not called."""
+        del save, preliminary
         self.adjust()
         for _ in range(MAX_FOCAL_ROUNDS):
             before = self.map.intrinsics

@@ -48,8 +48,8 @@ class PathAdjuster(Protocol):
         preliminary: bool = False,
     ) -> None:
         """The last adjustment, of the whole path. On a long path it ends soon after `stop` becomes true: loops may then
-        be open. `save` is called wherever a copy of the adjuster goes on with the same result; `preliminary`: with less
-        effort where the path is long."""
+        be open. `save` is called wherever a copy of the adjuster goes on with the same result; `preliminary`: with
+        fewer keyframes where the path is long."""
 
     def path_error(self) -> float | None:
         """Predicted error of the path relative to its RMS radius; None if it is not predicted, as of long paths."""

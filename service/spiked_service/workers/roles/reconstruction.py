@@ -116,14 +116,15 @@ class _Work:
         self.reconstructor.track_latest(first, frames)
         self.reporter.tracked(newest() - first - len(frames))
 
+    def is_over(self) -> bool:
+        """The worker is to exit or to stop."""
+        return self.channel.leave.is_set() or self.channel.stop.is_set()
+
     def adjust_path(self) -> None:
         """Close the loops of a path that is computed again from the recording, unless the worker is to stop."""
-        leave, stop = self.channel.leave, self.channel.stop
         if self.reconstructor.path is not None:
             os.nice(_OFFLINE_NICE - _LIVE_NICE)
-            self.reconstructor.end_tracking(
-                self.reporter.progress, lambda: leave.is_set() or stop.is_set(), preliminary=True
-            )
+            self.reconstructor.end_tracking(self.reporter.progress, self.is_over, preliminary=True)
 
     def finish(self) -> None:
         """Refine, publish and report the end, unless the worker is to exit: then the job restarts later."""
@@ -132,7 +133,7 @@ class _Work:
         self.reporter.refine()
         self.reconstructor.finish(
             lambda status: None if leave.is_set() else progress(status),
-            lambda: leave.is_set() or stop.is_set(),
+            self.is_over,
             budget_s=None if self.deadline == math.inf else max(0.0, self.deadline - time.monotonic()),
             save=self.save,
         )

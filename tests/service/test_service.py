@@ -4,7 +4,10 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import closing
+from http.client import HTTPConnection
 from pathlib import Path
+from select import select
 from typing import Any
 
 import httpx
@@ -67,6 +70,17 @@ def test_pages_and_health(daemon: Callable[..., Any]) -> None:
     examples = httpx.get(f"{one.address}openapi.json").json()["components"]["schemas"]["ViewRequest"]["examples"]
     assert len(examples) == 3
     assert [device["source"] for device in one.http.get("devices").json()["items"]][:2] == ["replay:rec.dat", "sim:"]
+
+
+def test_an_idle_connection_outlives_the_pools_of_clients(daemon: Callable[..., Any]) -> None:
+    """httpx uses one again for 5 s: closed after 5 s, too, a request at that moment got no answer."""
+    one = daemon("--device", "replay:rec.dat", "--no-capture")
+    with closing(HTTPConnection("127.0.0.1", httpx.URL(one.address).port, timeout=20)) as kept:
+        kept.request("GET", "/healthz")
+        assert kept.getresponse().read()
+        assert kept.sock is not None
+        closed, _, _ = select([kept.sock], [], [], 6.0)
+        assert not closed
 
 
 def test_a_token_is_asked_for_and_taken_in_three_ways(daemon: Callable[..., Any]) -> None:

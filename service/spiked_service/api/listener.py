@@ -15,6 +15,12 @@ CONNECTIONS = 1000
 """Further concurrent connections are answered with 503."""
 _USER_TIMEOUT_MS = 60_000
 """The kernel closes connections whose peer acknowledges nothing for this long."""
+KEPT_ALIVE_S = 75
+"""An idle connection is closed after this long.
+
+Longer than clients and proxies use one again after (httpx 5 s, aiohttp 15 s, nginx and AWS's load balancers 60 s): a
+request that crosses the closing of its connection is lost without an answer.
+"""
 MESSAGE_BYTES = 65_536
 """Largest WebSocket message from a client."""
 
@@ -45,6 +51,7 @@ def server_config(app: ASGIApp, settings: ReloadableSettings) -> uvicorn.Config:
         access_log=False,
         lifespan="on",
         timeout_graceful_shutdown=1,
+        timeout_keep_alive=KEPT_ALIVE_S,
         limit_concurrency=CONNECTIONS,
         ws="websockets-sansio",
         ws_max_size=MESSAGE_BYTES,

@@ -13,6 +13,7 @@ from spiked.poses import PoseFile
 from spiked.recon import Merged, Reconstructor, State, Status, Tracked
 from spiked.scene import Scene
 from spiked.trajectory import Trajectory
+from spiked_service.base.malloc import return_freed
 from spiked_service.events.payloads import PosePayload
 from spiked_service.results.map_reports import REGISTRATION, REPORT, write_report
 from spiked_service.results.published import Published
@@ -258,6 +259,7 @@ class ProgressReporter:
         except OSError as error:
             raise _write_error(error) from error
         self._send_version(published)
+        return_freed()
 
     def _send_version(self, published: Published, again_of: int | None = None) -> None:
         self._poses = published.poses

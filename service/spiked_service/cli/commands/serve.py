@@ -9,13 +9,13 @@ from typing import Annotated
 import typer
 
 from spiked.recon import State
+from spiked_service.base.malloc import limit_arenas
 from spiked_service.captures.captures import Captures
 from spiked_service.captures.sources import unpaced
 from spiked_service.cli.console import output
 from spiked_service.cli.fault_flags import Corrupt, Drop, Gap, Stall, UnplugAt, with_faults
 from spiked_service.cli.recording_flags import parse_intrinsics
 from spiked_service.daemon import Daemon
-from spiked_service.operations.malloc import limit_arenas
 from spiked_service.reconstructions.repository import ReconstructionRepository
 from spiked_service.settings.reload import ReloadableSettings
 from spiked_service.settings.settings import LogFormat, LogLevel, pass_on, setting

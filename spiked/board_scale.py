@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from spiked.board import Board
 from spiked.errors import ConfigurationError, SceneError
@@ -87,11 +87,11 @@ def scale_by_board_sightings(seen: list[BoardSighting], board: Board, square_m: 
             f"the board is in {len(seen)} of the pictures; {LEAST_VIEWS} from different sides are needed: move round "
             "it, nearer, or print a larger one; or give a known length instead"
         )
-    fit = least_squares(_errors, start, args=(seen, board), loss="soft_l1")
+    fit = scipy.optimize.least_squares(_errors, start, args=(seen, board), loss="soft_l1")
     seen = [one for one in seen if np.abs(_errors(fit.x, [one], board)).max() < MOST_ERROR_PX]
     if len(seen) < LEAST_VIEWS or turn_deg([one.centre for one in seen], fit.x[3:6]) < LEAST_TURN_DEG:
         raise SceneError(f"{len(seen)} views of the board agree, or all from one side: move round the board")
-    fit = least_squares(_errors, fit.x, args=(seen, board))
+    fit = scipy.optimize.least_squares(_errors, fit.x, args=(seen, board))
     errors = _errors(fit.x, seen, board)
     variance = float(errors @ errors) / max(1, len(errors) - len(fit.x))
     jacobian = np.asarray(fit.jac)

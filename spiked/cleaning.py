@@ -5,8 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from spiked.errors import ConfigurationError
 from spiked.recon.statistics import evenly
@@ -108,7 +108,7 @@ class FloaterRemoval:
         angle: far surfaces are no floaters.
         """
         count = min(self.neighbours + 1, len(scene))
-        found = np.asarray(cKDTree(scene.means).query(scene.means, count)[0])
+        found = np.asarray(scipy.spatial.cKDTree(scene.means).query(scene.means, count)[0])
         distances = found.reshape(len(scene), -1)[:, -1]
         angles = distances / seen.nearest
         usual = float(np.median(angles[seen.views > 0])) if seen.views.any() else 0.0

@@ -10,8 +10,8 @@ from functools import cached_property
 from typing import Protocol, final
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from spiked.pose import Array, exp_so3, log_so3
 
@@ -257,14 +257,14 @@ class _BandedSteps:
         for a in range(3):
             for b in range(a, 3):
                 bands[b - a, a : self._count - 2 + a] += bend[a] * bend[b]
-        self._factor = cholesky_banded(bands, lower=True)
+        self._factor = scipy.linalg.cholesky_banded(bands, lower=True)
 
     def towards(self, steps: Array) -> Array:
         """For steps [m, 3] at the times."""
         right = np.zeros((self._count, 3))
         for a in range(self._weights.shape[1]):
             np.add.at(right, self._first + a, self._weights[:, a, None] * steps)
-        return np.asarray(cho_solve_banded((self._factor, True), right))
+        return np.asarray(scipy.linalg.cho_solve_banded((self._factor, True), right))
 
 
 def interpolate_rotations(times: Array, rotations: Array, at: Array) -> Array:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from spiked.errors import ConfigurationError, SceneError
 from spiked.recon.statistics import evenly
@@ -231,12 +231,12 @@ def _fit(number: int, views: list[Sighting]) -> FoundTag | None:
     if len(views) < LEAST_VIEWS:
         return None
     start = _square(np.stack([crossing([(one.centre, one.rotation @ one.rays[k]) for one in views]) for k in range(4)]))
-    fit = least_squares(_errors, start, args=(views,), loss="soft_l1")
+    fit = scipy.optimize.least_squares(_errors, start, args=(views,), loss="soft_l1")
     worst = np.abs(_errors(fit.x, views)).reshape(len(views), -1).max(axis=1)
     views = [one for one, error in zip(views, worst, strict=True) if error < MOST_ERROR_PX]
     if len(views) < LEAST_VIEWS or turn_deg([one.centre for one in views], fit.x[3:6]) < LEAST_TURN_DEG:
         return None
-    fit = least_squares(_errors, fit.x, args=(views,))
+    fit = scipy.optimize.least_squares(_errors, fit.x, args=(views,))
     errors = _errors(fit.x, views)
     variance = float(errors @ errors) / max(1, len(errors) - len(fit.x))
     jacobian = np.asarray(fit.jac)

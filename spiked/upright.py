@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from spiked.errors import ConfigurationError, SceneError
 from spiked.scene import Scene
@@ -122,7 +122,7 @@ def _up_of(points: Array, cameras: Array) -> Array:
 
 def _normals(points: Array) -> Array:
     """Normals of the surface at points, [n, 3], by their neighbours; of either sign."""
-    _, near = cKDTree(points).query(points, NEIGHBOURS)
+    _, near = scipy.spatial.cKDTree(points).query(points, NEIGHBOURS)
     away = points[near] - points[near].mean(axis=1, keepdims=True)
     return np.linalg.eigh(away.swapaxes(1, 2) @ away)[1][:, :, 0]
 

@@ -10,11 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 import spiked.native._dense as _dense
 from spiked.errors import SceneError
@@ -97,7 +94,7 @@ def _volume(points: SurfacePoints, resolution: int) -> _Volume:
     inside = points.positions[((points.positions >= low) & (points.positions < high)).all(1)]
     filled = np.zeros(tuple(blocks), bool)
     filled[tuple(np.floor((inside - low) / (step * BLOCK)).astype(int).T)] = True
-    filled = binary_dilation(filled, np.ones((3, 3, 3), bool))
+    filled = scipy.ndimage.binary_dilation(filled, np.ones((3, 3, 3), bool))
     return _Volume(low, step, (int(blocks[0]), int(blocks[1]), int(blocks[2])), filled)
 
 
@@ -132,13 +129,13 @@ def _integrated(volume: _Volume, views: Sequence[RenderedView]) -> tuple[Floats,
 def _cleaned(vertices: Doubles, faces: NDArray[np.int64], points: SurfacePoints) -> Mesh:
     """Without small parts and unused vertices, with the colours of the nearest surface points."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    graph = coo_array((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), (len(vertices),) * 2)
-    _, part = connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_array((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), (len(vertices),) * 2)
+    _, part = scipy.sparse.csgraph.connected_components(graph, directed=False)
     sizes = np.bincount(part[faces[:, 0]], minlength=part.max() + 1)
     faces = faces[sizes[part[faces[:, 0]]] >= SMALLEST_PART * len(faces)]
     used, flat = np.unique(faces, return_inverse=True)
     vertices = vertices[used]
-    _, nearest = cKDTree(points.positions).query(vertices)
+    _, nearest = scipy.spatial.cKDTree(points.positions).query(vertices)
     return Mesh(vertices, flat.reshape(-1, 3), points.colours[nearest])
 
 

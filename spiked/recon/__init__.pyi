@@ -8,7 +8,7 @@ from .methods import METHODS, Alternation, Initialisation, Method, MethodName, P
 from .odometry.tracking_state import State
 from .options import LossName, MapOptions, Options
 from .reconstructor import Reconstructor
-from .report import Sample, Status, Tracked
+from .status import Sample, Status, Tracked
 
 __all__ = [
     "METHODS",

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 import spiked
 from spiked.errors import CheckpointError, SpikedError
-from spiked.recon import report
 from spiked.recon.checkpoint_file import CheckpointFolder, Place, State, read
+from spiked.recon.environment import versions
 from spiked.recon.frontend.recorded_views import RecordedFrames
 from spiked.recon.reconstructor import Reconstructor
 from spiked.recording import Recording
@@ -398,7 +398,7 @@ def _program() -> dict[str, str]:
     for path in sorted(path for found in folders for path in found if path.suffix in (".py", ".so")):
         digest.update(path.relative_to(home).as_posix().encode())
         digest.update(path.read_bytes())
-    return report.versions() | {"build": digest.hexdigest()}
+    return versions() | {"build": digest.hexdigest()}
 
 
 def _identity(recording: Recording) -> dict[str, Any]:

@@ -4,7 +4,6 @@ import numpy as np
 
 from spiked.errors import ConfigurationError
 from spiked.pose import Array
-from spiked.recon.odometry.odometry import Odometry
 from spiked.spline import Spline
 from spiked.trajectory import Trajectory
 
@@ -46,12 +45,8 @@ class GivenPoses:
         rotation, centre = Spline.fit(self._frames[around], rotations, centres, 1e9, degree=1).poses([time])
         return rotation[0], centre[0]
 
-    def end(self, odometry: Odometry, frames: int) -> float:
-        """Make these poses the path of the odometry, in units of the median depth.
-
-        `frames` is the length of the recording. Returns the median depth in the unit of the given poses, 1 where no
-        depth is known. Raises ConfigurationError, see `check`.
-        """
+    def path(self, frames: int) -> Spline:
+        """Through these poses, over a recording of so many frames. Raises ConfigurationError, see `check`."""
         self.check(frames)
         # Poses before and after the recording count as far as the path at its begin and end lies between them.
         ends = [self.at(time) for time in (0.0, float(frames))]
@@ -61,5 +56,4 @@ class GivenPoses:
             np.concatenate([[ends[0][k]], given[inside], [ends[1][k]]])
             for k, given in enumerate((self._poses.rotations, self._poses.centres))
         )
-        spline = Spline.fit(times, rotations, centres, KNOT_FRAMES)
-        return odometry.end_with_path(spline, 0.5 * frames) or 1.0
+        return Spline.fit(times, rotations, centres, KNOT_FRAMES)

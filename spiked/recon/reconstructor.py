@@ -17,8 +17,9 @@ from spiked.recon.odometry.odometry import Odometry
 from spiked.recon.odometry.self_calibration import FIRST_DEG, Focal
 from spiked.recon.options import Options
 from spiked.recon.refinement import Refinement
-from spiked.recon.report import Sample, Status, Tracked, WorkLog
+from spiked.recon.report import WorkLog
 from spiked.recon.results import Results
+from spiked.recon.status import Sample, Status, Tracked
 from spiked.recon.time_left import TimeLeft
 from spiked.recon.view_store import ViewStore
 from spiked.recon.view_tracking import ViewTracker

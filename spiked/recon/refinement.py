@@ -7,7 +7,7 @@ from spiked.recon.mapping.pose_alignment import TrajectoryPrior
 from spiked.recon.mapping.pose_steps import GaussNewton, PoseGradient, PoseStep
 from spiked.recon.mapping.trainer import MapTrainer
 from spiked.recon.methods import PoseStepName
-from spiked.recon.odometry.keyframe_adjuster import LONG_FRAMES
+from spiked.recon.odometry.long_paths import LONG_FRAMES
 from spiked.recon.odometry.self_calibration import optics_moved
 from spiked.recon.options import Options
 from spiked.recon.refiner import Refiner, plan_of

@@ -1,96 +1,23 @@
-"""What a reconstruction reports: its status, its tracked views, its work, and the sections of `report.json`."""
+"""What a reconstruction reports at its end: its samples, its work, and the sections of `report.json`."""
 
-import os
-import platform
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
-from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 
-from spiked.measurement import processor
-from spiked.pose import Array, log_so3
+from spiked.pose import log_so3
 from spiked.recon.frontend.demosaic import fill_mosaic
 from spiked.recon.mapping.mapper import Mapper
 from spiked.recon.odometry.assessment import WORST_PATH_ERROR
 from spiked.recon.odometry.odometry import Odometry
 from spiked.recon.odometry.self_calibration import EstimatedLens, Focal, corner_px
 from spiked.recon.odometry.sparse_map import TrackedView
-from spiked.recon.odometry.tracking_state import State
 from spiked.recon.options import Options
+from spiked.recon.status import Sample
 from spiked.recon.view_store import ViewRecord, ViewStore
-from spiked.render.cpu import usable_cores
-from spiked.sensor import Image
 from spiked.spline import Path, Spline
-
-LIBRARIES = "numpy", "opencv-python-headless"
-"""Packages whose versions are reported: results depend on them."""
-
-
-@dataclass(frozen=True)
-class Status:
-    """Progress and state of a reconstruction."""
-
-    state: State
-    reason: str
-    stage: str
-    """waiting, tracking, mapping, refining or done."""
-    frames: int
-    splats: int
-    loss: float | None
-    """Mean squared error of the views in units of white squared, weighted by the noise."""
-    version: int
-    """Increases when the scene or the trajectory changes."""
-    progress: float
-    """Share of the final refinement done, 0 to 1."""
-    inliers: float | None = None
-    """Of the newest pose, as are the next two: share of the known points that agree with it."""
-    chi2: float | None = None
-    """Squared median residual over the expected one; 1 if the noise explains it."""
-    sigma_px: float | None = None
-    """Predicted error, as a displacement of the image at the median depth."""
-    left_s: float | None = None
-    """Predicted seconds to the end of `Reconstructor.finish`; None while it is not known how many frames will come."""
-
-
-@dataclass(frozen=True)
-class Tracked:
-    """Tracking result of one view."""
-
-    time: float
-    """Middle of the view in frames."""
-    time_s: float
-    state: State
-    rotation: Array | None
-    """Camera to world, [3, 3]; None before the bootstrap and while lost."""
-    centre: Array | None
-    """[3], in the trajectory's unit."""
-    rate: float
-    """Mean spikes a pixel and frame."""
-    sigma_px: float | None = None
-    """Standard deviation of the pose in the image, if known."""
-    chi2: float | None = None
-    """Squared median residual over the expected one, if known."""
-
-    @classmethod
-    def of(cls, record: ViewRecord, frame_rate_hz: float, unit: float) -> "Tracked":
-        """From the record of a view; `unit` is the trajectory's length unit over the map's."""
-        view = record.tracked
-        centre = None if view.centre is None else view.centre * unit
-        time_s = view.time / frame_rate_hz
-        return cls(view.time, time_s, view.state, view.rotation, centre, record.rate, view.sigma_px, view.chi2)
-
-
-@dataclass(frozen=True)
-class Sample:
-    """Observed and rendered image [H, W, C] of one view, radiance, for visual comparison."""
-
-    time_s: float
-    observed: Image
-    rendered: Image | None
-    """None without a map."""
 
 
 def samples(views: ViewStore, mapper: Mapper, path: Path | None, frame_rate_hz: float, count: int) -> list[Sample]:
@@ -167,26 +94,6 @@ def path_warning(path_error: float | None) -> str | None:
         f"the shape of the whole path is only known to about {path_error:.0%}, before the map corrects it: "
         "few tracks tie its parts together; more sideways motion, slower motion or more light would help"
     )
-
-
-def versions() -> dict[str, str]:
-    """Versions of the program, Python, and the libraries that results depend on."""
-    try:
-        release = version("spiked")
-    except PackageNotFoundError:
-        release = "unknown"
-    return {"spiked": release, "python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
-
-
-def machine() -> dict[str, object]:
-    """The machine that runs this: processor, cores that may be used, bytes of memory, system."""
-    pages, page_bytes = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
-    return {
-        "processor": processor(),
-        "cores": usable_cores(),
-        "memory_bytes": pages * page_bytes,
-        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
-    }
 
 
 def options_section(options: Options) -> dict[str, object]:

@@ -4,11 +4,14 @@ import numpy as np
 
 from spiked.pose import Array
 from spiked.recon import report
+from spiked.recon.environment import machine, versions
 from spiked.recon.mapping.scene_psnr import COMPARED_VIEWS, scene_psnr_db
 from spiked.recon.mapping.trainer import MapTrainer
 from spiked.recon.options import Options
 from spiked.recon.refinement import Refinement
-from spiked.recon.report import Sample, Tracked, WorkLog
+from spiked.recon.report import WorkLog
+from spiked.recon.status import Sample, Tracked
+from spiked.recon.view_store import ViewRecord
 from spiked.recon.view_tracking import ViewTracker
 from spiked.render import Camera, rasteriser_for
 from spiked.scene import Scene
@@ -31,7 +34,7 @@ class Results:
 
     def tracked(self, since: int) -> list[Tracked]:
         """The views tracked so far, without the first `since`."""
-        return [Tracked.of(record, self._rate_hz, self._tracker.unit) for record in self._tracker.views.since(since)]
+        return [_tracked(record, self._rate_hz, self._tracker.unit) for record in self._tracker.views.since(since)]
 
     def closures(self) -> list[tuple[float, float]]:
         """Closed loops, in seconds."""
@@ -95,8 +98,8 @@ class Results:
         """Versions, machine, parameters, states with reasons, timings and gaps; `failure`: why there is no path."""
         sensor, mapper, odometry = self._trainer.sensor, self._trainer.mapper, self._tracker.odometry
         return {
-            "versions": report.versions(),
-            "machine": report.machine(),
+            "versions": versions(),
+            "machine": machine(),
             "sensor": {"width": sensor.width, "height": sensor.height, "frame_rate_hz": sensor.frame_rate_hz},
             **report.optics_section(mapper, odometry.focal, odometry.lens),
             "options": report.options_section(self._options),
@@ -110,3 +113,11 @@ class Results:
             **report.map_section(mapper),
             **self._log.report(),
         }
+
+
+def _tracked(record: ViewRecord, frame_rate_hz: float, unit: float) -> Tracked:
+    """What is told of a view; `unit` is the trajectory's length unit over the map's."""
+    view = record.tracked
+    centre = None if view.centre is None else view.centre * unit
+    time_s = view.time / frame_rate_hz
+    return Tracked(view.time, time_s, view.state, view.rotation, centre, record.rate, view.sigma_px, view.chi2)

@@ -16,7 +16,7 @@ from spiked.recon.frontend.windowing import MOST_SPACING_S, SPACING_PX
 from spiked.recon.mapping.mapper import LARGE_PIXELS
 from spiked.recon.mapping.options import MapOptions
 from spiked.recon.mapping.pyramid import SMALLEST_PIXELS
-from spiked.recon.odometry.keyframe_adjuster import LONG_FRAMES
+from spiked.recon.odometry.long_paths import LONG_FRAMES
 from spiked.sensor import Sensor
 
 REFERENCE_PIXELS = 100_000

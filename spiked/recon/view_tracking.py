@@ -123,7 +123,7 @@ class ViewTracker:
             self.odometry.end(stop, save, preliminary)
             self._waypoints = -1, None  # the views have moved
         else:
-            self.unit = self.given.end(self.odometry, self.frames)
+            self.unit = self.odometry.end_with_path(self.given.path(self.frames), 0.5 * self.frames) or 1.0
 
     def choose_views(self, focal_px: float) -> bool:
         """Keep those views of a long path that add something to a map; returns whether others were dropped."""

@@ -14,7 +14,7 @@ from spiked.recon import Options, Reconstructor
 from spiked.recon.frontend.feature_tracks import picture, white_of
 from spiked.recon.mapping.pose_steps import GaussNewton
 from spiked.recon.odometry import loop_closure
-from spiked.recon.odometry.keyframe_adjuster import LONG_FRAMES
+from spiked.recon.odometry.long_paths import LONG_FRAMES
 from spiked.recon.odometry.loop_closure import LoopSearch, find_closures
 from spiked.recon.odometry.odometry import Odometry
 from spiked.recon.odometry.place_index import PlaceIndex

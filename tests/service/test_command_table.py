@@ -32,3 +32,17 @@ def test_a_command_loads_no_other() -> None:
         done = subprocess.run([sys.executable, "-c", code, *words.split()], capture_output=True, text=True, check=False)
         loaded = done.stdout.splitlines()[-1].split()
         assert "typer" in loaded and lacks not in loaded
+
+
+def test_the_service_loads_no_tracker() -> None:
+    """Its workers do: here they would double the time of a start."""
+    code = "import sys\nimport spiked_service.cli.commands.serve\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert "spiked_service.api.app" in loaded
+    assert not loaded & {
+        "spiked.recon.odometry.odometry",
+        "spiked.recon.reconstructor",
+        "scipy.linalg",
+        "scipy.spatial",
+    }

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from spiked.errors import SceneError
 from spiked.scene import Scene
@@ -101,7 +101,7 @@ class ShownScene:
         if not len(before) or not len(rows):
             return found
         sampled = np.arange(0, len(rows), _SAMPLED)
-        tree = cKDTree(slots["mean"][before], balanced_tree=False, compact_nodes=False)
+        tree = scipy.spatial.cKDTree(slots["mean"][before], balanced_tree=False, compact_nodes=False)
         offsets = tree.query(rows["mean"][sampled])[1] - sampled
         for run in (offsets, np.append(offsets[1:], offsets[-1])):
             left = np.flatnonzero(found < 0)

@@ -25,9 +25,6 @@ from spiked.recon.statistics import evenly
 from spiked.sensor import LEAST_DEPTH
 from spiked.spline import Spline
 
-LONG_FRAMES, LONG_VIEWS = 12_000, 1000
-"""Frames or views with a pose from which on a path is long: shorter ones are adjusted as a whole, on a spline (decision
-15)."""
 KEYFRAME_PX = 4.0
 """Image motion from one keyframe to the next: 10 px triple the error, 2 px do not lower it (decision 15)."""
 LEAST_MOTION_PX, MOST_MOTION_PX = 2.0, 24.0

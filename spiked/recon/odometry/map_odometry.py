@@ -17,12 +17,11 @@ from spiked.recon.odometry.global_adjuster import GlobalAdjuster
 from spiked.recon.odometry.initialiser import Initialiser
 from spiked.recon.odometry.keyframe_adjuster import (
     LEAST_MOTION_PX,
-    LONG_FRAMES,
-    LONG_VIEWS,
     MOST_MOTION_PX,
     KeyframeAdjuster,
 )
 from spiked.recon.odometry.keyframe_pictures import KeyframePictures, PictureBuilder
+from spiked.recon.odometry.long_paths import LONG_FRAMES, LONG_VIEWS
 from spiked.recon.odometry.loop_closure import EVERY_PX, LIVE_EVERY_PX, LoopSearch
 from spiked.recon.odometry.path_adjuster import PathAdjuster
 from spiked.recon.odometry.pose_tracker import LOCAL_BA_EVERY, PoseTracker

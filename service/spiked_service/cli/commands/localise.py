@@ -10,7 +10,7 @@ from rich.progress import track
 
 from spiked.errors import ConfigurationError, RecordingError
 from spiked.recon import Localisation, Localiser, MapIndex
-from spiked.recon.report import machine, versions
+from spiked.recon.environment import machine, versions
 from spiked.recording import Recording
 from spiked.sensor import Sensor
 from spiked.whole_files import whole_folder
@@ -19,8 +19,9 @@ from spiked_service.cli import recording_flags as g
 from spiked_service.cli.console import messages, output, report_warning
 from spiked_service.cli.flag_groups import with_groups
 from spiked_service.cli.maps import read_map
+from spiked_service.results.localisation_figures import localisation_figures
 from spiked_service.results.map_folder import MAP_FILES, camera_in
-from spiked_service.results.map_reports import LOCALISATION, localisation_figures, recording_section
+from spiked_service.results.map_reports import LOCALISATION, recording_section
 from spiked_service.results.recording_feed import pieces
 
 NOT_RECOGNISED = 1

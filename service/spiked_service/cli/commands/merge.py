@@ -9,7 +9,7 @@ from rich.progress import Progress
 from spiked.errors import ConfigurationError
 from spiked.recon import Merged
 from spiked.recon import merge as merge_maps
-from spiked.recon.report import versions
+from spiked.recon.environment import versions
 from spiked_service.cli import outputs
 from spiked_service.cli.console import messages, output
 from spiked_service.cli.maps import read_map

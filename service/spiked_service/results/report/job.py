@@ -9,7 +9,7 @@ from typing import Any
 
 from spiked.errors import RecordingError
 from spiked.poses import PoseFile
-from spiked.recon.report import machine, versions
+from spiked.recon.environment import machine, versions
 from spiked.recording import Recording, open_recording, sidecar_path
 from spiked.sensor import Sensor
 from spiked.trajectory import Trajectory

@@ -9,8 +9,9 @@ from spiked.calibration import Calibration
 from spiked.errors import RecordingError
 from spiked.recon import Localiser, MapIndex
 from spiked.recording import Recording, open_recording, recorded_calibration
+from spiked_service.results.localisation_figures import localisation_figures
 from spiked_service.results.map_folder import camera_in
-from spiked_service.results.map_reports import LOCALISATION, localisation_figures
+from spiked_service.results.map_reports import LOCALISATION
 from spiked_service.results.pinned_map import PinnedMap
 from spiked_service.results.recording_feed import Piece, pieces
 from spiked_service.store.rows import FrameRange, Stage

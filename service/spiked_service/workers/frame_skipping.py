@@ -7,17 +7,23 @@ and the reconstruction runs again from the recording with all frames.
 import numpy as np
 from numpy.typing import NDArray
 
+from spiked.recon.view_tracking import BRIDGED_S
 from spiked.ring import End, Frames, Gap, RingReader
 
 LATE_FRAMES = 2000
 """Backlog, in frames, beyond which the tracker skips: fast motion is tracked at some hundred frames a second.
 Captures of fewer frames are tracked completely."""
-REACH_PX = (20.0, 60.0)
-"""Image motion between windows, pixels: feature tracks survive the first, and most survive the second."""
+REACH_PX = (20.0, 40.0)
+"""Image motion between windows, pixels: feature tracks survive the first, and most survive the second. With 60 px a
+view was lost several times a minute in turns (decision 64)."""
 _STRIDE_S = 0.05
 """Time over which the motion model predicts, about."""
 _LATE_S = 0.2
 """Lateness at which the second `REACH_PX` applies; in between, the reach is interpolated."""
+_BRIDGED_STRIDE_S = 0.95 * BRIDGED_S
+"""Longest time from the begin of a window to the end of the next where the path is interpolated between the two, ..."""
+_PATIENCE_S = 1.0
+"""... for a tracker up to this late; a later one takes larger strides before the ring, of 1.7 s, drops frames."""
 _STEP_S = 0.02
 """Time of a step of the map, about."""
 _STEP_REACH_PX, _PUNCTUAL_S = 4.0, 0.04
@@ -26,6 +32,8 @@ _SWEEP_REACH_PX = 15.0
 """Image motion behind the camera up to which a sweep for depth begins: it takes some of the cores."""
 LONGEST_UNMAPPED_S = 1.0
 """Time after which the map gets a step anyway."""
+WINDOWS_MEANT = 30
+"""Windows over which the time that one takes is averaged, about."""
 
 
 def may_map(late_frames: int, speed_px: float | None, rate_hz: float) -> bool:
@@ -45,17 +53,22 @@ def may_sweep(late_frames: int, speed_px: float | None) -> bool:
     return speed_px is not None and late_frames * speed_px < _SWEEP_REACH_PX
 
 
-def next_window(at: int, newest: int, count: int, speed_px: float | None, rate_hz: float) -> int:
+def next_window(at: int, newest: int, count: int, speed_px: float | None, rate_hz: float, window_s: float = 0.0) -> int:
     """First frame of the next window of `count` frames, at or after frame `at`.
 
-    The window ends at `newest` unless the motion from `at` exceeds the reach of the tracks. `speed_px` is the image
-    motion in pixels a frame, None if unknown.
+    The window ends at `newest` unless the motion from `at` exceeds the reach of the tracks, or the time that of the
+    path between them. `speed_px` is the image motion in pixels a frame, None if unknown. `window_s` is the time that
+    the tracker takes for a window: one that cannot keep up without gaps in the path does not try to.
     """
     latest = newest - count
     if speed_px:
         late_s = max(latest - at, 0) / rate_hz
+        stride_s = max(_STRIDE_S, late_s / 2)
+        bridged_s = max(_STRIDE_S, _BRIDGED_STRIDE_S - count / rate_hz)
+        if late_s < _PATIENCE_S and window_s < bridged_s:
+            stride_s = min(stride_s, bridged_s)
         reach_px = np.interp(late_s, (0, _LATE_S), REACH_PX)
-        latest = min(latest, int(at + min(reach_px / speed_px, max(_STRIDE_S, late_s / 2) * rate_hz)))
+        latest = min(latest, int(at + min(reach_px / speed_px, stride_s * rate_hz)))
     return max(at, latest)
 
 

@@ -30,6 +30,7 @@ from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.frame_skipping import (
     LATE_FRAMES,
     LONGEST_UNMAPPED_S,
+    WINDOWS_MEANT,
     LatestFrames,
     may_map,
     may_sweep,
@@ -266,14 +267,15 @@ def _track_latest(latest: LatestFrames, work: _Work, command: ReconstructionComm
     zero, stop = command.first_frame, command.stop_frame
     reconstructor = work.reconstructor
     rate_hz = reconstructor.sensor.frame_rate_hz
-    mapped_s = time.monotonic()
+    mapped_s, window_s = time.monotonic(), 0.0
     while not work.channel.leave.is_set() and (stop is None or latest.at < stop):
         count = reconstructor.latest_frames
-        first = next_window(latest.at, newest() + zero, count, reconstructor.speed_px, rate_hz)
+        first = next_window(latest.at, newest() + zero, count, reconstructor.speed_px, rate_hz, window_s)
         latest.track_latest(first, count)
         while (item := latest.take(_WAIT_S)) is None and not work.channel.leave.is_set():
             reconstructor.improve(_SPARE_S)
             mapped_s = time.monotonic()
+        taken_s = time.monotonic()
         match item:
             case End():
                 break
@@ -295,6 +297,7 @@ def _track_latest(latest: LatestFrames, work: _Work, command: ReconstructionComm
                 elif may_sweep(late, reconstructor.speed_px):
                     reconstructor.sweep_behind()
         work.reporter.progress(reconstructor.status())
+        window_s += (time.monotonic() - taken_s - window_s) / WINDOWS_MEANT
     return latest.skipped
 
 

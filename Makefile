@@ -22,6 +22,9 @@ WEB := $(shell find web -path web/node_modules -prune -o -type f -print)
 PAGE := service/spiked_service/page/index.html
 NPM_CI := web/node_modules/.package-lock.json
 
+# The service and its workers are many processes: without files of bytecode each would compile its modules again.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo check hooks test test-slow validation lint bench page api docs wheel wheels packages clean
 .DELETE_ON_ERROR:
 

@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from spiked.errors import SceneError
 from spiked.pose import quaternion
 from spiked.poses import PoseFile
 from spiked.recon import Merged, Reconstructor, State, Status, Tracked
+from spiked.recon.background import Background
 from spiked.scene import Scene
 from spiked.trajectory import Trajectory
 from spiked_service.base.malloc import return_freed
@@ -66,6 +67,10 @@ class ProgressReporter:
         versions = self._publisher.versions if resumed else []
         self._poses = versions[-1].poses if versions else 0
         self._pause_s = _PUBLISH_S
+        self._behind = command.ring is not None and not command.can_block
+        """Versions are written on another thread: a live tracker does not wait for the disk."""
+        self._publishing: Background[Published] | None = None
+        self._version = self._publisher.version
         self._least_poses = command.least_poses
         self._continues = resumed or command.least_poses > 0
         """Versions of earlier workers belong to this run of the reconstruction."""
@@ -105,13 +110,18 @@ class ProgressReporter:
             if status.splats:  # the map and the whole trajectory as tracked
                 self._publish(status)
                 self._hold()
-        if status.version != self._seen and now_s - self._published_s > self._pause_s:
-            self._publish(status)
-            self._pause_s = max(_PUBLISH_S, (time.monotonic() - now_s) / _PUBLISH_SHARE)
+        self._take_published()
+        due = status.version != self._seen and now_s - self._published_s > self._pause_s
+        if due and self._publishing is None:
+            self._publish(status, behind=self._behind)
         if now_s - self._sent_s > _STATUS_S:
             self._timeline.closed(self._reconstructor.closures())
             self._note_progress(status, _PROGRESS_S)
             self._send_status(status)
+
+    def close(self) -> None:
+        """Wait for the version that is being written, and tell of it. Raises SceneError if it cannot be."""
+        self._take_published(wait=True)
 
     def _note_progress(self, status: Status, least_s: float = 0.0) -> None:
         work_s = self._reconstructor.work_s
@@ -139,6 +149,7 @@ class ProgressReporter:
         self._hold()
 
     def _hold(self) -> None:
+        self._take_published(wait=True)
         self._publisher.protect_newest()
         self._candidates.add(self._publisher.version)
 
@@ -228,16 +239,18 @@ class ProgressReporter:
             latency_s=None if latency_frames is None else latency_frames / rate,
         )
 
-    def _publish(self, status: Status, tolerance: float = TOLERANCE, every_frame: bool = False) -> None:
+    def _publish(
+        self, status: Status, tolerance: float = TOLERANCE, every_frame: bool = False, behind: bool = False
+    ) -> None:
         """Publish a version if there is a path; while a long one is tracked with the poses of its views, or of
-        `every_frame`."""
+        `every_frame`. `behind`: on another thread."""
         poses = self._reconstructor.posed_frames
         self._published_s, self._seen = time.monotonic(), status.version
         if not poses or poses < self._least_poses:
             return
         trajectory = self._reconstructor.trajectory() if every_frame else self._reconstructor.trajectory_so_far()
         scene, white = self._reconstructor.scene(), self._reconstructor.white
-        self._publish_scene(scene, trajectory, white, _psnr_db(status.loss), tolerance, poses)
+        self._publish_scene(scene, trajectory, white, _psnr_db(status.loss), tolerance, poses, behind=behind)
 
     def _publish_scene(
         self,
@@ -248,21 +261,37 @@ class ProgressReporter:
         tolerance: float,
         poses: int | None = None,
         others: Sequence[RecordedPath] = (),
+        behind: bool = False,
     ) -> None:
+        self._take_published(wait=True)
         optics = self._reconstructor.camera.intrinsics
         rate_hz = self._reconstructor.sensor.frame_rate_hz
         states = self._timeline.states_at(frames_at(trajectory.times_s, rate_hz))
-        try:
+
+        def publish(_: Callable[[], bool]) -> Published:
+            begun_s = time.monotonic()
             published = self._publisher.publish(
                 scene, trajectory, white, psnr_db, optics, states, tolerance, poses, others
             )
+            self._pause_s = max(_PUBLISH_S, (time.monotonic() - begun_s) / _PUBLISH_SHARE)
+            return_freed()
+            return published
+
+        self._publishing = Background(publish)
+        self._take_published(wait=not behind)
+
+    def _take_published(self, wait: bool = False) -> None:
+        """Tell of the version that is being written once it is there, or `wait` for it."""
+        if self._publishing is None or not (wait or self._publishing.done):
+            return
+        publishing, self._publishing = self._publishing, None
+        try:
+            self._send_version(publishing.result())
         except OSError as error:
             raise _write_error(error) from error
-        self._send_version(published)
-        return_freed()
 
     def _send_version(self, published: Published, again_of: int | None = None) -> None:
-        self._poses = published.poses
+        self._poses, self._version = published.poses, published.version
         self._channel.send(VersionPublished(published=published, kept=self._publisher.kept, again_of=again_of))
 
     def _send_status(self, status: Status, shown: Published | None = None) -> None:
@@ -279,7 +308,7 @@ class ProgressReporter:
                 loss=status.loss if shown is None or psnr_db is None else 10 ** (-psnr_db / 10),
                 progress=status.progress,
                 poses=self._poses,
-                version=self._publisher.version,
+                version=self._version,
                 psnr_db=psnr_db,
                 eta_s=self._eta_s(status),
                 warnings=tuple(self._reconstructor.warnings),

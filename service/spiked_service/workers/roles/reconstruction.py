@@ -159,6 +159,7 @@ class _Work:
 
     def end(self) -> None:
         """The work is complete, unless the worker is to exit: its checkpoint is not needed any more."""
+        self.reporter.close()
         if self.checkpoints is not None and not self.channel.leave.is_set():
             self.checkpoints.remove()
 

@@ -18,10 +18,10 @@ import typer
 from spiked_driver import framing, gap_attribution, usb_budget, usb_connection
 from spiked_service.api import idempotency, listener, streams, zmq
 from spiked_service.api.routes import events as event_routes
+from spiked_service.base import malloc
 from spiked_service.captures import live_capture
 from spiked_service.cli.main import app
 from spiked_service.events import bus
-from spiked_service.operations import malloc
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
 from spiked_service.settings.settings import NOT_SETTINGS, Settings
 from spiked_service.workers import backoff, frame_skipping
@@ -376,7 +376,7 @@ CLAIMS: tuple[Claim, ...] = (
     ("architecture.md", "that ran for {:.0f} s", lambda: backoff.RESET_S),
     ("operations.md", "s or {} MiB", lambda: writer.MOST_BACKLOG_BYTES // MIB),
     ("operations.md", "is {:,} frames behind it", lambda: frame_skipping.LATE_FRAMES),
-    ("operations.md", "({:.0f} to {:.0f} pixels)", lambda: frame_skipping.REACH_PX),
+    ("operations.md", "({:.0f} to {:.0f} pixels)", lambda: frame_skipping.REACH_PX[::2]),
     ("operations.md", "no more than {:.0f} ms apart", lambda: 1000 * view_tracking.BRIDGED_S),
     ("service-figures.md", "the {:,} events that are remembered", lambda: bus.HISTORY),
     ("service-figures.md", "All threads share {} heaps", lambda: {2: "two"}[malloc.ARENAS]),

@@ -143,6 +143,11 @@ class RingReader:
         return RingReader(self._segment, policy, consumer, start_frame)
 
     @property
+    def backlog_frames(self) -> int:
+        """Frames that it may lag behind the newest before others are skipped, or of a lossless one lent."""
+        return self._lease_slots * self.geometry.block_frames
+
+    @property
     def geometry(self) -> RingLayout:
         """Sensor, number of slots, and frames per slot."""
         return self._segment.geometry

@@ -15,6 +15,7 @@ from spiked_service.base.malloc import return_freed
 
 resident = lambda: psutil.Process().memory_info().rss
 del (first := [np.ones({BLOCK_BYTES}, np.uint8)])[:]  # from now on glibc has blocks of this size in its heap
+return_freed()
 begun = resident()
 large, small = [], []
 for _ in range({BLOCKS}):
@@ -33,4 +34,4 @@ def test_freed_blocks_between_ones_in_use_are_returned() -> None:
     before, after = map(int, run.stdout.split())
     if before < BLOCKS * BLOCK_BYTES / 2:
         pytest.skip(f"this malloc kept only {before} bytes by itself")
-    assert BLOCKS * SMALL_BYTES <= after < BLOCKS * SMALL_BYTES + 4 * BLOCK_BYTES
+    assert after < BLOCKS * SMALL_BYTES + 4 * BLOCK_BYTES

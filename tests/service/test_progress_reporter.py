@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -9,6 +10,7 @@ import pytest
 from pydantic import BaseModel
 from spiked_service.results.versions import Publisher
 from spiked_service.settings.reconstruction_options import ReconstructionOptions
+from spiked_service.workers import progress_reporter
 from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.messages import ReconstructionCommand, ReconstructionStatus, VersionPublished
 from spiked_service.workers.progress_reporter import ProgressReporter
@@ -79,17 +81,19 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 
 
 def test_a_live_tracker_does_not_wait_for_a_slow_disk(
-    tracked: Reconstructor, tmp_path: Path, disk: threading.Event
+    tracked: Reconstructor, tmp_path: Path, disk: threading.Event, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(progress_reporter, "_PUBLISH_S", 0.0)
     told = Told()
     reporter = reporter_of(tracked, tmp_path, told)
-    for _ in range(3):  # returns each time, and begins no second version
-        reporter.progress(tracked.status())
+    for version in range(1, 4):  # returns each time, and begins no second one
+        reporter.progress(replace(tracked.status(), version=version))
     assert told.versions == [] and not list(tmp_path.glob("scene-*"))
     statuses = [event for event in told.events if isinstance(event, ReconstructionStatus)]
     assert statuses and {status.version for status in statuses} == {0}
     disk.set()
-    until(lambda: (reporter.progress(tracked.status()), told.versions == [1])[1], "the version is told")
+    status = replace(tracked.status(), version=1)  # the one that was written: none is due
+    until(lambda: (reporter.progress(status), told.versions == [1])[1], "the version is told")
     assert [file.name for file in tmp_path.glob("scene-*.ply")] == ["scene-000001.ply"]
 
 
@@ -113,8 +117,8 @@ def test_a_version_that_finds_no_room_is_an_error_of_the_reconstruction(
 
     monkeypatch.setattr(Publisher, "publish", full)
     reporter = reporter_of(tracked, tmp_path, Told())
-    reporter.progress(tracked.status())
     with pytest.raises(SceneError, match="No space left on device; free disk space"):
+        reporter.progress(tracked.status())
         end(reporter)
 
 

@@ -15,11 +15,11 @@ CONNECTIONS = 1000
 """Further concurrent connections are answered with 503."""
 _USER_TIMEOUT_MS = 60_000
 """The kernel closes connections whose peer acknowledges nothing for this long."""
-KEPT_ALIVE_S = 75
+KEPT_ALIVE_S = 120
 """An idle connection is closed after this long.
 
-Longer than clients and proxies use one again after (httpx 5 s, aiohttp 15 s, nginx and AWS's load balancers 60 s): a
-request that crosses the closing of its connection is lost without an answer.
+Longer than clients and proxies use one again after (httpx 5 s, aiohttp 15 s, nginx and AWS's load balancers 60 s, Go
+90 s): a request that crosses the closing of its connection is lost without an answer.
 """
 MESSAGE_BYTES = 65_536
 """Largest WebSocket message from a client."""

@@ -13,17 +13,20 @@ from spiked.ring import End, Frames, Gap, RingReader
 LATE_FRAMES = 2000
 """Backlog, in frames, beyond which the tracker skips: fast motion is tracked at some hundred frames a second.
 Captures of fewer frames are tracked completely."""
-REACH_PX = (20.0, 40.0)
-"""Image motion between windows, pixels: feature tracks survive the first, and most survive the second. With 60 px a
-view was lost several times a minute in turns (decision 64)."""
+REACH_PX = (20.0, 40.0, 60.0)
+"""Image motion between windows, pixels, of a tracker late by `_LATE_S`: feature tracks survive the first, and most
+survive the second; with the third everywhere a view was lost several times a minute in turns (decision 64)."""
 _STRIDE_S = 0.05
 """Time over which the motion model predicts, about."""
-_LATE_S = 0.2
-"""Lateness at which the second `REACH_PX` applies; in between, the reach is interpolated."""
+_LATE_S = (0.0, 0.2, 1.0)
+"""Lateness at which each `REACH_PX` applies; in between, the reach is interpolated."""
 _BRIDGED_STRIDE_S = 0.95 * BRIDGED_S
-"""Longest time from the begin of a window to the end of the next where the path is interpolated between the two, ..."""
-_PATIENCE_S = 1.0
-"""... for a tracker up to this late; a later one takes larger strides before the ring, of 1.7 s, drops frames."""
+"""Longest time from the begin of a window to the end of the next where the path is interpolated between the two."""
+_PATIENCE = 0.6
+"""Share of the ring's backlog up to which a late tracker skips no more than that: larger strides catch up before the
+ring drops frames."""
+_WINDOWS_MEANT = 30
+"""Windows over which the time that one takes is averaged, about."""
 _STEP_S = 0.02
 """Time of a step of the map, about."""
 _STEP_REACH_PX, _PUNCTUAL_S = 4.0, 0.04
@@ -32,8 +35,6 @@ _SWEEP_REACH_PX = 15.0
 """Image motion behind the camera up to which a sweep for depth begins: it takes some of the cores."""
 LONGEST_UNMAPPED_S = 1.0
 """Time after which the map gets a step anyway."""
-WINDOWS_MEANT = 30
-"""Windows over which the time that one takes is averaged, about."""
 
 
 def may_map(late_frames: int, speed_px: float | None, rate_hz: float) -> bool:
@@ -53,23 +54,36 @@ def may_sweep(late_frames: int, speed_px: float | None) -> bool:
     return speed_px is not None and late_frames * speed_px < _SWEEP_REACH_PX
 
 
-def next_window(at: int, newest: int, count: int, speed_px: float | None, rate_hz: float, window_s: float = 0.0) -> int:
-    """First frame of the next window of `count` frames, at or after frame `at`.
+class WindowChooser:
+    """Chooses the windows of a tracker that cannot keep up with the camera."""
 
-    The window ends at `newest` unless the motion from `at` exceeds the reach of the tracks, or the time that of the
-    path between them. `speed_px` is the image motion in pixels a frame, None if unknown. `window_s` is the time that
-    the tracker takes for a window: one that cannot keep up without gaps in the path does not try to.
-    """
-    latest = newest - count
-    if speed_px:
-        late_s = max(latest - at, 0) / rate_hz
-        stride_s = max(_STRIDE_S, late_s / 2)
-        bridged_s = max(_STRIDE_S, _BRIDGED_STRIDE_S - count / rate_hz)
-        if late_s < _PATIENCE_S and window_s < bridged_s:
-            stride_s = min(stride_s, bridged_s)
-        reach_px = np.interp(late_s, (0, _LATE_S), REACH_PX)
-        latest = min(latest, int(at + min(reach_px / speed_px, stride_s * rate_hz)))
-    return max(at, latest)
+    def __init__(self, rate_hz: float, backlog_s: float) -> None:
+        """`backlog_s` is how late a reader may be before the ring drops frames."""
+        self._rate_hz = rate_hz
+        self._patience_s = _PATIENCE * backlog_s
+        self._window_s = 0.0
+
+    def took(self, seconds: float) -> None:
+        """A window was tracked in this time."""
+        self._window_s += (seconds - self._window_s) / _WINDOWS_MEANT
+
+    def next(self, at: int, newest: int, count: int, speed_px: float | None) -> int:
+        """First frame of the next window of `count` frames, at or after frame `at`.
+
+        The window ends at `newest` unless the motion from `at` exceeds the reach of the tracks, or the time what is
+        bridged. A tracker that cannot keep up without gaps in the path does not try to. `speed_px` is the image
+        motion in pixels a frame, None if unknown.
+        """
+        latest = newest - count
+        if speed_px:
+            late_s = max(latest - at, 0) / self._rate_hz
+            stride_s = max(_STRIDE_S, late_s / 2)
+            bridged_s = _BRIDGED_STRIDE_S - count / self._rate_hz
+            if late_s < self._patience_s and self._window_s < _BRIDGED_STRIDE_S and bridged_s > 0:
+                stride_s = min(stride_s, bridged_s)
+            reach_px = np.interp(late_s, _LATE_S, REACH_PX)
+            latest = min(latest, int(at + min(reach_px / speed_px, stride_s * self._rate_hz)))
+        return max(at, latest)
 
 
 class LatestFrames:
@@ -85,6 +99,11 @@ class LatestFrames:
         """Index of the next frame of the ring."""
         self.skipped = 0
         """Frames that were skipped."""
+
+    @property
+    def backlog_frames(self) -> int:
+        """How far behind the newest frame may be read before the ring drops frames."""
+        return self._reader.backlog_frames
 
     def track_latest(self, first: int, count: int) -> None:
         """Select the next window. Frames collected for an earlier one and not taken count as skipped."""

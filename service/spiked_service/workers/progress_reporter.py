@@ -269,11 +269,10 @@ class ProgressReporter:
         states = self._timeline.states_at(frames_at(trajectory.times_s, rate_hz))
 
         def publish(_: Callable[[], bool]) -> Published:
-            begun_s = time.monotonic()
             published = self._publisher.publish(
                 scene, trajectory, white, psnr_db, optics, states, tolerance, poses, others
             )
-            self._pause_s = max(_PUBLISH_S, (time.monotonic() - begun_s) / _PUBLISH_SHARE)
+            self._pause_s = max(_PUBLISH_S, (time.monotonic() - self._published_s) / _PUBLISH_SHARE)
             return_freed()
             return published
 

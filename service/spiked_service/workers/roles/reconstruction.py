@@ -5,6 +5,7 @@ import math
 import os
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,11 +31,10 @@ from spiked_service.workers.channel import WorkerChannel
 from spiked_service.workers.frame_skipping import (
     LATE_FRAMES,
     LONGEST_UNMAPPED_S,
-    WINDOWS_MEANT,
     LatestFrames,
+    WindowChooser,
     may_map,
     may_sweep,
-    next_window,
 )
 from spiked_service.workers.messages import ReconstructionCommand
 from spiked_service.workers.progress_reporter import ProgressReporter
@@ -62,16 +62,23 @@ def run_reconstruction(command: ReconstructionCommand, channel: WorkerChannel) -
     Raises ConfigurationError, RecordingError or RingError for errors that the user can correct, SceneError if a version
     cannot be written.
     """
+    with ExitStack() as ended:  # what is being written is finished and told, however the work ends
+        _run(command, channel, ended)
+
+
+def _run(command: ReconstructionCommand, channel: WorkerChannel, ended: ExitStack) -> None:
     if command.ring is not None:
         os.nice(_LIVE_NICE)
         # Readers of a source that can block are never overrun. Of others, the tracker reads as far back as possible.
         policy = Policy.LOSSLESS if command.can_block else Policy.PRIORITY
         with RingReader.attach(command.ring, policy, "reconstruction", command.first_frame) as reader:
             work = _begin(command, reader.geometry.sensor, channel)
+            ended.callback(work.reporter.close)
             skipped = _follow(reader, work, command)
             pathless = work.reconstructor.status().state is State.BOOT
             if skipped and not command.recorded and pathless and not channel.stop.is_set():
                 work = _track_ring_again(reader, work, command)
+                ended.callback(work.reporter.close)
         if skipped and command.recorded:
             work.adjust_path()
             work.reporter.frames_skipped(skipped)
@@ -159,7 +166,6 @@ class _Work:
 
     def end(self) -> None:
         """The work is complete, unless the worker is to exit: its checkpoint is not needed any more."""
-        self.reporter.close()
         if self.checkpoints is not None and not self.channel.leave.is_set():
             self.checkpoints.remove()
 
@@ -268,15 +274,14 @@ def _track_latest(latest: LatestFrames, work: _Work, command: ReconstructionComm
     zero, stop = command.first_frame, command.stop_frame
     reconstructor = work.reconstructor
     rate_hz = reconstructor.sensor.frame_rate_hz
-    mapped_s, window_s = time.monotonic(), 0.0
+    windows = WindowChooser(rate_hz, latest.backlog_frames / rate_hz)
+    mapped_s = time.monotonic()
     while not work.channel.leave.is_set() and (stop is None or latest.at < stop):
         count = reconstructor.latest_frames
-        first = next_window(latest.at, newest() + zero, count, reconstructor.speed_px, rate_hz, window_s)
-        latest.track_latest(first, count)
+        latest.track_latest(windows.next(latest.at, newest() + zero, count, reconstructor.speed_px), count)
         while (item := latest.take(_WAIT_S)) is None and not work.channel.leave.is_set():
             reconstructor.improve(_SPARE_S)
             mapped_s = time.monotonic()
-        taken_s = time.monotonic()
         match item:
             case End():
                 break
@@ -285,6 +290,7 @@ def _track_latest(latest: LatestFrames, work: _Work, command: ReconstructionComm
                 if end > begin:
                     work.lose(begin - zero, end - begin, item.cause)
             case (begin, frames):
+                taken_s = time.monotonic()
                 frames = frames[max(0, zero - begin) :]
                 begin = max(begin, zero)
                 end = _within(begin, begin + len(frames), zero, stop)[1]
@@ -297,8 +303,8 @@ def _track_latest(latest: LatestFrames, work: _Work, command: ReconstructionComm
                     mapped_s = time.monotonic()
                 elif may_sweep(late, reconstructor.speed_px):
                     reconstructor.sweep_behind()
+                windows.took(time.monotonic() - taken_s)
         work.reporter.progress(reconstructor.status())
-        window_s += (time.monotonic() - taken_s - window_s) / WINDOWS_MEANT
     return latest.skipped
 
 

@@ -15,11 +15,7 @@ from spiked.recon.frontend.track_timestamps import TrackTimestamps
 from spiked.recon.odometry.assessment import assess
 from spiked.recon.odometry.global_adjuster import GlobalAdjuster
 from spiked.recon.odometry.initialiser import Initialiser
-from spiked.recon.odometry.keyframe_adjuster import (
-    LEAST_MOTION_PX,
-    MOST_MOTION_PX,
-    KeyframeAdjuster,
-)
+from spiked.recon.odometry.keyframe_adjuster import LEAST_MOTION_PX, MOST_MOTION_PX, KeyframeAdjuster
 from spiked.recon.odometry.keyframe_pictures import KeyframePictures, PictureBuilder
 from spiked.recon.odometry.long_paths import LONG_FRAMES, LONG_VIEWS
 from spiked.recon.odometry.loop_closure import EVERY_PX, LIVE_EVERY_PX, LoopSearch

@@ -30,6 +30,7 @@ from spiked.recon import view_tracking
 from spiked.recon.frontend import feature_tracks, windowing
 from spiked.recon.mapping import mapper, pyramid, render_requests
 from spiked.recon.mapping.densification import DensifyStrategy
+from spiked.recon.mapping.rates import RATES
 from spiked.recon.mapping.schedule import Schedule
 from spiked.recon.mapping.seeding import Seeding
 from spiked.recon.odometry import assessment, initialisation, self_calibration, spline_fitting, stationarity
@@ -355,7 +356,7 @@ CLAIMS: tuple[Claim, ...] = (
     ("decisions/0002-view-length-follows-motion.md", "above {:.1f} px, but", lambda: 2 * windowing.WINDOW_MOTION_PX[1]),
     ("decisions/0002-view-length-follows-motion.md", "Above {} px a frame views", lambda: windowing.FAST_PX[1]),
     ("decisions/0002-view-length-follows-motion.md", "above {} px a frame 4", lambda: windowing.FASTEST_PX[1]),
-    ("decisions/0003-learning-rates.md", "means {:.0e}, quaternions", lambda: MapOptions().rate_means),
+    ("decisions/0065-steps-along-the-axes.md", "{} of these for means", lambda: RATES.means),
     ("decisions/0003-learning-rates.md", "The defaults today are {:,} steps and {} splats", defaults),
     ("decisions/0005-motion-aware-rendering.md", "cap every {} steps", lambda: DensifyStrategy.every),
     ("decisions/0005-motion-aware-rendering.md", "a pixel and {:,} in all", lambda: MapOptions().most_splats),
@@ -427,7 +428,7 @@ def test_options_say_what_the_motion_makes_of_them() -> None:
     windows = f"({min(windowing.WINDOWS)} to {max(windowing.WINDOWS)})"
     assert windows in (ReconstructionOptions.model_fields["window_frames"].description or "")
     source = inspect.getsource(Options)
-    assert windows in source and f"up to {Schedule.fast_steps} times as many" in source
+    assert windows in source and Schedule.fast_steps == 3 and "up to three times as many" in source
     assert f"more than {Schedule.small_pixels:,} pixels" in source
 
 

@@ -22,9 +22,9 @@ class Options:
 
     window_frames: int | None = None
     """Frames of a view; None follows the motion (4 to 64)."""
-    steps: int = 2000
+    steps: int = 1600
     """Gradient steps of the final refinement; images of more than 130,000 pixels get fewer, as each costs more,
-    and fast motion gets up to 2.5 times as many."""
+    and fast motion gets up to three times as many."""
     seed: int = 0
     """Seed of all random choices: the same input, options and seed give the same result."""
     threads: int | None = None

@@ -20,7 +20,7 @@ from spiked.render.descent import Descent, DeviceDescent
 from spiked.render.gpu import GpuRasteriser
 from spiked.render.loss import StructuralSimilarity
 from spiked.render.optimiser import Adam
-from spiked.render.splats import Floats, SizeLimits
+from spiked.render.splats import Floats, MeanAxes, SizeLimits
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Sensor
 
@@ -145,7 +145,7 @@ def steps_with_adam(
                 rasteriser.forward_moving(fit.model, *poses, windows)
             else:
                 rasteriser.forward(fit.model, *poses)
-            fit.step(rasteriser, slope, (1e-9,) * 5, SizeLimits())
+            fit.step(rasteriser, slope, (1e-9,) * 5, SizeLimits(), MeanAxes())
 
         return repeated(step, repetitions)
 

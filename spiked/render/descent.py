@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from spiked.render.choice import AnyRasteriser, chosen
 from spiked.render.gpu import GpuRasteriser, device_errors
 from spiked.render.optimiser import Adam
-from spiked.render.splats import AnySplats, DeviceScene, Floats, SizeLimits
+from spiked.render.splats import AnySplats, DeviceScene, Floats, MeanAxes, SizeLimits
 from spiked.scene import Scene
 
 
@@ -64,15 +64,26 @@ class Descent:
         self._scene = self.scene.select(rows)
         self.adam.keep(rows)
 
-    def step(self, rasteriser: AnyRasteriser, slope: Floats, rates: tuple[float, ...], limits: SizeLimits) -> None:
+    def step(
+        self,
+        rasteriser: AnyRasteriser,
+        slope: Floats,
+        rates: tuple[float, ...],
+        limits: SizeLimits,
+        axes: MeanAxes,
+    ) -> None:
         """Change the splats that the last image of `rasteriser`, a render of `model`, shows: slope is the gradient by
-        its values, and rates are those of the five arrays.
+        its values, and rates are those of the five arrays, the first in units of the `axes`.
 
         Colours below 0 become 0, as viewers show them as black, and splats stay within the `limits`.
         """
         gradients = rasteriser.backward(slope)
-        scene = self._scene
-        self.adam.step(scene.arrays(), gradients.arrays(), rates, gradients.radius_px > 0)
+        scene, steps = self._scene, np.zeros_like(self._scene.means)
+        by_axes = self.adam.slopes_along_axes(scene, axes, gradients.means)
+        _, *others = scene.arrays()
+        _, *slopes = gradients.arrays()
+        self.adam.step((steps, *others), (by_axes, *slopes), rates, gradients.radius_px > 0)
+        self.adam.move_along_axes(scene, axes, steps)
         np.maximum(scene.colours, 0, out=scene.colours)
         np.minimum(scene.log_scales, limits.most(scene.means), out=scene.log_scales)
 
@@ -140,7 +151,14 @@ class DeviceDescent(Descent):
             self._device.native.select(np.flatnonzero(rows).astype(np.uint32))
         self._behind = True
 
-    def step(self, rasteriser: AnyRasteriser, slope: Floats, rates: tuple[float, ...], limits: SizeLimits) -> None:
+    def step(
+        self,
+        rasteriser: AnyRasteriser,
+        slope: Floats,
+        rates: tuple[float, ...],
+        limits: SizeLimits,
+        axes: MeanAxes,
+    ) -> None:
         """See `Descent.step`."""
         assert isinstance(rasteriser, GpuRasteriser)
         if self._device is None:
@@ -149,7 +167,7 @@ class DeviceDescent(Descent):
                 device.native.set(*self._scene.arrays(), *self.adam.packed())
             self._device = device
         beta1, beta2, _ = self._settings
-        rasteriser.descend(slope, self._device, rates, beta1, beta2, self.adam.epsilon, limits)
+        rasteriser.descend(slope, self._device, rates, axes, beta1, beta2, self.adam.epsilon, limits)
         self._behind = True
 
     def _fetch(self) -> None:

@@ -16,7 +16,7 @@ import spiked.native._gpu as _gpu
 from spiked.errors import ConfigurationError
 from spiked.render.camera import Camera
 from spiked.render.cpu import Rasteriser
-from spiked.render.splats import AnySplats, DeviceScene, Floats, Gradients, RenderedImage, SizeLimits
+from spiked.render.splats import AnySplats, DeviceScene, Floats, Gradients, MeanAxes, RenderedImage, SizeLimits
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics
 
@@ -92,6 +92,7 @@ class GpuRasteriser(Rasteriser):
         d_values: Floats,
         scene: DeviceScene,
         rates: tuple[float, ...],
+        axes: MeanAxes,
         beta1: float,
         beta2: float,
         epsilon: float,
@@ -102,8 +103,8 @@ class GpuRasteriser(Rasteriser):
         self._check_slope(d_values)
         with device_errors():
             self._native.descend(
-                np.ascontiguousarray(d_values, np.float32), scene.native, np.array(rates, np.float32), beta1, beta2,
-                epsilon, limits.log_scale, limits.widest, np.array(limits.centre, np.float32),
+                np.ascontiguousarray(d_values, np.float32), scene.native, np.array(rates, np.float32), axes.blur,
+                axes.own, beta1, beta2, epsilon, limits.log_scale, limits.widest, np.array(limits.centre, np.float32),
             )  # fmt: skip
 
     def _splats(self, splats: AnySplats) -> tuple[tuple[Any, ...], int, int]:

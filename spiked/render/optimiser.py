@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from spiked.errors import ConfigurationError
 from spiked.native._raster import AdamSteps, adam_corrections
 from spiked.render.cpu import usable_cores
-from spiked.render.splats import Floats
+from spiked.render.splats import Floats, MeanAxes
+from spiked.scene import Scene
 
 
 class Adam:
@@ -120,6 +121,16 @@ class Adam:
                 *self._betas,
                 self.epsilon,
             )
+
+    def slopes_along_axes(self, scene: Scene, axes: MeanAxes, by_means: Floats) -> Floats:
+        """Gradients by steps of a scene's means along the axes, from those by the means, [N, 3]."""
+        by_axes = np.empty_like(by_means)
+        self._steps.slopes_along_axes(scene.quats, scene.log_scales, axes.blur, axes.own, by_means, by_axes)
+        return by_axes
+
+    def move_along_axes(self, scene: Scene, axes: MeanAxes, steps: Floats) -> None:
+        """Change a scene's means by such steps, [N, 3]."""
+        self._steps.move_along_axes(scene.quats, scene.log_scales, axes.blur, axes.own, steps, scene.means)
 
 
 def _rows(array: Floats) -> Floats:

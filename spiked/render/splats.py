@@ -48,6 +48,18 @@ class SizeLimits:
 
 
 @dataclass(frozen=True)
+class MeanAxes:
+    """Along what means move in a step of gradient descent; their learning rate is in units of these axes (decision
+    65)."""
+
+    blur: float = 1.0
+    """A length, in the scene's unit."""
+    own: bool = False
+    """Whether they are the axes of each splat, as long as its standard deviations blurred by `blur`: the root of the
+    sum of their squares. Otherwise those of the world, as long as that."""
+
+
+@dataclass(frozen=True)
 class RenderedImage:
     """A rendered image of H rows and W columns; with sub-poses, sums or means over them."""
 

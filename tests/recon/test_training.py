@@ -37,10 +37,10 @@ def test_a_schedule_ends_at_full_size_with_rates_of_zero() -> None:
 
 def test_large_images_get_fewer_steps_and_fast_motion_more() -> None:
     schedule = Schedule()
-    assert schedule.steps(2000, schedule.small_pixels, 0.0) == 2000
-    assert schedule.steps(2000, 4 * schedule.small_pixels, 0.0) == round(2000 / 4**0.4)
-    assert schedule.steps(2000, schedule.small_pixels, 1.0) == 5000
-    assert schedule.steps(2000, schedule.small_pixels // 2, 0.5) == 3500
+    assert schedule.steps(1600, schedule.small_pixels, 0.0) == 1600
+    assert schedule.steps(1600, 4 * schedule.small_pixels, 0.0) == round(1600 / 4**0.4)
+    assert schedule.steps(1600, schedule.small_pixels, 1.0) == 4800
+    assert schedule.steps(1600, schedule.small_pixels // 2, 0.5) == 3200
 
 
 def scene(opacity_logits: list[float]) -> Scene:

@@ -5,7 +5,10 @@ import pytest
 import torch
 
 from spiked.errors import ConfigurationError
+from spiked.pose import rotation_of
 from spiked.render.optimiser import Adam
+from spiked.render.splats import MeanAxes
+from spiked.scene import Scene
 
 SHAPES = ((203, 3), (203, 4), (203,), (203, 1))
 
@@ -94,3 +97,22 @@ def test_the_number_of_threads_changes_no_bit() -> None:
     for one, three, before in zip(*moved, start, strict=True):
         np.testing.assert_array_equal(one, three)
         assert (one != before).any(axis=tuple(range(1, one.ndim))).tolist() == seen.tolist()
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_means_move_along_axes(own: bool) -> None:
+    rng = np.random.default_rng(3)
+    quats = rng.normal(size=(203, 4)).astype(np.float32)
+    log_scales, means = rng.normal(-3, 1, (203, 3)).astype(np.float32), rng.normal(size=(203, 3)).astype(np.float32)
+    slopes, steps = (rng.normal(size=(203, 3)).astype(np.float32) for _ in range(2))
+    scene = Scene(means.copy(), quats, log_scales, np.zeros(203, np.float32), np.zeros((203, 1), np.float32))
+    if own:
+        lengths = np.sqrt(np.exp(2 * log_scales) + 0.05**2)
+        axes = np.stack([rotation_of(quat) for quat in quats.astype(float)]) * lengths[:, None]
+    else:
+        axes = np.tile(0.05 * np.eye(3), (203, 1, 1))
+    adam = Adam(arrays(0))
+    by_axes = adam.slopes_along_axes(scene, MeanAxes(0.05, own), slopes)
+    np.testing.assert_allclose(by_axes, np.einsum("nij,ni->nj", axes, slopes), atol=1e-6)
+    adam.move_along_axes(scene, MeanAxes(0.05, own), steps)
+    np.testing.assert_allclose(scene.means - means, np.einsum("nij,nj->ni", axes, steps), atol=1e-6)

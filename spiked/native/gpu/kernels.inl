@@ -626,9 +626,13 @@ struct Descend {
                 const double bias2 = 1 - pow(static_cast<double>(rates.beta2), static_cast<double>(steps));
                 const float correction = static_cast<float>(::sqrt(bias2) / bias1);
                 float *m = first + n * (11 + colours), *v = second + n * (11 + colours);
-                move(means, gradients.means, n, 3, rates.rates[0] * correction, m, v);
+                float by_axes[3], along[3] = {};
+                const SplatAxes splat{quats + 4 * n, log_scales + 3 * n, rates.blur, rates.own_axes};
+                slopes_along_axes(splat, 0, 1, gradients.means + 3 * n, by_axes);
+                move(along, by_axes, 0, 3, rates.rates[0] * correction, m, v);
                 move(quats, gradients.quats, n, 4, rates.rates[1] * correction, m, v);
                 move(log_scales, gradients.log_scales, n, 3, rates.rates[2] * correction, m, v);
+                move_along_axes(splat, 0, 1, along, means + 3 * n);
                 move(opacity_logits, gradients.opacity_logits, n, 1, rates.rates[3] * correction, m, v);
                 move(colour, gradients.colour, n, colours, rates.rates[4] * correction, m, v);
             }

@@ -33,6 +33,8 @@ class GpuScene {
 // A step of Adam on all splats that the last image showed.
 struct DescentRates {
     float rates[5];  // of the five arrays
+    float blur;      // see SplatAxes
+    bool own_axes;
     float beta1, beta2, epsilon;
     float most_log_scale;  // log scales stay below, and colours at or above 0
     float widest;          // and so do standard deviations over the distance from the camera at `centre`

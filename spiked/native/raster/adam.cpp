@@ -39,7 +39,6 @@ class AdamSteps {
 
     void step(Array<float, 2> parameter, Array<const float, 2> gradient, Array<float, 2> first, Array<float, 2> second,
               Array<const float, 1> correction, float rate, double beta1, double beta2, float epsilon) {
-        constexpr size_t kRows = 8192;  // of a task
         const size_t rows = parameter.shape(0), columns = parameter.shape(1);
         auto fits = [&](const auto& array) { return array.shape(0) == rows && array.shape(1) == columns; };
         expect(fits(gradient) && fits(first) && fits(second) && correction.shape(0) == rows, "arrays disagree");
@@ -47,15 +46,46 @@ class AdamSteps {
         const AdamRates rates{rate, static_cast<float>(1 - beta1), static_cast<float>(1 - beta2), epsilon};
         nb::gil_scoped_release release;
         const RasterKernels& kernels = choose_kernels();
-        pool_.run(static_cast<int>((rows + kRows - 1) / kRows), [&](int task, int) {
-            const size_t row = kRows * static_cast<size_t>(task), at = row * columns;
-            kernels.adam(rates, static_cast<int>(std::min(kRows, rows - row)), static_cast<int>(columns),
-                         correction.data() + row, gradient.data() + at, parameter.data() + at, first.data() + at,
-                         second.data() + at);
+        run(rows, [&](size_t row, size_t last) {
+            const size_t at = row * columns;
+            kernels.adam(rates, static_cast<int>(last - row), static_cast<int>(columns), correction.data() + row,
+                         gradient.data() + at, parameter.data() + at, first.data() + at, second.data() + at);
         });
     }
 
+    void slopes_along_axes(Array<const float, 2> quats, Array<const float, 2> log_scales, float blur, bool own,
+                           Array<const float, 2> by_means, Array<float, 2> by_axes) {
+        along_axes(quats, log_scales, blur, own, by_means, by_axes, choose_kernels().slopes_along_axes);
+    }
+
+    void move_along_axes(Array<const float, 2> quats, Array<const float, 2> log_scales, float blur, bool own,
+                         Array<const float, 2> steps, Array<float, 2> means) {
+        along_axes(quats, log_scales, blur, own, steps, means, choose_kernels().move_along_axes);
+    }
+
   private:
+    static constexpr size_t kRows = 8192;  // of a task
+
+    template <class Kernel>
+    void along_axes(const Array<const float, 2>& quats, const Array<const float, 2>& log_scales, float blur, bool own,
+                    const Array<const float, 2>& from, const Array<float, 2>& to, Kernel kernel) {
+        const size_t rows = quats.shape(0);
+        auto fits = [&](const auto& array) { return array.shape(0) == rows && array.shape(1) == 3; };
+        expect(quats.shape(1) == 4 && fits(log_scales) && fits(from) && fits(to), "arrays disagree");
+        const SplatAxes splats{quats.data(), log_scales.data(), blur, own};
+        nb::gil_scoped_release release;
+        run(rows, [&](size_t first, size_t last) {
+            kernel(splats, static_cast<int>(first), static_cast<int>(last), from.data(), to.data());
+        });
+    }
+
+    // Calls task(first, last) for all rows, on several threads.
+    template <class Task>
+    void run(size_t rows, Task task) {
+        pool_.run(static_cast<int>((rows + kRows - 1) / kRows),
+                  [&](int number, int) { task(number * kRows, std::min(rows, (number + 1) * kRows)); });
+    }
+
     Pool pool_;
 };
 
@@ -68,7 +98,11 @@ void bind_adam(nb::module_& m) {
         .def(nb::init<int>(), nb::arg("threads"))
         .def("step", &AdamSteps::step, nb::arg("parameter").noconvert(), nb::arg("gradient"),
              nb::arg("first").noconvert(), nb::arg("second").noconvert(), nb::arg("correction"), nb::arg("rate"),
-             nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"));
+             nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"))
+        .def("slopes_along_axes", &AdamSteps::slopes_along_axes, nb::arg("quats"), nb::arg("log_scales"),
+             nb::arg("blur"), nb::arg("own"), nb::arg("by_means"), nb::arg("by_axes").noconvert())
+        .def("move_along_axes", &AdamSteps::move_along_axes, nb::arg("quats"), nb::arg("log_scales"), nb::arg("blur"), nb::arg("own"),
+             nb::arg("steps"), nb::arg("means").noconvert());
 }
 
 }  // namespace spiked

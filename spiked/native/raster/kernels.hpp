@@ -136,6 +136,13 @@ struct SplatArrays {  // C-contiguous: [count][3], [count][4], [count][3], [coun
     const float *means, *quats, *log_scales, *opacity_logits, *colour;
 };
 
+// What the axes along which means are moved are made of: [count][4], [count][3].
+struct SplatAxes {
+    const float *quats, *log_scales;
+    float blur;  // a length, as the means
+    bool own;    // whether these are the axes of the splats; otherwise those of the world
+};
+
 struct GradientArrays {  // the same shapes; rotation and centre [sub-poses][3]
     float *means, *quats, *log_scales, *opacity_logits, *colour;
     double *rotation, *centre;

@@ -51,6 +51,58 @@ SPIKED_DEVICE static inline Vec scale_of(Vec log_scale) {
     return exp2_fine(clamp(log_scale, broadcast(-30.0f), broadcast(30.0f)) * kLog2e);
 }
 
+// A splat's axes, columns of a matrix (row-major): its rotation times diag(lengths). Makes the quaternion a unit one.
+SPIKED_DEVICE static inline void axes_of(Vec quat[4], const Vec lengths[3], Vec axes[9]) {
+    normalise(quat);
+    Vec w = quat[0], x = quat[1], y = quat[2], z = quat[3];
+    Vec rotation[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z),     2 * (x * z + w * y),
+                       2 * (x * y + w * z),     1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+                       2 * (x * z - w * y),     2 * (y * z + w * x),     1 - 2 * (x * x + y * y)};
+    for (int k = 0; k < 3; ++k)
+        for (int row = 0; row < 3; ++row) axes[3 * row + k] = rotation[3 * row + k] * lengths[k];
+}
+
+// The axes along which splats' means are moved by a step of 1: their own, as long as the standard deviations blurred by
+// `blur`, or those of the world, as long as that.
+SPIKED_DEVICE static inline void read_axes(const SplatAxes& splats, int first, int last, Vec axes[9]) {
+    if (!splats.own) {
+        for (int k = 0; k < 9; ++k) axes[k] = broadcast(k % 4 == 0 ? splats.blur : 0.0f);
+        return;
+    }
+    Vec quat[4], length[3];
+    read_rows<4>(splats.quats, first, last, quat);
+    read_rows<3>(splats.log_scales, first, last, length);
+    for (int k = 0; k < 3; ++k) {
+        const Vec scale = scale_of(length[k]);
+        length[k] = sqrt(scale * scale + splats.blur * splats.blur);
+    }
+    axes_of(quat, length, axes);
+}
+
+SPIKED_DEVICE static inline void slopes_along_axes(const SplatAxes& splats, int first, int last, const float* by_means,
+                                                   float* by_axes) {
+    for (int base = first; base < last; base += kLanes) {
+        Vec axes[9], mean[3], along[3];
+        read_axes(splats, base, last, axes);
+        read_rows<3>(by_means, base, last, mean);
+        for (int k = 0; k < 3; ++k) along[k] = axes[k] * mean[0] + axes[3 + k] * mean[1] + axes[6 + k] * mean[2];
+        write_rows<3>(by_axes, base, last, along);
+    }
+}
+
+SPIKED_DEVICE static inline void move_along_axes(const SplatAxes& splats, int first, int last, const float* steps,
+                                                 float* means) {
+    for (int base = first; base < last; base += kLanes) {
+        Vec axes[9], step[3], mean[3];
+        read_axes(splats, base, last, axes);
+        read_rows<3>(steps, base, last, step);
+        read_rows<3>(means, base, last, mean);
+        for (int k = 0; k < 3; ++k)
+            mean[k] += axes[3 * k] * step[0] + axes[3 * k + 1] * step[1] + axes[3 * k + 2] * step[2];
+        write_rows<3>(means, base, last, mean);
+    }
+}
+
 SPIKED_DEVICE static inline void prepare(const SplatArrays& splats, int first, int last, float* const mean[3],
                                          float* const spread[9], float* log2_opacity) {
     for (int base = first; base < last; base += kLanes) {
@@ -60,15 +112,10 @@ SPIKED_DEVICE static inline void prepare(const SplatArrays& splats, int first, i
         read_rows<3>(splats.log_scales, base, splats.count, log_scale);
         read_rows<1>(splats.opacity_logits, base, splats.count, &logit);
         for (int k = 0; k < 3; ++k) store(mean[k] + base, position[k]);
-        normalise(quat);
-        Vec w = quat[0], x = quat[1], y = quat[2], z = quat[3];
-        Vec rotation[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z),     2 * (x * z + w * y),
-                           2 * (x * y + w * z),     1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-                           2 * (x * z - w * y),     2 * (y * z + w * x),     1 - 2 * (x * x + y * y)};
-        for (int k = 0; k < 3; ++k) {
-            Vec s = scale_of(log_scale[k]);
-            for (int row = 0; row < 3; ++row) store(spread[3 * row + k] + base, rotation[3 * row + k] * s);
-        }
+        Vec scale[3], axes[9];
+        for (int k = 0; k < 3; ++k) scale[k] = scale_of(log_scale[k]);
+        axes_of(quat, scale, axes);
+        for (int k = 0; k < 9; ++k) store(spread[k] + base, axes[k]);
         logit = clamp(logit, broadcast(-30.0f), broadcast(30.0f));
         store(log2_opacity + base, 0.0f - log2_fine(1.0f + exp2_fine(-kLog2e * logit)));
     }

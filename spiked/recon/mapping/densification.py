@@ -21,9 +21,10 @@ class DensifyStrategy:
     """Steps between densifications, each in the view of that step (decision 5)."""
     until: float = 0.7
     """Share of a refinement with densification; after it the splats only converge."""
-    share: float = 0.02
-    """Most splats added at a time, as a share of the cap; dead splats are replaced beyond that. 2 % every 20 steps
-    instead of 6 % every 100 (decision 8)."""
+    share: float = 0.03
+    """Most splats added at a time, as a share of the cap; dead splats are replaced beyond that (decision 65)."""
+    fast_share: float = 0.02
+    """The same in views of fast motion, whose refinements have more steps (decision 8)."""
     dead_logit: float = -4.0
     """A splat of a lower opacity logit, an opacity below 0.018, is replaced; 3DGS prunes below 0.005."""
     noise_px: float = 0.7
@@ -47,14 +48,15 @@ class DensifyStrategy:
         return np.asarray(np.maximum(badness - np.median(badness), 0))
 
     def choose(
-        self, error: Image, replaced: int, cap: int, headroom: int, rng: np.random.Generator
+        self, error: Image, replaced: int, cap: int, headroom: int, rng: np.random.Generator, *, fast: bool = False
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
         """Rows and columns of the pixels that become splats; None if there is no headroom or no error.
 
-        `replaced` splats were removed, `headroom` is left below the `cap`.
+        `replaced` splats were removed, `headroom` is left below the `cap`; `fast`: in a view of fast motion.
         """
         badness = self.badness(error)
-        count, total = min(int(self.share * cap) + replaced, headroom), float(badness.sum())
+        share = self.fast_share if fast else self.share
+        count, total = min(int(share * cap) + replaced, headroom), float(badness.sum())
         if count < 1 or total <= 0:
             return None
         count = min(count, badness.size // 4)

@@ -17,6 +17,7 @@ from spiked.recon.mapping.options import MapOptions
 from spiked.recon.mapping.photometric import Nuisances
 from spiked.recon.mapping.pyramid import Level, levels
 from spiked.recon.mapping.render_requests import RenderRequest
+from spiked.recon.mapping.rates import Rates
 from spiked.recon.mapping.replay import Replay
 from spiked.recon.mapping.seeding import SweptView, isotropic_splats
 from spiked.recon.statistics import WHITE_PERCENTILE
@@ -34,13 +35,13 @@ BETAS = 0.9, 0.99
 few."""
 NUISANCES_FROM = 50
 """Steps before view brightness is estimated: the map has to converge roughly first (decision 5)."""
-GAINS_FROM = 800
+GAINS_FROM = 500
 """Steps before pixel gains are estimated: earlier they absorb errors of the geometry (decision 13)."""
 BRIGHTER = 1.05
 """Step by which a map's white rises: each changes the colours of all splats that a page has."""
 NOISE_PX = 3, 3
 """Pixels of one colour over whose mean a view's white is taken."""
-NUISANCE_STEPS = 200
+NUISANCE_STEPS = 100
 """Steps between estimates of the pixel gains."""
 
 
@@ -70,7 +71,7 @@ class Mapper:
         """The radiance that should be shown as white, of the brightest seeded view, in steps of `BRIGHTER`: viewers cut
         off what is brighter."""
         self.depth = 1.0
-        """Typical depth of the scene; the learning rate of the means is relative to it."""
+        """Typical depth of the scene."""
         self.nuisances = Nuisances(sensor.height, sensor.width)
         self.rate_loss = RateLoss(options.ssim, options.floor)
         self.view_loss = options.view_loss(threads)
@@ -195,10 +196,10 @@ class Mapper:
         # A random background: otherwise dark surfaces become holes.
         background = float(self._rng.uniform(0, self.options.background)) * self.white
         if request.warp is None:
-            slope = self._compare_rates(key, view, request, level, background)
+            rates, slope = self.options.rates, self._compare_rates(key, view, request, level, background)
         else:
-            slope = self._compare_charge(key, request, level, background)
-        self._descend(level.rasteriser, slope, decay, request.centres[len(request.centres) // 2])
+            rates, slope = self.options.fast_rates, self._compare_charge(key, request, level, background)
+        self._descend(level.rasteriser, slope, decay, request.centres[len(request.centres) // 2], rates)
 
     def replay(self, replay: Replay, decay: float) -> None:
         """One gradient step towards what another map shows."""
@@ -206,15 +207,14 @@ class Mapper:
         image = replay.render(self.descent.model, background)
         shown = replay.comparable(image.values)
         slope = self.rate_loss(shown, replay.target(shown), self.white)[1]
-        self._descend(replay.rasteriser, replay.slope(slope, image.values), decay, replay.centre)
+        self._descend(replay.rasteriser, replay.slope(slope, image.values), decay, replay.centre, self.options.rates)
 
-    def _descend(self, rasteriser: AnyRasteriser, slope: Image, decay: float, centre: Array) -> None:
+    def _descend(self, rasteriser: AnyRasteriser, slope: Image, decay: float, centre: Array, rates: Rates) -> None:
         """A step along the gradient of an image that was seen from `centre`."""
         self.steps += 1
-        o = self.options
-        others = (o.rate_quats, o.rate_scales, o.rate_opacities, o.rate_colours * self.white)
-        rates = tuple(decay * rate for rate in (o.rate_means * self.depth, *others))
-        self.descent.step(rasteriser, slope, rates, self._limits(centre))
+        scaled = tuple(decay * rate for rate in rates.of_arrays(self.white))
+        axes = rates.axes(self.depth, self.camera.intrinsics.fx)
+        self.descent.step(rasteriser, slope, scaled, self._limits(centre), axes)
 
     def _limits(self, centre: Array) -> SizeLimits:
         """How large splats may be after a step on an image that was seen from `centre`."""
@@ -293,7 +293,7 @@ class Mapper:
             size = (self.camera.width, self.camera.height)
             error = cv2.resize(self._charge_error, size, interpolation=cv2.INTER_LINEAR)
         seen = fill_mosaic(view.rate, self.channels) if request.warp is None else image.values
-        self._replace(error, seen, image.depth, rotation, centre, view.time)
+        self._replace(error, seen, image.depth, rotation, centre, view.time, fast=request.warp is not None)
 
     def densify_replay(self, replay: Replay) -> None:
         """Add splats where the map differs most from what another map shows."""
@@ -305,13 +305,21 @@ class Mapper:
         self._replace(error, seen, replay.depth, replay.rotation, replay.centre, None)
 
     def _replace(
-        self, error: Image, seen: Image, depth: Image, rotation: Array, centre: Array, home: float | None
+        self,
+        error: Image,
+        seen: Image,
+        depth: Image,
+        rotation: Array,
+        centre: Array,
+        home: float | None,
+        *,
+        fast: bool = False,
     ) -> None:
         """Remove dead splats and add others where `error` is large, of the colours and depths of images [H, W]."""
         strategy = self.options.densification
         dead = strategy.dead(self.descent.opacity_logits)
         self._remove(dead)
-        chosen = strategy.choose(error, int(dead.sum()), self.cap, self.cap - len(self), self._rng)
+        chosen = strategy.choose(error, int(dead.sum()), self.cap, self.cap - len(self), self._rng, fast=fast)
         if chosen is None:
             return
         v, u = chosen

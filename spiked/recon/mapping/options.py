@@ -13,6 +13,7 @@ from spiked.recon.mapping.loss import (
     WarpedChargeLoss,
 )
 from spiked.recon.mapping.pruning import Pruning
+from spiked.recon.mapping.rates import FAST_RATES, RATES, Rates
 from spiked.recon.mapping.schedule import Schedule
 from spiked.recon.mapping.seeding import Seeding
 from spiked.render.loss import StructuralSimilarity
@@ -36,16 +37,10 @@ class MapOptions:
     extent_px: float = 1000.0
     """Image motion of a path up to which a map has the size above; beyond it splats, seeded views and steps grow in
     proportion. The recordings of docs/accuracy.md move by up to 700 px."""
-    rate_means: float = 2e-3
-    """Learning rate of the means at the start, per step, in units of depth (decision 3)."""
-    rate_quats: float = 2.5e-2
-    """Of the quaternions, per step (decision 3)."""
-    rate_scales: float = 1e-1
-    """Of the logarithms of the scales, per step (decision 3)."""
-    rate_opacities: float = 8e-2
-    """Of the opacity logits, per step (decision 6)."""
-    rate_colours: float = 1.5e-2
-    """Of the colours, per step, in units of white (decision 6)."""
+    rates: Rates = RATES
+    """Learning rates."""
+    fast_rates: Rates = FAST_RATES
+    """Those of steps on views of fast motion."""
     loss: LossName = LossName.CHARGE
     """What the map is fitted to."""
     ssim: float = RateLoss.ssim

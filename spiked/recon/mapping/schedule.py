@@ -22,8 +22,9 @@ class Schedule:
     large_power: float = 0.4
     """The steps of larger images fall with this power of their pixels: a compromise of cost and convergence (decision
     13)."""
-    fast_steps: float = 2.5
-    """Factor on the steps for views of fast motion: a step costs less and carries less fine detail (decision 13)."""
+    fast_steps: float = 3.0
+    """Factor on the steps for views of fast motion: a step costs less and carries less fine detail (decisions 13 and
+    65)."""
     live_steps: int = 800
     """Steps of a live map from the coarsest pyramid level to full size."""
     stale_px: float = 0.05

@@ -1736,7 +1736,7 @@ class ReconstructionOptions(BaseModel):
     steps: Annotated[
         int,
         Field(description="Gradient steps of the refinement after the last frame; its time grows with them."),
-    ] = 2000
+    ] = 1600
     seed: Annotated[int, Field(description="Same input, options and seed: same result.")] = 0
     window_frames: Annotated[
         int | None,

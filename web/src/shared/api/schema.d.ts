@@ -3712,7 +3712,7 @@ export interface components {
             /**
              * Steps
              * @description Gradient steps of the refinement after the last frame; its time grows with them.
-             * @default 2000
+             * @default 1600
              */
             steps?: number;
             /**

@@ -31,9 +31,15 @@ void descend(GpuRenderer& self, AnyArray<const float> d_values, GpuScene& scene,
     expect(rates.shape(0) == 5, "a rate for each of the five arrays");
     expect(centre.shape(0) == 3, "a centre has three coordinates");
     const float *r = rates.data(), *c = centre.data();
-    const DescentRates given{
-        {r[0], r[1], r[2], r[3], r[4]}, blur, own_axes, beta1, beta2, epsilon, most_log_scale, widest,
-        {c[0], c[1], c[2]}};
+    const DescentRates given{{r[0], r[1], r[2], r[3], r[4]},
+                             blur,
+                             own_axes,
+                             beta1,
+                             beta2,
+                             epsilon,
+                             most_log_scale,
+                             widest,
+                             {c[0], c[1], c[2]}};
     nb::gil_scoped_release release;
     self.descend(d_values.data(), scene, given);
 }
@@ -104,8 +110,9 @@ NB_MODULE(_gpu, m) {
              nb::arg("centres").noconvert(), nb::arg("weights").none().noconvert(),
              nb::arg("windows").none().noconvert(), nb::arg("channels").none().noconvert(), nb::arg("background"),
              nb::arg("values").noconvert(), nb::arg("alpha").noconvert(), nb::arg("depth").noconvert())
-        .def("descend", &descend, nb::arg("d_values"), nb::arg("scene"), nb::arg("rates"), nb::arg("blur"), nb::arg("own_axes"), nb::arg("beta1"),
-             nb::arg("beta2"), nb::arg("epsilon"), nb::arg("most_log_scale"), nb::arg("widest"), nb::arg("centre"))
+        .def("descend", &descend, nb::arg("d_values"), nb::arg("scene"), nb::arg("rates"), nb::arg("blur"),
+             nb::arg("own_axes"), nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"), nb::arg("most_log_scale"),
+             nb::arg("widest"), nb::arg("centre"))
         .def("scene", &GpuRenderer::scene);
     m.def(
         "renderer",

@@ -101,8 +101,8 @@ void bind_adam(nb::module_& m) {
              nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"))
         .def("slopes_along_axes", &AdamSteps::slopes_along_axes, nb::arg("quats"), nb::arg("log_scales"),
              nb::arg("blur"), nb::arg("own"), nb::arg("by_means"), nb::arg("by_axes").noconvert())
-        .def("move_along_axes", &AdamSteps::move_along_axes, nb::arg("quats"), nb::arg("log_scales"), nb::arg("blur"), nb::arg("own"),
-             nb::arg("steps"), nb::arg("means").noconvert());
+        .def("move_along_axes", &AdamSteps::move_along_axes, nb::arg("quats"), nb::arg("log_scales"), nb::arg("blur"),
+             nb::arg("own"), nb::arg("steps"), nb::arg("means").noconvert());
 }
 
 }  // namespace spiked

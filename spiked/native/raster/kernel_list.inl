@@ -47,8 +47,7 @@ SPIKED_KERNEL(void, adam,
               (const AdamRates&, int rows, int columns, const float* correction, const float* gradient,
                float* parameter, float* first, float* second))
 // From gradients by the means of splats [first, last) to those by steps along their axes; and such steps.
-SPIKED_KERNEL(void, slopes_along_axes,
-              (const SplatAxes&, int first, int last, const float* by_means, float* by_axes))
+SPIKED_KERNEL(void, slopes_along_axes, (const SplatAxes&, int first, int last, const float* by_means, float* by_axes))
 SPIKED_KERNEL(void, move_along_axes, (const SplatAxes&, int first, int last, const float* steps, float* means))
 // Structural similarity of rows [first, last) in three passes: the rows of planes[0..4], from those what planes[5..7]
 // hold and sums [height], from those the gradient. Planes have kSsimMargin rows of zeros above and below; scratch has

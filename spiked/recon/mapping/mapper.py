@@ -16,8 +16,8 @@ from spiked.recon.mapping.loss import RateLoss, WarpedChargeLoss
 from spiked.recon.mapping.options import MapOptions
 from spiked.recon.mapping.photometric import Nuisances
 from spiked.recon.mapping.pyramid import Level, levels
-from spiked.recon.mapping.render_requests import RenderRequest
 from spiked.recon.mapping.rates import Rates
+from spiked.recon.mapping.render_requests import RenderRequest
 from spiked.recon.mapping.replay import Replay
 from spiked.recon.mapping.seeding import SweptView, isotropic_splats
 from spiked.recon.statistics import WHITE_PERCENTILE

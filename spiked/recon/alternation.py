@@ -99,7 +99,7 @@ class Alternator:
     def _begin(self, most_steps: int) -> list[_Action]:
         """Make the first splats; returns what is to be done."""
         trainer, ids = self._trainer, self._trainer.views.mappable(self.path)
-        fast = float(np.mean([trainer.views[i].frames.warped is not None for i in ids]))
+        fast = trainer.fast_share(ids)
         pixels = trainer.camera.width * trainer.camera.height
         steps = trainer.options.schedule.steps(most_steps, pixels, fast, trainer.extent)
         if not self._progressive:

@@ -67,6 +67,7 @@ def extend(
     joint = join(known, second, options.threads)
     kept = joint.kept()
     trainer, path = _trainer(joint, reconstructor)
+    trainer.fit_motion(path)
     trainer.mapper.adopt(brightened(joint.splats(kept), 1 / joint.brightness))
     trainer.mapper.extent = HEADROOM * len(trainer.mapper) / (trainer.mapper.cap / trainer.mapper.extent)
     replays = [one.replay.brightened(1 / joint.brightness) for one in joint.first_views]

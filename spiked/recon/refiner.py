@@ -2,8 +2,6 @@
 
 from collections.abc import Callable, Iterator
 
-import numpy as np
-
 from spiked.pose import Array
 from spiked.recon.mapping.pose_steps import ALIGNED_VIEWS, LONG_ALIGNED_VIEWS, PoseStep
 from spiked.recon.mapping.trainer import MapTrainer
@@ -22,7 +20,7 @@ def plan_of(
     small images. On a `long` path the map is pruned."""
     options, camera = trainer.options, trainer.camera
     pixels, extent = camera.width * camera.height, trainer.extent_of(travelled_px)
-    fast = float(np.mean([trainer.views[i].frames.warped is not None for i in ids])) if ids else 0.0
+    fast = trainer.fast_share(ids)
     return RefinementPlan(
         options.schedule.steps(most_steps, pixels, fast, extent),
         len(options.seeding.order(ids, extent)) if ids else 0,
@@ -31,7 +29,8 @@ def plan_of(
         min(len(ids), options.pruning.views) if long else 0,
         pixels,
         trainer.mapper.cap_of(extent),
-        trainer.sensor.mosaic is not None or fast > 0.5,
+        trainer.sensor.mosaic is not None,
+        fast > 0.5,
         options,
         trainer.threads,
     )

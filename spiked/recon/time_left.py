@@ -108,7 +108,8 @@ class RefinementPlan:
     """Of the sensor."""
     most_splats: int
     coloured: bool
-    """Steps compare colours, or charges of fast motion."""
+    fast: bool
+    """Most views see fast motion: steps compare charges."""
     options: MapOptions
     threads: int | None = None
 
@@ -131,7 +132,7 @@ class RefinementPlan:
     def _step_s(self, pixels: float, splats: float) -> float:
         size = float((pixels / REFERENCE_PIXELS) ** STEP_POWER)
         full = (splats + STEP_SPLATS) / (FULL_SPLATS + STEP_SPLATS)
-        return self.scale * STEP_S * size * full * (COLOUR_WORK if self.coloured else 1.0)
+        return self.scale * STEP_S * size * full * (COLOUR_WORK if self.coloured or self.fast else 1.0)
 
     def steps_s(self, done: int, splats: int) -> float:
         """Work of the steps that are left, with so many splats now: densification adds some, prunings remove some."""
@@ -146,7 +147,8 @@ class RefinementPlan:
             if self.pruned_views and pruning.due(share) > pruned:
                 pruned, now = pruning.due(share), now * (1 - PRUNED_SHARE)
             if share < densify.until:
-                now = max(now, min(now + densify.share * self.most_splats * each / densify.every, self.most_splats))
+                added = densify.share_of(self.fast) * self.most_splats * each / densify.every
+                now = max(now, min(now + added, self.most_splats))
             total += each * self.step_s(float(at), now)
         return total
 
@@ -156,7 +158,7 @@ class RefinementPlan:
 
     def aligning_s(self, splats: float) -> float:
         """Work of one alignment."""
-        large = self.coloured or self.pixels > LARGE_PIXELS
+        large = self.coloured or self.fast or self.pixels > LARGE_PIXELS
         pixels = self.pixels / 4 if large and _levels(self.pixels) > 1 else self.pixels
         return ALIGNED_VIEW * self.aligned_views * self._step_s(pixels, splats)
 
@@ -298,6 +300,7 @@ def typical_work_s(width: int, height: int, frames: int, steps: int, options: Ma
         pixels,
         most,
         coloured=False,
+        fast=False,
         options=options,
         threads=REFERENCE_THREADS,
     )

@@ -17,7 +17,7 @@ from spiked.simulate import MotionKind, SimulatedCamera
 
 SENSOR = Sensor(160, 104, 20_000.0, intrinsics=Intrinsics.from_fov(160, 104, 60))
 PLAN = RefinementPlan(
-    1000, 11, Schedule.align_at, 80, 0, 100_000, 80_000, coloured=False, options=MapOptions(), threads=2
+    1000, 11, Schedule.align_at, 80, 0, 100_000, 80_000, coloured=False, fast=False, options=MapOptions(), threads=2
 )
 
 

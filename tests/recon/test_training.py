@@ -12,6 +12,7 @@ from spiked.recon.mapping.loss import RateLoss
 from spiked.recon.mapping.mapper import BETAS, Mapper
 from spiked.recon.mapping.options import MapOptions
 from spiked.recon.mapping.pyramid import Target
+from spiked.recon.mapping.rates import FAST_RATES, RATES
 from spiked.recon.mapping.render_requests import RenderPlanner
 from spiked.recon.mapping.schedule import Schedule
 from spiked.recon.mapping.seeding import Seeding, isotropic_splats
@@ -53,6 +54,45 @@ def test_densification_is_due_every_so_many_steps_until_its_share() -> None:
     strategy = DensifyStrategy(every=5, until=0.5)
     assert [step for step in range(1, 12) if strategy.due(step, 0.2)] == [5, 10]
     assert not strategy.due(5, 0.5)
+
+
+def test_fast_motion_adds_fewer_splats_at_a_time() -> None:
+    strategy, error = DensifyStrategy(share=0.3, fast_share=0.1), np.ones((20, 20), np.float32)
+    error[:10] = 2.0
+    rng = np.random.default_rng(0)
+    slow, fast = (strategy.choose(error, 0, 100, 100, rng, fast=fast) for fast in (False, True))
+    assert slow is not None and fast is not None
+    assert (len(slow[0]), len(fast[0])) == (30, 10)
+
+
+def test_means_move_in_units_of_splats_or_of_the_scenes_depth() -> None:
+    """A pixel at a depth of 3 with a focal length of 200 pixels is 0.015 wide."""
+    own, world = RATES.axes(3.0, 200.0), FAST_RATES.axes(3.0, 200.0)
+    assert own.own and own.blur == pytest.approx(0.015 * (RATES.blur_px or 0))
+    assert not world.own and world.blur == 3.0
+
+
+def test_a_map_has_one_kind_of_rates_and_no_moments_of_the_other() -> None:
+    sensor = Sensor(64, 40, 20_000.0, intrinsics=Intrinsics(60, 60, 32, 20))
+    camera = Camera(sensor.intrinsics, 64, 40)
+    mapper = Mapper(sensor, camera, MapOptions(), seed=0, threads=1)
+    image = np.random.default_rng(0).uniform(0.1, 0.9, (40, 64)).astype(np.float32)
+    view = SimpleNamespace(rate=image, time=0.0)
+    mapper.seed_view(view, np.eye(3), np.zeros(3), np.full((40, 64), 2.0, np.float32))  # type: ignore[arg-type]
+    mapper.depth = 2.0
+    moved = {}
+    for fast in (True, False, True):
+        mapper.fit_motion(fast)
+        assert mapper.descent.adam.taken.max() == 0
+        seen = mapper.rasteriser.forward(mapper.scene, np.eye(3)[None], np.zeros((1, 3)))
+        before = mapper.scene.means.copy()
+        mapper._descend(mapper.rasteriser, np.asarray(seen.values - 0.5, np.float32), 1.0, np.zeros(3))
+        mapper.fit_motion(fast)
+        assert mapper.descent.adam.taken.max() == 1
+        moved[fast] = np.abs(mapper.scene.means - before)
+    assert moved[True].max() == pytest.approx(2.0 * FAST_RATES.means, rel=1e-3)
+    pixel = 2.0 / 60
+    assert moved[False].max() > 1.2 * RATES.means * pixel and moved[False].max() > 2 * moved[True].max()
 
 
 def test_faint_splats_are_dead() -> None:

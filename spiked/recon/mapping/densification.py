@@ -24,7 +24,7 @@ class DensifyStrategy:
     share: float = 0.03
     """Most splats added at a time, as a share of the cap; dead splats are replaced beyond that (decision 65)."""
     fast_share: float = 0.02
-    """The same in views of fast motion, whose refinements have more steps (decision 8)."""
+    """The same where most views see fast motion: their refinements have more steps (decision 8)."""
     dead_logit: float = -4.0
     """A splat of a lower opacity logit, an opacity below 0.018, is replaced; 3DGS prunes below 0.005."""
     noise_px: float = 0.7
@@ -47,16 +47,19 @@ class DensifyStrategy:
         badness = badness.sum(-1) if badness.ndim == 3 else badness
         return np.asarray(np.maximum(badness - np.median(badness), 0))
 
+    def share_of(self, fast: bool) -> float:
+        """Most splats added at a time, for views of slow or of fast motion."""
+        return self.fast_share if fast else self.share
+
     def choose(
         self, error: Image, replaced: int, cap: int, headroom: int, rng: np.random.Generator, *, fast: bool = False
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
         """Rows and columns of the pixels that become splats; None if there is no headroom or no error.
 
-        `replaced` splats were removed, `headroom` is left below the `cap`; `fast`: in a view of fast motion.
+        `replaced` splats were removed, `headroom` is left below the `cap`; `fast`: most views see fast motion.
         """
         badness = self.badness(error)
-        share = self.fast_share if fast else self.share
-        count, total = min(int(share * cap) + replaced, headroom), float(badness.sum())
+        count, total = min(int(self.share_of(fast) * cap) + replaced, headroom), float(badness.sum())
         if count < 1 or total <= 0:
             return None
         count = min(count, badness.size // 4)

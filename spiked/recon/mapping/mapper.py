@@ -16,7 +16,6 @@ from spiked.recon.mapping.loss import RateLoss, WarpedChargeLoss
 from spiked.recon.mapping.options import MapOptions
 from spiked.recon.mapping.photometric import Nuisances
 from spiked.recon.mapping.pyramid import Level, levels
-from spiked.recon.mapping.rates import Rates
 from spiked.recon.mapping.render_requests import RenderRequest
 from spiked.recon.mapping.replay import Replay
 from spiked.recon.mapping.seeding import SweptView, isotropic_splats
@@ -36,7 +35,8 @@ few."""
 NUISANCES_FROM = 50
 """Steps before view brightness is estimated: the map has to converge roughly first (decision 5)."""
 GAINS_FROM = 500
-"""Steps before pixel gains are estimated: earlier they absorb errors of the geometry (decision 13)."""
+"""Steps before pixel gains are estimated: earlier they absorb errors of the geometry (decisions 13 and
+65)."""
 BRIGHTER = 1.05
 """Step by which a map's white rises: each changes the colours of all splats that a page has."""
 NOISE_PX = 3, 3
@@ -72,6 +72,8 @@ class Mapper:
         off what is brighter."""
         self.depth = 1.0
         """Typical depth of the scene."""
+        self.fast = False
+        """Whether most views see fast motion."""
         self.nuisances = Nuisances(sensor.height, sensor.width)
         self.rate_loss = RateLoss(options.ssim, options.floor)
         self.view_loss = options.view_loss(threads)
@@ -191,15 +193,24 @@ class Mapper:
         """The pyramid level for a coarseness from 0 (full size) to 1 (smallest)."""
         return self.levels[int(np.ceil(coarse * (len(self.levels) - 1)))]
 
+    def fit_motion(self, fast: bool) -> None:
+        """Take the learning rates and the densification of views that mostly see fast motion, or those of slow motion.
+
+        Adam's moments are in units of the rates, so that they begin anew where these change.
+        """
+        if fast != self.fast:
+            self.fast = fast
+            self.descent.adopt(self.descent.scene)
+
     def step(self, key: int, view: View, request: RenderRequest, decay: float, level: Level) -> None:
         """One gradient step on the view of id `key`; `decay` scales all learning rates."""
         # A random background: otherwise dark surfaces become holes.
         background = float(self._rng.uniform(0, self.options.background)) * self.white
         if request.warp is None:
-            rates, slope = self.options.rates, self._compare_rates(key, view, request, level, background)
+            slope = self._compare_rates(key, view, request, level, background)
         else:
-            rates, slope = self.options.fast_rates, self._compare_charge(key, request, level, background)
-        self._descend(level.rasteriser, slope, decay, request.centres[len(request.centres) // 2], rates)
+            slope = self._compare_charge(key, request, level, background)
+        self._descend(level.rasteriser, slope, decay, request.centres[len(request.centres) // 2])
 
     def replay(self, replay: Replay, decay: float) -> None:
         """One gradient step towards what another map shows."""
@@ -207,11 +218,12 @@ class Mapper:
         image = replay.render(self.descent.model, background)
         shown = replay.comparable(image.values)
         slope = self.rate_loss(shown, replay.target(shown), self.white)[1]
-        self._descend(replay.rasteriser, replay.slope(slope, image.values), decay, replay.centre, self.options.rates)
+        self._descend(replay.rasteriser, replay.slope(slope, image.values), decay, replay.centre)
 
-    def _descend(self, rasteriser: AnyRasteriser, slope: Image, decay: float, centre: Array, rates: Rates) -> None:
+    def _descend(self, rasteriser: AnyRasteriser, slope: Image, decay: float, centre: Array) -> None:
         """A step along the gradient of an image that was seen from `centre`."""
         self.steps += 1
+        rates = self.options.rates_of(self.fast)
         scaled = tuple(decay * rate for rate in rates.of_arrays(self.white))
         axes = rates.axes(self.depth, self.camera.intrinsics.fx)
         self.descent.step(rasteriser, slope, scaled, self._limits(centre), axes)
@@ -293,7 +305,7 @@ class Mapper:
             size = (self.camera.width, self.camera.height)
             error = cv2.resize(self._charge_error, size, interpolation=cv2.INTER_LINEAR)
         seen = fill_mosaic(view.rate, self.channels) if request.warp is None else image.values
-        self._replace(error, seen, image.depth, rotation, centre, view.time, fast=request.warp is not None)
+        self._replace(error, seen, image.depth, rotation, centre, view.time)
 
     def densify_replay(self, replay: Replay) -> None:
         """Add splats where the map differs most from what another map shows."""
@@ -305,21 +317,13 @@ class Mapper:
         self._replace(error, seen, replay.depth, replay.rotation, replay.centre, None)
 
     def _replace(
-        self,
-        error: Image,
-        seen: Image,
-        depth: Image,
-        rotation: Array,
-        centre: Array,
-        home: float | None,
-        *,
-        fast: bool = False,
+        self, error: Image, seen: Image, depth: Image, rotation: Array, centre: Array, home: float | None
     ) -> None:
         """Remove dead splats and add others where `error` is large, of the colours and depths of images [H, W]."""
         strategy = self.options.densification
         dead = strategy.dead(self.descent.opacity_logits)
         self._remove(dead)
-        chosen = strategy.choose(error, int(dead.sum()), self.cap, self.cap - len(self), self._rng, fast=fast)
+        chosen = strategy.choose(error, int(dead.sum()), self.cap, self.cap - len(self), self._rng, fast=self.fast)
         if chosen is None:
             return
         v, u = chosen

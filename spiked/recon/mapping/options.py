@@ -38,9 +38,9 @@ class MapOptions:
     """Image motion of a path up to which a map has the size above; beyond it splats, seeded views and steps grow in
     proportion. The recordings of docs/accuracy.md move by up to 700 px."""
     rates: Rates = RATES
-    """Learning rates."""
+    """Learning rates of a map whose views mostly see slow motion."""
     fast_rates: Rates = FAST_RATES
-    """Those of steps on views of fast motion."""
+    """Those of a map whose views mostly see fast motion."""
     loss: LossName = LossName.CHARGE
     """What the map is fitted to."""
     ssim: float = RateLoss.ssim
@@ -74,6 +74,10 @@ class MapOptions:
     """Which splats are removed."""
     schedule: Schedule = field(default_factory=Schedule)
     """What happens when in a refinement."""
+
+    def rates_of(self, fast: bool) -> Rates:
+        """Learning rates for views of slow or of fast motion."""
+        return self.fast_rates if fast else self.rates
 
     def view_loss(self, threads: int | None = 1) -> ViewLoss:
         """The loss of a view's image; `LossName.CHARGE` has another one for fast motion. Threads: None, the cores that

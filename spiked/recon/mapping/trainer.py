@@ -107,6 +107,14 @@ class MapTrainer:
         most = max(1.0, options.most_splats / (options.splats_a_pixel * pixels))
         return float(np.clip(travelled_px / options.extent_px, 1.0, most))
 
+    def fast_share(self, ids: Sequence[int]) -> float:
+        """The share of views that see fast motion; 0 of none."""
+        return float(np.mean([self.views[i].frames.warped is not None for i in ids])) if ids else 0.0
+
+    def fit_motion(self, path: Path) -> None:
+        """Let the map be fitted as suits most of the views on the path."""
+        self.mapper.fit_motion(self.fast_share(self.views.mappable(path)) > 0.5)
+
     def reshuffle(self) -> None:
         """Draw a new random order of the views at the next step."""
         self._queue = []
@@ -121,6 +129,7 @@ class MapTrainer:
 
         points [N, 3] are landmarks, whose depths give the range of the sweep.
         """
+        self.fit_motion(path)
         posed = self._posed(path)
         works = (self._sweeps.prepare(posed, posed.ids.index(one), points, threads=self.threads) for one in ids)
         self._plant([work() for work in works if work is not None], (self.options.seeding.sure, 0.0))
@@ -128,6 +137,7 @@ class MapTrainer:
     def _sweep_now(self, path: Path, points: Array) -> None:
         """As `sweep_behind`, on this thread."""
         self._swept_px = self.views.travelled_px
+        self.fit_motion(path)
         work = self._prepare_quick(path, points, self.threads)
         self._plant([] if work is None else [work()])
 
@@ -140,6 +150,7 @@ class MapTrainer:
             swept, self._sweeping = self._sweeping.result(), None
             (rotation,), (centre,) = path.poses([swept.view.time])
             self.carry(path)
+            self.fit_motion(path)
             self._plant([replace(swept, rotation=rotation, centre=centre)])
             self.carry(path)
         if self._sweeping is not None or not self.sweep_due:

@@ -75,8 +75,8 @@ class Descent:
         """Change the splats that the last image of `rasteriser`, a render of `model`, shows: slope is the gradient by
         its values, and rates are those of the five arrays, the first in units of the `axes`.
 
-        The axes of the means are those before the step for the gradient, and those after it for the move. Colours below 0
-        become 0, as viewers show them as black, and splats stay within the `limits`.
+        The axes of the means are those before the step for the gradient, and those after it for the move. Colours below
+        0 become 0, as viewers show them as black, and splats stay within the `limits`.
         """
         gradients = rasteriser.backward(slope)
         scene, steps = self._scene, np.zeros_like(self._scene.means)

@@ -3,8 +3,8 @@
 The compiler is Clang of the package ziglang, which brings the C library of each target. It links against glibc 2.28 on
 any machine and compiles for aarch64 on x86-64. Tools come from PyPI by number (wheels/tools.txt). With
 SOURCE_DATE_EPOCH, by default the time of the last commit, the same sources give the same bytes, in whatever folder they
-lie.
-docs/packages.md has the figures.
+lie. nvcc takes no Clang with libc++: the module of the CUDA kernels is compiled by GCC, on x86-64, and linked by that
+Clang against the same glibc. docs/packages.md has the figures.
 
     make wheels
     python deploy/build_wheels.py --python python3.12 --machine aarch64
@@ -25,6 +25,8 @@ GLIBC = "2.28"
 """manylinux_2_28: Debian 10, Ubuntu 18.10, RHEL 8 and all after them."""
 MACHINES = ("x86_64", "aarch64")
 PYTHONS = ("python3.11", "python3.12")
+KERNELS = Path(tempfile.gettempdir()) / "spiked-kernels"
+"""Where the module of the CUDA kernels is compiled: nvcc's names of symbols depend on the folder."""
 MOST_BYTES = 30_000_000
 """Size of a wheel that stops the build."""
 
@@ -66,6 +68,47 @@ def target_settings(programs: Path, machine: str, folder: Path) -> tuple[dict[st
     return variables, defines
 
 
+def gpu_module(programs: Path, scripts: Path) -> Path:
+    """The module with the CUDA kernels for the tools' Python, on x86-64."""
+    if shutil.which("g++") is None:
+        sys.exit("error: nvcc needs g++; install it")
+    shutil.rmtree(KERNELS, ignore_errors=True)
+    source, tree = KERNELS / "source", KERNELS / "build"
+    shutil.copytree(ROOT / "spiked/native", source / "spiked/native", ignore=shutil.ignore_patterns("*.so"))
+    shutil.copy(ROOT / "CMakeLists.txt", source)
+    # libgcc_s is the target's: the unwinder of this machine's static one needs its glibc.
+    standard, unwinder = (run("g++", f"-print-file-name={name}").strip() for name in ("libstdc++.a", "libgcc_s.so.1"))
+    extra = f"-Wl,--version-script={DEPLOY}/wheels/exports.map {DEPLOY}/wheels/single_threaded.c"
+    link = f"{scripts}/cc -shared -s -Wl,--gc-sections {extra} -o <TARGET> <OBJECTS> <LINK_LIBRARIES>"
+    stable = run(programs / "python", "-c", "import sys; print(int(sys.version_info >= (3, 12)))").strip() == "1"
+    defines = [f"Python_EXECUTABLE={programs}/python", "CMAKE_CXX_COMPILER=g++", "SKBUILD_STATE=wheel"]
+    defines += [f"CMAKE_CXX_CREATE_SHARED_MODULE={link} {standard} {unwinder} -lm"]
+    defines += ["SKBUILD_SABI_COMPONENT=Development.SABIModule"] if stable else []
+    path = f"{programs}{os.pathsep}{os.environ['PATH']}"
+    run(programs / "cmake", "-S", source, "-B", tree, "-G", "Ninja", *(f"-D{define}" for define in defines), PATH=path)
+    run(programs / "cmake", "--build", tree, "--target", "_gpu", PATH=path)
+    if not (tree / "spiked/native/gpu/cuda.o").is_file():
+        sys.exit("error: the kernels were not compiled; CMake's warning above says why")
+    (module,) = (tree / "spiked/native/gpu").glob("_gpu*.so")
+    check_symbols(programs, module)
+    return module
+
+
+def check_symbols(programs: Path, module: Path) -> None:
+    """End the program if the module needs a symbol that neither Python nor a library of the target has."""
+    script = (
+        "import sys; from elftools.elf.elffile import ELFFile as E; e = E(open(sys.argv[1], 'rb'));"
+        "v = e.get_section_by_name('.gnu.version');"
+        "print(*(s.name for i, s in enumerate(e.get_section_by_name('.dynsym').iter_symbols()) if s.name"
+        " and s['st_shndx'] == 'SHN_UNDEF' and s['st_info']['bind'] == 'STB_GLOBAL'"
+        " and v.get_symbol(i)['ndx'] in ('VER_NDX_LOCAL', 'VER_NDX_GLOBAL')))"
+    )
+    needed = run(programs / "python", "-c", script, module).split()
+    unknown = [name for name in needed if not name.startswith(("Py", "_Py"))]
+    if unknown:
+        sys.exit(f"error: {module.name} needs {', '.join(unknown)}, which glibc {GLIBC} lacks")
+
+
 def build(python: str, machine: str, out: Path) -> Path:
     """One wheel, checked, in the folder `out`."""
     work = ROOT / "build" / "wheels"
@@ -75,6 +118,8 @@ def build(python: str, machine: str, out: Path) -> Path:
     variables |= compilers(programs, machine, scripts)
     variables |= {"SOURCE_DATE_EPOCH": epoch(), "LC_ALL": "C.UTF-8"}
     variables |= {"PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"}
+    if machine == "x86_64" == platform.machine():
+        defines += [f"SPIKED_GPU_MODULE={gpu_module(programs, scripts)}"]
     tree = work / f"{Path(python).name}-{machine}"
     with tempfile.TemporaryDirectory() as made:
         run(
@@ -93,6 +138,7 @@ def build(python: str, machine: str, out: Path) -> Path:
         check(programs, wheel)
         out.mkdir(parents=True, exist_ok=True)
         shutil.copy(wheel, out / wheel.name)
+    shutil.rmtree(KERNELS, ignore_errors=True)
     return out / wheel.name
 
 

@@ -16,7 +16,10 @@ class ArmRequest(BaseModel):
     model_config = ConfigDict(
         extra="ignore",
     )
-    pretrigger_s: Annotated[float, Field(description="How far back a capture shall be able to begin, seconds.")] = 1.0
+    pretrigger_s: Annotated[
+        float,
+        Field(description="How far back a capture shall be able to begin, seconds."),
+    ] = 1.0
 
 
 class BaselineScaleRequest(BaseModel):
@@ -29,7 +32,10 @@ class BaselineScaleRequest(BaseModel):
     )
     revision: Annotated[int, Field(description="The one that this replaces; 409 if it is not.")]
     baseline_m: Annotated[float, Field(description="Distance of the cameras.")]
-    path: Annotated[int, Field(description="Path of the second camera, see GET paths; the first has path 0.")] = 1
+    path: Annotated[
+        int,
+        Field(description="Path of the second camera, see GET paths; the first has path 0."),
+    ] = 1
     offset_s: Annotated[
         float | None,
         Field(
@@ -81,8 +87,14 @@ class CalibrationOut(BaseModel):
     model_config = ConfigDict(
         extra="ignore",
     )
-    gain_spread: Annotated[float, Field(description="Standard deviation of the logarithm of good pixels' gains.")]
-    dark_rate: Annotated[float, Field(description="Spikes a frame without light, median over the pixels.")]
+    gain_spread: Annotated[
+        float,
+        Field(description="Standard deviation of the logarithm of good pixels' gains."),
+    ]
+    dark_rate: Annotated[
+        float,
+        Field(description="Spikes a frame without light, median over the pixels."),
+    ]
     useless: Annotated[int, Field(description="Pixels that are left out: dead, stuck or hot.")]
     pixels: Annotated[int, Field(description="Of the sensor.")]
 
@@ -105,8 +117,14 @@ class CalibrationRequest(BaseModel):
     model_config = ConfigDict(
         extra="ignore",
     )
-    dark: Annotated[str | None, Field(description="Capture with the lens covered: dark rates and hot pixels.")] = None
-    flat: Annotated[str | None, Field(description="Capture of an even light: gains and dead pixels.")] = None
+    dark: Annotated[
+        str | None,
+        Field(description="Capture with the lens covered: dark rates and hot pixels."),
+    ] = None
+    flat: Annotated[
+        str | None,
+        Field(description="Capture of an even light: gains and dead pixels."),
+    ] = None
 
 
 class CameraModel(BaseModel):
@@ -244,9 +262,18 @@ class EditedOut(BaseModel):
     outside: Annotated[int, Field(description="Splats that lay outside the box.")]
     outlined: Annotated[int, Field(description="Splats that lay inside the outline.")]
     floaters: Annotated[int, Field(description="Splats that were removed as floaters.")]
-    split: Annotated[int, Field(description="Splats larger than a quarter of the scene that were replaced by several.")]
-    shrunk: Annotated[int, Field(description="Splats so large that were made smaller: no view sees them.")]
-    large: Annotated[int, Field(description="Splats that stay so large: as several they would be too many.")]
+    split: Annotated[
+        int,
+        Field(description="Splats larger than a quarter of the scene that were replaced by several."),
+    ]
+    shrunk: Annotated[
+        int,
+        Field(description="Splats so large that were made smaller: no view sees them."),
+    ]
+    large: Annotated[
+        int,
+        Field(description="Splats that stay so large: as several they would be too many."),
+    ]
 
 
 class ExportFormatOut(BaseModel):
@@ -262,7 +289,10 @@ class ExportFormatOut(BaseModel):
     readers: Annotated[str, Field(description="Programs that read it.")]
     loses: Annotated[str, Field(description="What of the reconstruction is not in it.")]
     suffix: Annotated[str, Field(description="Of the file that is sent.")]
-    missing: Annotated[str, Field(description="How to install what the format needs; empty if nothing is missing.")]
+    missing: Annotated[
+        str,
+        Field(description="How to install what the format needs; empty if nothing is missing."),
+    ]
 
 
 class ExportFormatsOut(BaseModel):
@@ -423,7 +453,8 @@ class LocalisedViewOut(BaseModel):
     inliers: Annotated[int, Field(description="Points of the map that agree within 1.5 px.")]
     inlier_share: Annotated[float, Field(description="Of those in view.")]
     correlation: Annotated[
-        float, Field(description="Of the details of the image with those of the map rendered there.")
+        float,
+        Field(description="Of the details of the image with those of the map rendered there."),
     ]
     sigma: Annotated[float, Field(description="Predicted standard deviation of the position.")]
     sigma_px: Annotated[float, Field(description="The same in the image.")]
@@ -539,7 +570,8 @@ class NoiseModel(BaseModel):
     ] = 0.00967
     dark: Annotated[float, Field(description="Mean dark current in spikes a frame (Eq 17).")] = 0.002
     dark_spread: Annotated[
-        float, Field(description="Standard deviation of the dark current over the pixels, in spikes a frame (Eq 17).")
+        float,
+        Field(description="Standard deviation of the dark current over the pixels, in spikes a frame (Eq 17)."),
     ] = 0.0002
     capacitance_mismatch: Annotated[
         float,
@@ -554,13 +586,18 @@ class NoiseModel(BaseModel):
         ),
     ] = 0.0208
     hot_share: Annotated[float, Field(description="Share of the pixels that are hot.")] = 0.0
-    hot_rate: Annotated[float, Field(description="Extra dark current of a hot pixel, in spikes a frame.")] = 0.2
+    hot_rate: Annotated[
+        float,
+        Field(description="Extra dark current of a hot pixel, in spikes a frame."),
+    ] = 0.2
     dead_share: Annotated[float, Field(description="Share of the pixels that never fire.")] = 0.0
-    flicker: Annotated[float, Field(description="Depth of the light's flicker: amplitude as a share of the mean.")] = (
-        0.0
-    )
+    flicker: Annotated[
+        float,
+        Field(description="Depth of the light's flicker: amplitude as a share of the mean."),
+    ] = 0.0
     flicker_hz: Annotated[
-        float, Field(description="Frequency of the flicker in Hz; lamps have twice that of the mains.")
+        float,
+        Field(description="Frequency of the flicker in Hz; lamps have twice that of the mains."),
     ] = 100.0
 
 
@@ -622,7 +659,10 @@ class OutlineModel(BaseModel):
     model_config = ConfigDict(
         extra="ignore",
     )
-    corners: Annotated[list[list[float]], Field(description="x/z and y/z in the camera's OpenCV axes, in order.")]
+    corners: Annotated[
+        list[list[float]],
+        Field(description="x/z and y/z in the camera's OpenCV axes, in order."),
+    ]
     camera: Annotated[CameraModel, Field(description="A frame cannot be given here.")]
 
 
@@ -658,7 +698,8 @@ class PathOut(BaseModel):
         extra="ignore",
     )
     path: Annotated[
-        int, Field(description="To be given as `path` of the trajectory; 0 is that of the reconstruction's capture.")
+        int,
+        Field(description="To be given as `path` of the trajectory; 0 is that of the reconstruction's capture."),
     ]
     capture_id: Annotated[str, Field(description="Its capture, which may have been removed since.")]
     poses: int
@@ -700,7 +741,8 @@ class Pinhole(BaseModel):
     cx: float
     cy: float
     distortion: Annotated[
-        OpencvLens | FisheyeLens | None, Field(description="Of the lens, as OpenCV has it; null: none.")
+        OpencvLens | FisheyeLens | None,
+        Field(description="Of the lens, as OpenCV has it; null: none."),
     ] = None
 
 
@@ -716,18 +758,24 @@ class PointOut(BaseModel):
     frame: Annotated[int, Field(description="Whose pose it is seen from.")]
     opacity: Annotated[float, Field(description="How opaque the scene is there, 0 to 1.")]
     rate: Annotated[
-        list[float], Field(description="Radiance in expected spikes a frame; red, green and blue of a colour scene.")
+        list[float],
+        Field(description="Radiance in expected spikes a frame; red, green and blue of a colour scene."),
     ]
     depth: Annotated[
         float | None,
         Field(description="Along the camera's axis, in the scene's unit of length; null below an opacity of 0.5."),
     ]
-    depth_m: Annotated[float | None, Field(description="The same in metres; null while the scale is not known.")]
+    depth_m: Annotated[
+        float | None,
+        Field(description="The same in metres; null while the scale is not known."),
+    ]
     depth_m_sigma: Annotated[
-        float | None, Field(description="Standard deviation of depth_m by that of the scale alone; null: not known.")
+        float | None,
+        Field(description="Standard deviation of depth_m by that of the scale alone; null: not known."),
     ]
     position: Annotated[
-        list[float] | None, Field(description="Of the surface, in the axes of the scene; null as depth.")
+        list[float] | None,
+        Field(description="Of the surface, in the axes of the scene; null as depth."),
     ]
 
 
@@ -822,7 +870,10 @@ class RecordingOut(BaseModel):
     bytes: int
     frames: int
     first_frame: Annotated[int, Field(description="Index in the capture of the first frame recorded.")]
-    lost: Annotated[int, Field(description="Frames missing between its first and the end of the capture.")]
+    lost: Annotated[
+        int,
+        Field(description="Frames missing between its first and the end of the capture."),
+    ]
     lost_by_cause: Annotated[
         dict[str, int],
         Field(description="By cause: device, usb, ring; disk, which took what had come too slowly or not at all."),
@@ -839,7 +890,10 @@ class ReloadedOut(BaseModel):
         extra="ignore",
     )
     changed: Annotated[list[str], Field(description="Settings whose new value is in effect.")]
-    needs_restart: Annotated[list[str], Field(description="Settings whose new value takes effect after a restart.")]
+    needs_restart: Annotated[
+        list[str],
+        Field(description="Settings whose new value takes effect after a restart."),
+    ]
 
 
 class Response(StrEnum):
@@ -859,7 +913,10 @@ class RevertRequest(BaseModel):
     model_config = ConfigDict(
         extra="ignore",
     )
-    version: Annotated[int, Field(description="The newest version, which is edited; 409 if there is another.")]
+    version: Annotated[
+        int,
+        Field(description="The newest version, which is edited; 409 if there is another."),
+    ]
     to: Annotated[int, Field(description="A version that is kept; `GET versions` lists them.")]
 
 
@@ -933,11 +990,18 @@ class SettingOut(BaseModel):
     key: str
     value: Any
     origin: SettingOrigin
-    reloadable: Annotated[bool, Field(description="Whether `configuration:reload` brings a new value into effect.")]
-    editable: Annotated[
-        bool, Field(description="Whether `PATCH configuration` changes it; others are changed in the file.")
+    reloadable: Annotated[
+        bool,
+        Field(description="Whether `configuration:reload` brings a new value into effect."),
     ]
-    option: Annotated[dict[str, Any], Field(description="JSON Schema: type, limits, default, meaning.")]
+    editable: Annotated[
+        bool,
+        Field(description="Whether `PATCH configuration` changes it; others are changed in the file."),
+    ]
+    option: Annotated[
+        dict[str, Any],
+        Field(description="JSON Schema: type, limits, default, meaning."),
+    ]
     doc: str
 
 
@@ -970,9 +1034,13 @@ class SettingsOut(BaseModel):
     items: list[SettingOut]
     file: Annotated[str, Field(description="The file that `PATCH configuration` changes.")]
     needs_restart: Annotated[
-        list[str], Field(description="Settings whose value in the file takes effect after a restart.")
+        list[str],
+        Field(description="Settings whose value in the file takes effect after a restart."),
     ]
-    problem: Annotated[str | None, Field(description="Why the file as it is now cannot be loaded; null if it can be.")]
+    problem: Annotated[
+        str | None,
+        Field(description="Why the file as it is now cannot be loaded; null if it can be."),
+    ]
 
 
 class SimilarityOut(BaseModel):
@@ -1000,10 +1068,14 @@ class SourceKindOut(BaseModel):
     usage: Annotated[str, Field(description="How a source of this kind is written.")]
     summary: str
     is_camera: Annotated[bool, Field(description="Hardware: frames that are not read in time are lost.")]
-    can_block: Annotated[bool, Field(description="With `pace=0` it waits for its consumers, so that no frame is lost.")]
+    can_block: Annotated[
+        bool,
+        Field(description="With `pace=0` it waits for its consumers, so that no frame is lost."),
+    ]
     takes_path: Annotated[bool, Field(description="A path on the service's machine follows the colon.")]
     options: Annotated[
-        dict[str, Any], Field(description="JSON Schema of its options: types, limits, defaults and meaning.")
+        dict[str, Any],
+        Field(description="JSON Schema of its options: types, limits, defaults and meaning."),
     ]
 
 
@@ -1028,7 +1100,10 @@ class SpikesOut(BaseModel):
     )
     first_frame: Annotated[int, Field(description="Absolute index of the first frame that was looked at.")]
     frames: Annotated[int, Field(description="Number of recorded frames that were looked at.")]
-    spikes: Annotated[list[int], Field(description="Absolute indices of the frames in which it fired.")]
+    spikes: Annotated[
+        list[int],
+        Field(description="Absolute indices of the frames in which it fired."),
+    ]
 
 
 class Stage(StrEnum):
@@ -1118,9 +1193,13 @@ class TokenOut(BaseModel):
     created_at: AwareDatetime
     expires_at: AwareDatetime | None
     scope: Annotated[
-        Scope, Field(description="read: look and download; operate: change captures, too; admin: set-up, too.")
+        Scope,
+        Field(description="read: look and download; operate: change captures, too; admin: set-up, too."),
     ]
-    created_by: Annotated[str | None, Field(description="The token that it was created with; null: by `spiked token`.")]
+    created_by: Annotated[
+        str | None,
+        Field(description="The token that it was created with; null: by `spiked token`."),
+    ]
 
 
 class TokenRequest(BaseModel):
@@ -1134,7 +1213,8 @@ class TokenRequest(BaseModel):
     name: Annotated[str, Field(description="Of its user or device.")]
     scope: Scope
     days: Annotated[
-        float | None, Field(description="Until it expires; null: when the token of this request does, if that expires.")
+        float | None,
+        Field(description="Until it expires; null: when the token of this request does, if that expires."),
     ] = None
 
 
@@ -1171,10 +1251,16 @@ class TrajectoryOut(BaseModel):
     )
     version: int
     frames: Annotated[list[int], Field(description="Absolute frame indices.")]
-    times_s: Annotated[list[float], Field(description="Middle of each frame, seconds since the start of the capture.")]
+    times_s: Annotated[
+        list[float],
+        Field(description="Middle of each frame, seconds since the start of the capture."),
+    ]
     positions: Annotated[list[list[float]], Field(description="[n, 3], length unit of the scene.")]
     quaternions_wxyz: Annotated[list[list[float]], Field(description="[n, 4]")]
-    states: Annotated[list[State | None], Field(description="State of the tracking then; null where it is not known.")]
+    states: Annotated[
+        list[State | None],
+        Field(description="State of the tracking then; null where it is not known."),
+    ]
 
 
 class UpRequest(BaseModel):
@@ -1187,10 +1273,12 @@ class UpRequest(BaseModel):
     )
     revision: Annotated[int, Field(description="The one that this replaces; 409 if it is not.")]
     gravity: Annotated[
-        list[float] | None, Field(description="In the axes of the camera: x right, y down, z forward.")
+        list[float] | None,
+        Field(description="In the axes of the camera: x right, y down, z forward."),
     ] = None
     frame: Annotated[
-        int | None, Field(description="Of gravity: the pose nearest to it is used. Default: the first.")
+        int | None,
+        Field(description="Of gravity: the pose nearest to it is used. Default: the first."),
     ] = None
     points: Annotated[list[list[float]] | None, Field(description="Of the floor, in the scene.")] = None
 
@@ -1302,7 +1390,10 @@ class ZmqOut(BaseModel):
         extra="ignore",
     )
     events: Annotated[str, Field(description="PUB: all but pictures.")]
-    state: Annotated[str, Field(description="REP: the newest message of each kind, or those after a number.")]
+    state: Annotated[
+        str,
+        Field(description="REP: the newest message of each kind, or those after a number."),
+    ]
     previews: Annotated[str, Field(description="PUB: pictures.")]
 
 
@@ -1314,11 +1405,15 @@ class CleanRequest(BaseModel):
     model_config = ConfigDict(
         extra="ignore",
     )
-    version: Annotated[int, Field(description="The newest version, which is edited; 409 if there is another.")]
+    version: Annotated[
+        int,
+        Field(description="The newest version, which is edited; 409 if there is another."),
+    ]
     box: Annotated[BoxModel | None, Field(description="Splats outside are removed.")] = None
-    outline: Annotated[OutlineModel | None, Field(description="Splats inside are removed, however far behind it.")] = (
-        None
-    )
+    outline: Annotated[
+        OutlineModel | None,
+        Field(description="Splats inside are removed, however far behind it."),
+    ] = None
     floaters: Annotated[bool, Field(description="Remove splats that few views see or that hang alone.")] = True
     split: Annotated[
         bool,
@@ -1337,14 +1432,21 @@ class ConsumerOut(BaseModel):
         extra="ignore",
     )
     name: str
-    policy: Annotated[Policy, Field(description="latest skips frames by intention; the others want them all.")]
+    policy: Annotated[
+        Policy,
+        Field(description="latest skips frames by intention; the others want them all."),
+    ]
     frames_read: Annotated[int, Field(description="Frames that it read intact.")]
     received: Annotated[int, Field(deprecated=True, description="Deprecated: use frames_read.")]
     lost: Annotated[
-        int, Field(description="Frames that it did not read, of any cause; frames_read + lost is its next frame.")
+        int,
+        Field(description="Frames that it did not read, of any cause; frames_read + lost is its next frame."),
     ]
     lag_frames: int
-    fill: Annotated[float, Field(description="Its lag as a part of what it may lag; at 1 it loses frames.")]
+    fill: Annotated[
+        float,
+        Field(description="Its lag as a part of what it may lag; at 1 it loses frames."),
+    ]
     lagging: bool
 
 
@@ -1383,7 +1485,10 @@ class DeviceOut(BaseModel):
     description: str
     state: DeviceState
     reason: Annotated[str, Field(description="Why it is absent or lost.")]
-    warnings: Annotated[list[str], Field(description="What its capture, or it while armed, does without.")]
+    warnings: Annotated[
+        list[str],
+        Field(description="What its capture, or it while armed, does without."),
+    ]
     serial: str | None
     port: str | None
     speed: str | None
@@ -1467,7 +1572,8 @@ class IntrinsicsModel(BaseModel):
     cx: float
     cy: float
     distortion: Annotated[
-        OpencvLens | FisheyeLens | None, Field(description="Of the lens, as OpenCV has it; null: none.")
+        OpencvLens | FisheyeLens | None,
+        Field(description="Of the lens, as OpenCV has it; null: none."),
     ] = None
 
 
@@ -1484,7 +1590,8 @@ class IntrinsicsOption(BaseModel):
     cx: float
     cy: float
     distortion: Annotated[
-        OpencvLens | FisheyeLens | None, Field(description="Of the lens, as OpenCV has it; null: none.")
+        OpencvLens | FisheyeLens | None,
+        Field(description="Of the lens, as OpenCV has it; null: none."),
     ] = None
 
 
@@ -1503,7 +1610,8 @@ class LocalisationOut(BaseModel):
     references: Annotated[int, Field(description="Reference views of the map.")]
     best_inliers: Annotated[int, Field(description="Most points that agreed with one pose in a search.")]
     views: Annotated[
-        list[LocalisedViewOut], Field(description="In order of time; empty if the place was not recognised.")
+        list[LocalisedViewOut],
+        Field(description="In order of time; empty if the place was not recognised."),
     ]
 
 
@@ -1517,7 +1625,10 @@ class LocaliseRequest(BaseModel):
     )
     capture_id: str
     first_frame: Annotated[int, Field(description="First frame to use, absolute index.")] = 0
-    frames: Annotated[int | None, Field(description="Number of frames to use; 1,000 suffice. Default: all.")] = None
+    frames: Annotated[
+        int | None,
+        Field(description="Number of frames to use; 1,000 suffice. Default: all."),
+    ] = None
     intrinsics: Annotated[
         IntrinsicsModel | None,
         Field(description="Lens of the recording, if it does not state it. Default: that of the map."),
@@ -1538,10 +1649,17 @@ class NewTokenOut(BaseModel):
     created_at: AwareDatetime
     expires_at: AwareDatetime | None
     scope: Annotated[
-        Scope, Field(description="read: look and download; operate: change captures, too; admin: set-up, too.")
+        Scope,
+        Field(description="read: look and download; operate: change captures, too; admin: set-up, too."),
     ]
-    created_by: Annotated[str | None, Field(description="The token that it was created with; null: by `spiked token`.")]
-    secret: Annotated[str, Field(description="The token itself, which is not shown again: only its hash is kept.")]
+    created_by: Annotated[
+        str | None,
+        Field(description="The token that it was created with; null: by `spiked token`."),
+    ]
+    secret: Annotated[
+        str,
+        Field(description="The token itself, which is not shown again: only its hash is kept."),
+    ]
 
 
 class ProfileModel(BaseModel):
@@ -1553,9 +1671,10 @@ class ProfileModel(BaseModel):
         extra="ignore",
     )
     rate: Annotated[float | None, Field(description="Frames per second.")] = None
-    mosaic: Annotated[Mosaic | None, Field(description="Colour mosaic of the upright image; none: a grey sensor.")] = (
-        None
-    )
+    mosaic: Annotated[
+        Mosaic | None,
+        Field(description="Colour mosaic of the upright image; none: a grey sensor."),
+    ] = None
     flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
     response: Annotated[
         Response | None,
@@ -1572,14 +1691,19 @@ class ProfileModel(BaseModel):
     intrinsics: IntrinsicsModel | None = None
     model: Annotated[str, Field(description="Name of the product.")] = ""
     serial: Annotated[
-        str | None, Field(description="Serial number of the camera that the profile is of; null: of any.")
+        str | None,
+        Field(description="Serial number of the camera that the profile is of; null: of any."),
     ] = None
     width: Annotated[int | None, Field(description="Pixels in a row.")] = None
     height: Annotated[int | None, Field(description="Rows.")] = None
     calibration: Annotated[
-        str | None, Field(description="File of gains, dark rates and dead pixels, relative to the profile.")
+        str | None,
+        Field(description="File of gains, dark rates and dead pixels, relative to the profile."),
     ] = None
-    session: Annotated[Session | None, Field(description="How the bridge of a USB camera is made to send.")] = None
+    session: Annotated[
+        Session | None,
+        Field(description="How the bridge of a USB camera is made to send."),
+    ] = None
     note: str = ""
 
 
@@ -1610,13 +1734,18 @@ class ReconstructionOptions(BaseModel):
         ),
     ] = None
     steps: Annotated[
-        int, Field(description="Gradient steps of the refinement after the last frame; its time grows with them.")
+        int,
+        Field(description="Gradient steps of the refinement after the last frame; its time grows with them."),
     ] = 1600
     seed: Annotated[int, Field(description="Same input, options and seed: same result.")] = 0
     window_frames: Annotated[
-        int | None, Field(description="Frames of a view; follows the motion (4 to 64) if not given.")
+        int | None,
+        Field(description="Frames of a view; follows the motion (4 to 64) if not given."),
     ] = None
-    threads: Annotated[int | None, Field(description="Threads of the rasteriser; all cores if not given.")] = None
+    threads: Annotated[
+        int | None,
+        Field(description="Threads of the rasteriser; all cores if not given."),
+    ] = None
     max_views: Annotated[int, Field(description="Views kept for mapping; beyond it older ones thin out.")] = 400
     most_splats: Annotated[
         int,
@@ -1625,7 +1754,8 @@ class ReconstructionOptions(BaseModel):
         ),
     ] = 250000
     memory_mb: Annotated[
-        int, Field(description="MiB of images held in memory; the others are built anew from the recording.")
+        int,
+        Field(description="MiB of images held in memory; the others are built anew from the recording."),
     ] = 512
     refine_poses: Annotated[bool, Field(description="Whether the map corrects the trajectory.")] = True
     method: Annotated[
@@ -1635,15 +1765,17 @@ class ReconstructionOptions(BaseModel):
         ),
     ] = MethodName.spiked
     initialisation: Annotated[
-        Initialisation | None, Field(description="How the path begins; as in the method if not given.")
+        Initialisation | None,
+        Field(description="How the path begins; as in the method if not given."),
     ] = None
     pose_step: Annotated[
         PoseStepName | None,
         Field(description="What corrects the poses while the map is fitted; as in the method if not given."),
     ] = None
-    loss: Annotated[LossName | None, Field(description="What the map is fitted to; as in the method if not given.")] = (
-        None
-    )
+    loss: Annotated[
+        LossName | None,
+        Field(description="What the map is fitted to; as in the method if not given."),
+    ] = None
     intrinsics: Annotated[
         IntrinsicsOption | None,
         Field(description="Optics, where neither the capture nor its recording says them, or to overrule them."),
@@ -1661,7 +1793,8 @@ class ReconstructionOptions(BaseModel):
         ),
     ] = None
     flipped: Annotated[
-        bool | None, Field(description="Rows come bottom-up; false: top-down; as the recording states if not given.")
+        bool | None,
+        Field(description="Rows come bottom-up; false: top-down; as the recording states if not given."),
     ] = None
 
 
@@ -1677,13 +1810,16 @@ class ReconstructionOut(BaseModel):
     name: str
     notes: str
     capture_id: Annotated[
-        str, Field(description="The capture that its trajectory belongs to; of a merge that of the first map.")
+        str,
+        Field(description="The capture that its trajectory belongs to; of a merge that of the first map."),
     ]
     task: Annotated[
-        Task, Field(description="A localisation has the scene of the map, and the path of the recording in it.")
+        Task,
+        Field(description="A localisation has the scene of the map, and the path of the recording in it."),
     ]
     maps: Annotated[
-        list[MapRefOut], Field(description="What it uses; the result is in the frame of reference of the first.")
+        list[MapRefOut],
+        Field(description="What it uses; the result is in the frame of reference of the first."),
     ]
     recognised: Annotated[
         bool | None,
@@ -1694,20 +1830,34 @@ class ReconstructionOut(BaseModel):
     part: Annotated[FrameRangeOut | None, Field(description="Frames that are localised; null: all.")]
     live: bool
     state: JobState
-    node: Annotated[str, Field(description="The machine that runs it or ran it last; empty: that of the service.")]
+    node: Annotated[
+        str,
+        Field(description="The machine that runs it or ran it last; empty: that of the service."),
+    ]
     stage: Stage
     progress: Annotated[float, Field(description="0 to 1.")]
     tracking_state: State
-    reason: Annotated[str, Field(description="Why it failed, waits or tracks badly; empty while all is well.")]
-    warnings: Annotated[list[str], Field(description="What it found out about the camera, or had to assume.")]
+    reason: Annotated[
+        str,
+        Field(description="Why it failed, waits or tracks badly; empty while all is well."),
+    ]
+    warnings: Annotated[
+        list[str],
+        Field(description="What it found out about the camera, or had to assume."),
+    ]
     priority: int
-    user: Annotated[str, Field(description="Name of the token with which it was queued; empty if none was needed.")]
+    user: Annotated[
+        str,
+        Field(description="Name of the token with which it was queued; empty if none was needed."),
+    ]
     options: ReconstructionOptions
     poses_from: Annotated[
-        str, Field(description="Given poses: the id of their reconstruction, or `file`; empty: estimated.")
+        str,
+        Field(description="Given poses: the id of their reconstruction, or `file`; empty: estimated."),
     ]
     calibration_from: Annotated[
-        str, Field(description="Device of its calibration; empty: that of the recording, if any.")
+        str,
+        Field(description="Device of its calibration; empty: that of the recording, if any."),
     ]
     created_at: AwareDatetime
     started_at: AwareDatetime | None
@@ -1715,11 +1865,23 @@ class ReconstructionOut(BaseModel):
     frames: Annotated[int, Field(description="Frames taken so far.")]
     poses: Annotated[int, Field(description="Frames that have a pose in the published trajectory.")]
     splats: int
-    loss: Annotated[float | None, Field(description="Mean squared error of the views, in units of white squared.")]
+    loss: Annotated[
+        float | None,
+        Field(description="Mean squared error of the views, in units of white squared."),
+    ]
     psnr_db: float | None
-    version: Annotated[int, Field(description="Number of the newest published scene and trajectory; 0: none yet.")]
-    white: Annotated[float | None, Field(description="Radiance shown as white in that version, spikes a frame.")]
-    queue_place: Annotated[int | None, Field(description="1 is the next to begin; null unless it waits in the queue.")]
+    version: Annotated[
+        int,
+        Field(description="Number of the newest published scene and trajectory; 0: none yet."),
+    ]
+    white: Annotated[
+        float | None,
+        Field(description="Radiance shown as white in that version, spikes a frame."),
+    ]
+    queue_place: Annotated[
+        int | None,
+        Field(description="1 is the next to begin; null unless it waits in the queue."),
+    ]
     held: Annotated[bool, Field(description="Whether it stays in the queue until it is let go.")]
     eta_s: Annotated[
         float | None,
@@ -1737,10 +1899,12 @@ class ReconstructionPage(BaseModel):
     )
     items: list[ReconstructionOut]
     next_cursor: Annotated[
-        str | None, Field(description="To be given as `cursor` for those that follow; null: there are no more.")
+        str | None,
+        Field(description="To be given as `cursor` for those that follow; null: there are no more."),
     ]
     total: Annotated[
-        int | None, Field(description="Reconstructions in the queue; null unless it is listed in its order.")
+        int | None,
+        Field(description="Reconstructions in the queue; null unless it is listed in its order."),
     ]
 
 
@@ -1786,21 +1950,42 @@ class RegistrationOut(BaseModel):
         extra="ignore",
     )
     joined: bool
-    reason: Annotated[str, Field(description="Why they were not; empty if they were. Then there are figures.")]
+    reason: Annotated[
+        str,
+        Field(description="Why they were not; empty if they were. Then there are figures."),
+    ]
     similarity: SimilarityOut | None
-    scale_range: Annotated[list[float] | None, Field(description="Smallest and largest scale along the second way.")]
-    scale_sigma: Annotated[float | None, Field(description="Predicted relative standard deviation of the scale.")]
+    scale_range: Annotated[
+        list[float] | None,
+        Field(description="Smallest and largest scale along the second way."),
+    ]
+    scale_sigma: Annotated[
+        float | None,
+        Field(description="Predicted relative standard deviation of the scale."),
+    ]
     turn_sigma_deg: float | None
     shift_sigma: float | None
     residual_px: Annotated[float | None, Field(description="Median distance of common points.")]
-    searched: Annotated[int | None, Field(description="Views of the second that were searched for in the first.")]
+    searched: Annotated[
+        int | None,
+        Field(description="Views of the second that were searched for in the first."),
+    ]
     recognised: Annotated[int | None, Field(description="Of these, views that were found.")]
-    agreeing: Annotated[int | None, Field(description="Views that agree on how the two lie to each other.")]
+    agreeing: Annotated[
+        int | None,
+        Field(description="Views that agree on how the two lie to each other."),
+    ]
     views_alike: int | None
     views_different: int | None
-    brightness: Annotated[float | None, Field(description="Radiance of the first over that of the second.")]
+    brightness: Annotated[
+        float | None,
+        Field(description="Radiance of the first over that of the second."),
+    ]
     splats_kept: Annotated[list[int] | None, Field(description="Of the first and of the second.")]
-    psnr_db: Annotated[list[float] | None, Field(description="How well the result shows what each of them showed.")]
+    psnr_db: Annotated[
+        list[float] | None,
+        Field(description="How well the result shows what each of them showed."),
+    ]
 
 
 class RestartRequest(BaseModel):
@@ -1823,18 +2008,21 @@ class ScaleOut(BaseModel):
         extra="ignore",
     )
     revision: Annotated[
-        int, Field(description="Counts the changes; 0: nothing is known. A change names the one it replaces.")
+        int,
+        Field(description="Counts the changes; 0: nothing is known. A change names the one it replaces."),
     ]
     metres_per_unit: float | None
     sigma: Annotated[
-        float | None, Field(description="Relative standard deviation of metres_per_unit; null: not known.")
+        float | None,
+        Field(description="Relative standard deviation of metres_per_unit; null: not known."),
     ]
     source: Annotated[
         ScaleSource | None,
         Field(description="What the scale rests on: a known length, AprilTags, a board, or two cameras."),
     ]
     up: Annotated[
-        list[float] | None, Field(description="Direction in the scene, of length 1; null: -y is taken for up.")
+        list[float] | None,
+        Field(description="Direction in the scene, of length 1; null: -y is taken for up."),
     ]
     version: Annotated[int | None, Field(description="Version of the scene that it was measured in.")]
     since: Annotated[
@@ -1857,7 +2045,10 @@ class SensorOut(BaseModel):
     height: int
     frame_rate_hz: float
     intrinsics: IntrinsicsModel | None
-    mosaic: Annotated[Mosaic | None, Field(description="Colour pattern of the upright image; null for a grey camera.")]
+    mosaic: Annotated[
+        Mosaic | None,
+        Field(description="Colour pattern of the upright image; null for a grey camera."),
+    ]
 
 
 class StatedCameraModel(BaseModel):
@@ -1869,15 +2060,18 @@ class StatedCameraModel(BaseModel):
         extra="ignore",
     )
     calibration: Annotated[
-        str | None, Field(description="File of gains, dark rates and dead pixels, from `spiked calibrate`.")
+        str | None,
+        Field(description="File of gains, dark rates and dead pixels, from `spiked calibrate`."),
     ] = None
     profile: Annotated[
-        str | None, Field(description="Camera profile, a JSON file; options that are stated win over it.")
+        str | None,
+        Field(description="Camera profile, a JSON file; options that are stated win over it."),
     ] = None
     rate: Annotated[float | None, Field(description="Frames per second.")] = None
-    mosaic: Annotated[Mosaic | None, Field(description="Colour mosaic of the upright image; none: a grey sensor.")] = (
-        None
-    )
+    mosaic: Annotated[
+        Mosaic | None,
+        Field(description="Colour mosaic of the upright image; none: a grey sensor."),
+    ] = None
     flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
     response: Annotated[
         Response | None,
@@ -1907,14 +2101,24 @@ class SystemOut(BaseModel):
     uptime_s: float
     data_folder: str
     disk: DiskOut
-    memory_bytes: Annotated[int, Field(description="Resident memory of the service itself, without its workers.")]
+    memory_bytes: Annotated[
+        int,
+        Field(description="Resident memory of the service itself, without its workers."),
+    ]
     pid: int
     events_seq: Annotated[int, Field(description="Number of the newest event.")]
-    event_clients: Annotated[int, Field(description="Clients of the events now, WebSocket and server-sent events.")]
+    event_clients: Annotated[
+        int,
+        Field(description="Clients of the events now, WebSocket and server-sent events."),
+    ]
     zmq: Annotated[ZmqOut | None, Field(description="null where ZeroMQ is turned off.")]
-    scope: Annotated[Scope, Field(description="Scope of the token of this request; admin where no token is required.")]
+    scope: Annotated[
+        Scope,
+        Field(description="Scope of the token of this request; admin where no token is required."),
+    ]
     token_required: Annotated[
-        bool, Field(description="Whether requests need a token. Where none is required, scopes limit nothing.")
+        bool,
+        Field(description="Whether requests need a token. Where none is required, scopes limit nothing."),
     ]
     token_scope: Annotated[
         Scope | None,
@@ -1953,7 +2157,10 @@ class TimelineOut(BaseModel):
     loss: list[float | None]
     psnr_db: list[float | None]
     splats: list[int | None]
-    work_s: Annotated[list[float | None], Field(description="Seconds of work when the view was tracked.")]
+    work_s: Annotated[
+        list[float | None],
+        Field(description="Seconds of work when the view was tracked."),
+    ]
     work: WorkOut
     gaps: list[GapOut]
     closures: Annotated[list[ClosureOut], Field(description="In the order in which they were closed.")]
@@ -1968,9 +2175,10 @@ class UploadProfile(BaseModel):
         extra="ignore",
     )
     rate: Annotated[float | None, Field(description="Frames per second.")] = None
-    mosaic: Annotated[Mosaic | None, Field(description="Colour mosaic of the upright image; none: a grey sensor.")] = (
-        None
-    )
+    mosaic: Annotated[
+        Mosaic | None,
+        Field(description="Colour mosaic of the upright image; none: a grey sensor."),
+    ] = None
     flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
     response: Annotated[
         Response | None,
@@ -1987,7 +2195,8 @@ class UploadProfile(BaseModel):
     intrinsics: IntrinsicsModel | None = None
     model: Annotated[str, Field(description="Name of the product.")] = ""
     serial: Annotated[
-        str | None, Field(description="Serial number of the camera that the profile is of; null: of any.")
+        str | None,
+        Field(description="Serial number of the camera that the profile is of; null: of any."),
     ] = None
     width: Annotated[int | None, Field(description="Pixels in a row.")] = None
     height: Annotated[int | None, Field(description="Rows.")] = None
@@ -1997,7 +2206,10 @@ class UploadProfile(BaseModel):
             description="Sent on its own, by `PUT uploads/ID/calibration`: a file name says nothing to another machine."
         ),
     ] = None
-    session: Annotated[Session | None, Field(description="How the bridge of a USB camera is made to send.")] = None
+    session: Annotated[
+        Session | None,
+        Field(description="How the bridge of a USB camera is made to send."),
+    ] = None
     note: str = ""
 
 
@@ -2058,9 +2270,10 @@ class ViewRequest(BaseModel):
             description="Optics of the pictures; if not given the capture's own, scaled to the width, the height taken from or added to the middle."
         ),
     ] = None
-    undistorted: Annotated[bool, Field(description="Without the distortion of the lens that these optics have.")] = (
-        False
-    )
+    undistorted: Annotated[
+        bool,
+        Field(description="Without the distortion of the lens that these optics have."),
+    ] = False
     background: list[float] | None = None
     output: Annotated[
         Output,
@@ -2101,7 +2314,10 @@ class BoardScaleOut(BaseModel):
     square: Annotated[float, Field(description="Side of a square, in the unit of the scene.")]
     views: int
     corners: Annotated[int, Field(description="Of the board, that were used.")]
-    error_px: Annotated[float, Field(description="Root mean square error of its corners, px of the pictures.")]
+    error_px: Annotated[
+        float,
+        Field(description="Root mean square error of its corners, px of the pictures."),
+    ]
 
 
 class CalibratedOut(BaseModel):
@@ -2147,7 +2363,10 @@ class CaptureOut(BaseModel):
     verdict: Annotated[VerdictOut | None, Field(description="Null until the recording is closed.")]
     started_at: AwareDatetime
     ended_at: AwareDatetime | None
-    deleted_at: Annotated[AwareDatetime | None, Field(description="Not null: removed; `:restore` brings it back.")]
+    deleted_at: Annotated[
+        AwareDatetime | None,
+        Field(description="Not null: removed; `:restore` brings it back."),
+    ]
     frames_planned: Annotated[int | None, Field(description="Length of the capture if it is known.")]
     recording: RecordingOut | None
     reconstruction_ids: Annotated[
@@ -2157,7 +2376,10 @@ class CaptureOut(BaseModel):
     reconstruction_count: Annotated[int, Field(description="Number of all its reconstructions.")]
     counters: CountersOut | None
     sensor: Annotated[SensorOut | None, Field(description="Null until the source is open.")]
-    group: Annotated[str | None, Field(description="Id of the group of captures that were started together.")]
+    group: Annotated[
+        str | None,
+        Field(description="Id of the group of captures that were started together."),
+    ]
     ring: Annotated[
         str | None,
         Field(
@@ -2176,7 +2398,8 @@ class CapturePage(BaseModel):
     )
     items: list[CaptureOut]
     next_cursor: Annotated[
-        str | None, Field(description="To be given as `cursor` for those that follow; null: there are no more.")
+        str | None,
+        Field(description="To be given as `cursor` for those that follow; null: there are no more."),
     ]
     total: Annotated[int, Field(description="Captures on all pages.")]
 
@@ -2195,20 +2418,36 @@ class CaptureRequest(BaseModel):
             description="usb0, pcie:PATH, sim: or replay:FILE, with options after a question mark. A file or simulation without `pace` waits for its readers."
         ),
     ] = None
-    device: Annotated[str | None, Field(description="Id of a device, instead of a source; `GET devices`.")] = None
-    frames: Annotated[int | None, Field(description="Length; until the source ends or is stopped if not given.")] = None
-    seconds: Annotated[float | None, Field(description="Length in seconds of the camera, instead of frames.")] = None
+    device: Annotated[
+        str | None,
+        Field(description="Id of a device, instead of a source; `GET devices`."),
+    ] = None
+    frames: Annotated[
+        int | None,
+        Field(description="Length; until the source ends or is stopped if not given."),
+    ] = None
+    seconds: Annotated[
+        float | None,
+        Field(description="Length in seconds of the camera, instead of frames."),
+    ] = None
     pretrigger_s: Annotated[float, Field(description="Begin so much earlier, from an armed device's ring.")] = 0.0
     name: str = ""
     notes: str = ""
     record: Annotated[bool, Field(description="Keep the frames in the data folder.")] = True
     reconstruct: Annotated[bool, Field(description="Reconstruct while it runs.")] = True
     options: ReconstructionOptions | None = None
-    camera: Annotated[StatedCameraModel | None, Field(description="The same as options of the source's text.")] = None
-    noise: Annotated[NoiseModel | None, Field(description="Of `sim:`: the same as options of the source's text.")] = (
-        None
-    )
-    intrinsics: Annotated[IntrinsicsModel | None, Field(description="If the source does not know its own.")] = None
+    camera: Annotated[
+        StatedCameraModel | None,
+        Field(description="The same as options of the source's text."),
+    ] = None
+    noise: Annotated[
+        NoiseModel | None,
+        Field(description="Of `sim:`: the same as options of the source's text."),
+    ] = None
+    intrinsics: Annotated[
+        IntrinsicsModel | None,
+        Field(description="If the source does not know its own."),
+    ] = None
 
 
 class GeometryModel(BaseModel):
@@ -2220,9 +2459,10 @@ class GeometryModel(BaseModel):
         extra="ignore",
     )
     rate: Annotated[float | None, Field(description="Frames per second.")] = None
-    mosaic: Annotated[Mosaic | None, Field(description="Colour mosaic of the upright image; none: a grey sensor.")] = (
-        None
-    )
+    mosaic: Annotated[
+        Mosaic | None,
+        Field(description="Colour mosaic of the upright image; none: a grey sensor."),
+    ] = None
     flipped: Annotated[bool | None, Field(description="Rows come bottom-up; false: top-down.")] = None
     response: Annotated[
         Response | None,
@@ -2240,10 +2480,12 @@ class GeometryModel(BaseModel):
     width: Annotated[int | None, Field(description="Pixels in a row, a multiple of 8.")] = None
     height: Annotated[int | None, Field(description="Rows.")] = None
     layout: Annotated[
-        Layout | None, Field(description="How a frame is stored: rows only, or each row followed by its number.")
+        Layout | None,
+        Field(description="How a frame is stored: rows only, or each row followed by its number."),
     ] = None
     bit_order: Annotated[
-        BitOrder | None, Field(description="Which bit of a byte is the leftmost of its eight pixels.")
+        BitOrder | None,
+        Field(description="Which bit of a byte is the leftmost of its eight pixels."),
     ] = None
     frame_rate_hz: Annotated[float | None, Field(deprecated=True, description="Deprecated: use rate.")] = None
 
@@ -2289,10 +2531,12 @@ class UploadRequest(BaseModel):
     sidecar: UploadSidecar | None = None
     geometry: Annotated[GeometryModel | None, Field(description="Wins over the sidecar.")] = None
     profile: Annotated[
-        UploadProfile | None, Field(description="Camera profile, which says what geometry does not.")
+        UploadProfile | None,
+        Field(description="Camera profile, which says what geometry does not."),
     ] = None
     device: Annotated[
-        str | None, Field(description="Device that the recording is of: its profile and its calibration are used.")
+        str | None,
+        Field(description="Device that the recording is of: its profile and its calibration are used."),
     ] = None
     sha256: Annotated[str | None, Field(description="Of the whole file, in hex; checked at the end.")] = None
     form: Annotated[
@@ -2302,5 +2546,6 @@ class UploadRequest(BaseModel):
         ),
     ] = None
     array: Annotated[
-        str | None, Field(description="Name of the array of spikes, where the file has several with three axes.")
+        str | None,
+        Field(description="Name of the array of spikes, where the file has several with three axes."),
     ] = None

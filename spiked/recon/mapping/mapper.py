@@ -194,10 +194,7 @@ class Mapper:
         return self.levels[int(np.ceil(coarse * (len(self.levels) - 1)))]
 
     def fit_motion(self, fast: bool) -> None:
-        """Take the learning rates and the densification of views that mostly see fast motion, or those of slow motion.
-
-        Adam's moments are in units of the rates, so that they begin anew where these change.
-        """
+        """Take the rates and densification of fast or of slow motion; moments, in their units, begin anew on a change."""
         if fast != self.fast:
             self.fast = fast
             self.descent.adopt(self.descent.scene)
@@ -222,11 +219,10 @@ class Mapper:
 
     def _descend(self, rasteriser: AnyRasteriser, slope: Image, decay: float, centre: Array) -> None:
         """A step along the gradient of an image that was seen from `centre`."""
-        self.steps += 1
-        rates = self.options.rates_of(self.fast)
+        self.steps, rates = self.steps + 1, self.options.rates_of(self.fast)
         scaled = tuple(decay * rate for rate in rates.of_arrays(self.white))
-        axes = rates.axes(self.depth, self.camera.intrinsics.fx)
-        self.descent.step(rasteriser, slope, scaled, self._limits(centre), axes)
+        axes, limits = rates.axes(self.depth, self.camera.intrinsics.fx), self._limits(centre)
+        self.descent.step(rasteriser, slope, scaled, limits, axes)
 
     def _limits(self, centre: Array) -> SizeLimits:
         """How large splats may be after a step on an image that was seen from `centre`."""

@@ -194,7 +194,7 @@ class Mapper:
         return self.levels[int(np.ceil(coarse * (len(self.levels) - 1)))]
 
     def fit_motion(self, fast: bool) -> None:
-        """Take the rates and densification of fast or of slow motion; moments, in their units, begin anew on a change."""
+        """Take the rates and densification of fast or of slow motion; moments, in their units, begin anew then."""
         if fast != self.fast:
             self.fast = fast
             self.descent.adopt(self.descent.scene)

@@ -68,8 +68,8 @@ def target_settings(programs: Path, machine: str, folder: Path) -> tuple[dict[st
     return variables, defines
 
 
-def gpu_module(programs: Path, scripts: Path) -> Path:
-    """The module with the CUDA kernels for the tools' Python, on x86-64."""
+def gpu_module(programs: Path, scripts: Path, path: str) -> Path:
+    """The module with the CUDA kernels for the tools' Python, on x86-64; `path` is that of programs."""
     if shutil.which("g++") is None:
         sys.exit("error: nvcc needs g++; install it")
     shutil.rmtree(KERNELS, ignore_errors=True)
@@ -84,7 +84,6 @@ def gpu_module(programs: Path, scripts: Path) -> Path:
     defines = [f"Python_EXECUTABLE={programs}/python", "CMAKE_CXX_COMPILER=g++", "SKBUILD_STATE=wheel"]
     defines += [f"CMAKE_CXX_CREATE_SHARED_MODULE={link} {standard} {unwinder} -lm"]
     defines += ["SKBUILD_SABI_COMPONENT=Development.SABIModule"] if stable else []
-    path = f"{programs}{os.pathsep}{os.environ['PATH']}"
     run(programs / "cmake", "-S", source, "-B", tree, "-G", "Ninja", *(f"-D{define}" for define in defines), PATH=path)
     run(programs / "cmake", "--build", tree, "--target", "_gpu", PATH=path)
     if not (tree / "spiked/native/gpu/cuda.o").is_file():
@@ -119,7 +118,7 @@ def build(python: str, machine: str, out: Path) -> Path:
     variables |= {"SOURCE_DATE_EPOCH": epoch(), "LC_ALL": "C.UTF-8"}
     variables |= {"PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"}
     if machine == "x86_64" == platform.machine():
-        defines += [f"SPIKED_GPU_MODULE={gpu_module(programs, scripts)}"]
+        defines += [f"SPIKED_GPU_MODULE={gpu_module(programs, scripts, variables['PATH'])}"]
     tree = work / f"{Path(python).name}-{machine}"
     with tempfile.TemporaryDirectory() as made:
         run(

@@ -30,7 +30,7 @@ def plan_of(
         pixels,
         trainer.mapper.cap_of(extent),
         trainer.sensor.mosaic is not None,
-        fast > 0.5,
+        trainer.mostly_fast(ids),
         options,
         trainer.threads,
     )

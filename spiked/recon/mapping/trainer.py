@@ -111,9 +111,13 @@ class MapTrainer:
         """The share of views that see fast motion; 0 of none."""
         return float(np.mean([self.views[i].frames.warped is not None for i in ids])) if ids else 0.0
 
+    def mostly_fast(self, ids: Sequence[int]) -> bool:
+        """Whether most of these views see fast motion."""
+        return self.fast_share(ids) > 0.5
+
     def fit_motion(self, path: Path) -> None:
         """Let the map be fitted as suits most of the views on the path."""
-        self.mapper.fit_motion(self.fast_share(self.views.mappable(path)) > 0.5)
+        self.mapper.fit_motion(self.mostly_fast(self.views.mappable(path)))
 
     def reshuffle(self) -> None:
         """Draw a new random order of the views at the next step."""
@@ -129,17 +133,15 @@ class MapTrainer:
 
         points [N, 3] are landmarks, whose depths give the range of the sweep.
         """
-        self.fit_motion(path)
         posed = self._posed(path)
         works = (self._sweeps.prepare(posed, posed.ids.index(one), points, threads=self.threads) for one in ids)
-        self._plant([work() for work in works if work is not None], (self.options.seeding.sure, 0.0))
+        self._plant(path, [work() for work in works if work is not None], (self.options.seeding.sure, 0.0))
 
     def _sweep_now(self, path: Path, points: Array) -> None:
         """As `sweep_behind`, on this thread."""
         self._swept_px = self.views.travelled_px
-        self.fit_motion(path)
         work = self._prepare_quick(path, points, self.threads)
-        self._plant([] if work is None else [work()])
+        self._plant(path, [] if work is None else [work()])
 
     def sweep_behind(self, path: Path, points: Array) -> None:
         """Seed the view that another thread has swept, and let it sweep a recent one if the camera has moved on.
@@ -150,8 +152,7 @@ class MapTrainer:
             swept, self._sweeping = self._sweeping.result(), None
             (rotation,), (centre,) = path.poses([swept.view.time])
             self.carry(path)
-            self.fit_motion(path)
-            self._plant([replace(swept, rotation=rotation, centre=centre)])
+            self._plant(path, [replace(swept, rotation=rotation, centre=centre)])
             self.carry(path)
         if self._sweeping is not None or not self.sweep_due:
             return
@@ -178,9 +179,10 @@ class MapTrainer:
         moved_px = self.views.travelled_px - self._swept_px
         return len(self.mapper) > 0 and moved_px > self.options.seeding.live_px
 
-    def _plant(self, swept: list[SweptView], surer: tuple[float, ...] = (0.0,)) -> None:
+    def _plant(self, path: Path, swept: list[SweptView], surer: tuple[float, ...] = (0.0,)) -> None:
         """Seed splats from swept views where the map is empty, first where the depth is `surer`."""
         begins = len(self.mapper) == 0
+        self.fit_motion(path)
         self.mapper.extent = self.extent
         for least in surer:
             for one in swept:

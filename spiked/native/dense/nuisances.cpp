@@ -1,8 +1,7 @@
 // Evidence of the brightness of a view and of the gains of pixels, see spiked/recon/mapping/photometric.py.
-#include <cmath>
+#include "nuisances.hpp"
 
 #include "../common/arrays.hpp"
-#include "../common/clones.hpp"
 #include "bindings.hpp"
 
 namespace spiked {
@@ -23,11 +22,10 @@ SPIKED_CLONES Light agreeing_light(const float* gain, const float* rendered, con
                                    const float* deviation, int64_t width, float model_error, float sigmas) {
     float expected_sum = 0, observed_sum = 0;
     for (int64_t x = 0; x < width; ++x) {
-        const float expected = gain[x] * rendered[x], error = model_error * (expected + observed[x]);
-        // An infinite deviation says that nothing was seen.
-        const bool agrees = std::fabs(observed[x] - expected) < sigmas * (deviation[x] + error) && deviation[x] < 1e30f;
-        expected_sum += agrees ? expected : 0.0f;
-        observed_sum += agrees ? observed[x] : 0.0f;
+        const float expected = gain[x] * rendered[x];
+        const bool counts = agrees(expected, observed[x], deviation[x], model_error, sigmas);
+        expected_sum += counts ? expected : 0.0f;
+        observed_sum += counts ? observed[x] : 0.0f;
     }
     return {expected_sum, observed_sum};
 }
@@ -50,10 +48,9 @@ nb::tuple agreement(const Image& gain, const Image& rendered, const Image& obser
 SPIKED_CLONES void add_evidence(const float* gain, const float* rendered, const float* observed, const float* deviation,
                                 int64_t count, float level, float model_error, float* xx, float* xy) {
     for (int64_t i = 0; i < count; ++i) {
-        const float error = model_error * (gain[i] * rendered[i] + observed[i]), model = rendered[i] * level;
-        const float weighted = model / (deviation[i] * deviation[i] + error * error + 1e-12f);
-        xx[i] += weighted * model;
-        xy[i] += weighted * (observed[i] - model);
+        const GainTerms terms = gain_terms(gain[i], rendered[i], observed[i], deviation[i], level, model_error);
+        xx[i] += terms.xx;
+        xy[i] += terms.xy;
     }
 }
 

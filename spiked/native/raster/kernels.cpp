@@ -9,6 +9,7 @@
 #include "moving_camera.inl"
 #include "composite.inl"
 #include "adam.inl"
+#include "similarity.inl"
 #include "ssim.inl"
 // clang-format on
 

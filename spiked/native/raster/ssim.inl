@@ -1,5 +1,4 @@
 // Mean structural similarity and its gradient: plain loops that the compiler vectorises for each instruction set.
-// (Z. Wang et al., "Image quality assessment: from error visibility to structural similarity", 2004.)
 
 namespace spiked {
 namespace {
@@ -19,27 +18,14 @@ static double sum_floats(const float* x, int count) {
     return sum;
 }
 
-constexpr int kReach = kSsimMargin;  // the window has 2 kReach + 1 pixels on a side
-// exp(-k^2 / (2 1.5^2)), normalised over -5..5
-static constexpr float kWindow[kReach + 1] = {0.26601172f, 0.21300553f, 0.10936069f,
-                                              0.03600077f, 0.00759876f, 0.00102838f};
-
 // out[x] = the window over in[x - 5 .. x + 5].
 static inline void blur_row(const float* __restrict in, int width, float* __restrict out) {
-    for (int x = 0; x < width; ++x) {
-        float sum = kWindow[0] * in[x];
-        for (int k = 1; k <= kReach; ++k) sum += kWindow[k] * (in[x - k] + in[x + k]);
-        out[x] = sum;
-    }
+    for (int x = 0; x < width; ++x) out[x] = windowed(in + x, 1);
 }
 
 // out[x] = the window over the rows above and below in[x], `stride` apart.
 static inline void blur_column(const float* __restrict in, int stride, int width, float* __restrict out) {
-    for (int x = 0; x < width; ++x) {
-        float sum = kWindow[0] * in[x];
-        for (int k = 1; k <= kReach; ++k) sum += kWindow[k] * (in[x - k * stride] + in[x + k * stride]);
-        out[x] = sum;
-    }
+    for (int x = 0; x < width; ++x) out[x] = windowed(in + x, stride);
 }
 
 // Of one row: similarity, and its derivatives by the blurs of x, x^2 and xy.
@@ -48,15 +34,11 @@ static inline void similarity_row(const SsimImage& image, float* const blurred[5
     const float *mean_x = blurred[0], *mean_y = blurred[1], *xx = blurred[2], *yy = blurred[3], *xy = blurred[4];
     float* __restrict d_mean = d[0], * __restrict d_xx = d[1], * __restrict d_xy = d[2];
     for (int x = 0; x < image.width; ++x) {
-        const float m = mean_x[x], n = mean_y[x];
-        const float a1 = 2 * m * n + image.c1, a2 = 2 * (xy[x] - m * n) + image.c2;
-        const float over1 = 1 / (m * m + n * n + image.c1);
-        const float over2 = 1 / (xx[x] - m * m + yy[x] - n * n + image.c2);
-        const float s = a1 * a2 * over1 * over2;
-        similarity[x] = s;
-        d_mean[x] = 2 * n * (a2 - a1) * over1 * over2 - 2 * m * s * (over1 - over2);
-        d_xx[x] = -s * over2;
-        d_xy[x] = 2 * a1 * over1 * over2;
+        const Similar at = similar(image, mean_x[x], mean_y[x], xx[x], yy[x], xy[x]);
+        similarity[x] = at.value;
+        d_mean[x] = at.by_mean;
+        d_xx[x] = at.by_xx;
+        d_xy[x] = at.by_xy;
     }
 }
 
@@ -118,7 +100,7 @@ static void ssim_gradient(const SsimImage& image, const float* rendered, const f
         const float *a = rendered + at, *b = target + at;
         float* out = d_rendered + at;
         for (int k = 0; k < 3; ++k) blur_column(planes[5 + k] + at, width, width, d_rows[k]);
-        for (int x = 0; x < width; ++x) out[x] = over * (d_rows[0][x] + 2 * a[x] * d_rows[1][x] + b[x] * d_rows[2][x]);
+        for (int x = 0; x < width; ++x) out[x] = over * by_rendered(a[x], b[x], d_rows[0][x], d_rows[1][x], d_rows[2][x]);
     }
 }
 

@@ -63,7 +63,7 @@ class AnyRasteriser(Protocol):
 class Choice:
     """The chosen renderer and the reason."""
 
-    renderer: Literal["cpu", "cuda"]
+    renderer: Literal["cpu", "cuda", "emulated"]
     reason: str
     unused: bool = False
     """A GPU is there, and cannot be rendered with."""
@@ -73,7 +73,8 @@ class Choice:
 
 
 def chosen() -> Choice:
-    """The renderer that SPIKED_RENDER names, cpu or cuda; without it the GPU's if it can render here.
+    """The renderer that SPIKED_RENDER names, cpu or cuda; without it the GPU's if it can render here. For tests it may
+    also be emulated: the GPU's kernels on the CPU, slowly.
 
     Where an NVIDIA driver is loaded, a GPU that cannot be used is said in the log, once a process. Raises
     ConfigurationError where cuda is wanted and cannot be had.
@@ -84,6 +85,8 @@ def chosen() -> Choice:
 @cache
 def choice_for(wanted: str) -> Choice:
     """The renderer for a value of SPIKED_RENDER (cpu, cuda or empty), found once. Raises ConfigurationError."""
+    if wanted == "emulated":
+        return Choice("emulated", "SPIKED_RENDER asks for it")
     if wanted not in ("", "cpu", "cuda"):
         raise ConfigurationError(f"SPIKED_RENDER={wanted} is no renderer: use cpu or cuda, or unset it")
     if wanted == "cpu":
@@ -101,4 +104,5 @@ def choice_for(wanted: str) -> Choice:
 
 def rasteriser_for(camera: Camera, threads: int | None = None) -> AnyRasteriser:
     """A rasteriser of the kind that is `chosen`; threads are the CPU's. Raises ConfigurationError as that does."""
-    return Rasteriser(camera, threads) if chosen().renderer == "cpu" else gpu.GpuRasteriser(camera)
+    renderer = chosen().renderer
+    return Rasteriser(camera, threads) if renderer == "cpu" else gpu.GpuRasteriser(camera, device=renderer)

@@ -148,17 +148,8 @@ class Rasteriser:
         channels: NDArray[np.uint8] | None,
         background: float | Sequence[float],
     ) -> RenderedImage:
-        rotations = np.ascontiguousarray(rotations, np.float64)
-        centres = np.ascontiguousarray(centres, np.float64)
+        rotations, centres = checked_poses(rotations, centres)
         arrays, count, colours = self._splats(splats)
-        if rotations.ndim != 3 or rotations.shape[1:] != (3, 3) or centres.shape != (len(rotations), 3):
-            raise ConfigurationError(
-                f"sub-poses are rotations [S, 3, 3] and centres [S, 3], not {rotations.shape} and {centres.shape}"
-            )
-        if len(rotations) == 0:
-            raise ConfigurationError("a render needs at least one sub-pose")
-        if not (np.isfinite(rotations).all() and np.isfinite(centres).all()):
-            raise ConfigurationError("a sub-pose is not finite: the trajectory that it comes from is broken")
         size = (self.camera.height, self.camera.width)
         if channels is not None:
             channels = _checked_channels(channels, size, colours)
@@ -193,6 +184,21 @@ class Rasteriser:
         )
         self._native.backward(d_values, *out.arrays(), out.rotation, out.centre, out.contribution, out.radius_px)
         return out
+
+
+def checked_poses(rotations: ArrayLike, centres: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """[S, 3, 3] and [S, 3], contiguous. Raises ConfigurationError for other shapes, and where they are not finite."""
+    rotations = np.ascontiguousarray(rotations, np.float64)
+    centres = np.ascontiguousarray(centres, np.float64)
+    if rotations.ndim != 3 or rotations.shape[1:] != (3, 3) or centres.shape != (len(rotations), 3):
+        raise ConfigurationError(
+            f"sub-poses are rotations [S, 3, 3] and centres [S, 3], not {rotations.shape} and {centres.shape}"
+        )
+    if len(rotations) == 0:
+        raise ConfigurationError("a render needs at least one sub-pose")
+    if not (np.isfinite(rotations).all() and np.isfinite(centres).all()):
+        raise ConfigurationError("a sub-pose is not finite: the trajectory that it comes from is broken")
+    return rotations, centres
 
 
 def _checked_channels(channels: NDArray[Any], size: tuple[int, int], colours: int) -> NDArray[np.uint8]:

@@ -3,6 +3,8 @@
 `descent_for` gives the best one here: on a GPU splats and moments stay on the device from step to step.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +13,15 @@ from spiked.render.gpu import GpuRasteriser, device_errors
 from spiked.render.optimiser import Adam
 from spiked.render.splats import AnySplats, DeviceScene, Floats, MeanAxes, SizeLimits
 from spiked.scene import Scene
+
+
+class Stride(NamedTuple):
+    """How far a step goes."""
+
+    rates: tuple[float, ...]
+    """Of the five arrays, the first in units of the `axes`."""
+    limits: SizeLimits
+    axes: MeanAxes
 
 
 class Descent:
@@ -155,21 +166,26 @@ class DeviceDescent(Descent):
     def step(
         self,
         rasteriser: AnyRasteriser,
-        slope: Floats,
+        slope: Floats | None,
         rates: tuple[float, ...],
         limits: SizeLimits,
         axes: MeanAxes,
     ) -> None:
-        """See `Descent.step`."""
+        """See `Descent.step`; no slope: that of the last comparison of `rasteriser`, which was of `on_device`."""
         assert isinstance(rasteriser, GpuRasteriser)
+        beta1, beta2, _ = self._settings
+        scene = self.on_device(rasteriser)
+        rasteriser.descend(slope, scene, rates, axes, beta1, beta2, self.adam.epsilon, limits)
+        self._behind = True
+
+    def on_device(self, rasteriser: GpuRasteriser) -> DeviceScene:
+        """The scene on the device, which `model` is from now on."""
         if self._device is None:
             with device_errors():
                 device = rasteriser.device_scene()
                 device.native.set(*self._scene.arrays(), *self.adam.packed())
             self._device = device
-        beta1, beta2, _ = self._settings
-        rasteriser.descend(slope, self._device, rates, axes, beta1, beta2, self.adam.epsilon, limits)
-        self._behind = True
+        return self._device
 
     def _fetch(self) -> None:
         if not self._behind or self._device is None:

@@ -11,11 +11,13 @@ from functools import cache
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 import spiked.native._gpu as _gpu
 from spiked.errors import ConfigurationError
 from spiked.render.camera import Camera
-from spiked.render.cpu import Rasteriser
+from spiked.render.comparison import Compared, DeviceFrame, RateTerms, ViewGains
+from spiked.render.cpu import Rasteriser, checked_poses
 from spiked.render.splats import AnySplats, DeviceScene, Floats, Gradients, MeanAxes, RenderedImage, SizeLimits
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics
@@ -65,13 +67,15 @@ def device_errors() -> Iterator[None]:
 class GpuRasteriser(Rasteriser):
     """`Rasteriser` on a GPU: the same methods, shapes and errors. The same input gives the same bits.
 
-    Splats, images and gradients are copied to and from the device at every call.
+    Splats, images and gradients are copied to and from the device at every call, but for what is done to a
+    `DeviceScene`: its splats stay there, and where it is compared with a `DeviceFrame`, images and gradients do, too.
     """
 
     def __init__(self, camera: Camera, near: float = 0.01, device: Literal["cuda", "emulated"] = "cuda") -> None:
         """The emulated device runs the same kernels on the CPU, slowly: for tests. Raises ConfigurationError where
         there is no GPU."""
         self._emulated = device == "emulated"
+        self._gain: Floats | None = None
         super().__init__(camera, 1, near)
 
     def _forward(self, *inputs: Any) -> RenderedImage:
@@ -87,9 +91,73 @@ class GpuRasteriser(Rasteriser):
         """A scene on this device, empty."""
         return DeviceScene(self._native.scene())
 
+    def frame(
+        self, rates: Floats, deviation: Floats, windows: Floats | None, channels: NDArray[np.uint8] | None = None
+    ) -> DeviceFrame:
+        """A view on this device: rates and their deviations [H, W] or [H, W, 3], infinite where nothing was seen, the
+        windows [2, H, W] of `forward_moving` or None for a camera that stands still, and a mosaic's channels [H, W]."""
+        arrays = [np.ascontiguousarray(array, np.float32) for array in (rates, deviation)]
+        if windows is not None:
+            windows = np.ascontiguousarray(windows, np.float32)
+        parts = [array for array in (*arrays, windows, channels) if array is not None]
+        with self._told(), device_errors():
+            return DeviceFrame(self._native.frame(*arrays, windows, channels), sum(part.nbytes for part in parts))
+
+    def compare(
+        self,
+        scene: DeviceScene,
+        rotations: ArrayLike,
+        centres: ArrayLike,
+        frame: DeviceFrame,
+        terms: RateTerms,
+        gains: ViewGains | None = None,
+        background: float = 0.0,
+    ) -> Compared:
+        """Render a scene from the poses, as `forward` or `forward_moving` with the windows of a frame, and compare the
+        image with that.
+
+        The image and the gradient of the loss by it, (1 - ssim) error + ssim * ssim_scale * unlike, stay on the device
+        for `descend` and `add_evidence`. SSIM of a mosaic is that of grey images.
+        """
+        poses = checked_poses(rotations, centres)
+        self._inputs = None  # backward() needs the slope of an image that was brought here
+        self._frame = frame  # its windows are needed until descend() is done
+        with self._told(), device_errors():
+            if gains is not None and gains.gain is not self._gain:
+                self._native.set_gains(np.ascontiguousarray(gains.gain, np.float32))
+                self._gain = gains.gain
+            error, similarity, expected, seen = self._native.compare(
+                scene.native, frame.native, *poses, np.full(3, background, np.float32),
+                white=terms.white, floor=terms.floor, share=terms.ssim, scale=terms.ssim_scale,
+                level=None if gains is None else gains.level,
+                model_error=0.0 if gains is None else gains.model_error,
+                sigmas=0.0 if gains is None else gains.sigmas,
+            )  # fmt: skip
+        return Compared(error, 1 - similarity, expected, seen)
+
+    def slope(self, shape: tuple[int, ...]) -> Floats:
+        """The gradient of the last comparison by its image, of that shape."""
+        out = np.empty(shape, np.float32)
+        with self._told(), device_errors():
+            self._native.slope(out)
+        return out
+
+    def add_evidence(self, frame: DeviceFrame, level: float, model_error: float) -> None:
+        """Add the last comparison, which was with this frame, to the evidence of the pixels' gains, see `Nuisances`."""
+        with self._told(), device_errors():
+            self._native.add_evidence(frame.native, level, model_error)
+
+    def take_evidence(self) -> tuple[Floats, Floats]:
+        """The evidence since it was last taken, as sums xx and xy [H, W] of normal equations."""
+        size = (self.camera.height, self.camera.width)
+        xx, xy = np.empty(size, np.float32), np.empty(size, np.float32)
+        with device_errors():
+            self._native.take_evidence(xx, xy)
+        return xx, xy
+
     def descend(
         self,
-        d_values: Floats,
+        d_values: Floats | None,
         scene: DeviceScene,
         rates: tuple[float, ...],
         axes: MeanAxes,
@@ -99,13 +167,24 @@ class GpuRasteriser(Rasteriser):
         limits: SizeLimits,
     ) -> None:
         """`backward` and a step of Adam on the device, as in `Descent.step`. The last image was of `scene`, or of the
-        splats that it was set to."""
-        self._check_slope(d_values)
-        with device_errors():
+        splats that it was set to; without `d_values` it was compared, and the gradient is that of its loss."""
+        if d_values is not None:
+            self._check_slope(d_values)
+            d_values = np.ascontiguousarray(d_values, np.float32)
+        with self._told(), device_errors():
             self._native.descend(
-                np.ascontiguousarray(d_values, np.float32), scene.native, np.array(rates, np.float32), axes.blur,
+                d_values, scene.native, np.array(rates, np.float32), axes.blur,
                 axes.own, beta1, beta2, epsilon, limits.log_scale, limits.widest, np.array(limits.centre, np.float32),
             )  # fmt: skip
+
+    @staticmethod
+    @contextmanager
+    def _told() -> Iterator[None]:
+        """Raises ConfigurationError for what does not fit."""
+        try:
+            yield
+        except ValueError as error:
+            raise ConfigurationError(f"scene, view and image do not fit: {error}") from error
 
     def _splats(self, splats: AnySplats) -> tuple[tuple[Any, ...], int, int]:
         if isinstance(splats, DeviceScene):

@@ -17,6 +17,9 @@ namespace {
 
 constexpr int kWarp = 32;
 
+// Blocks of a grid that has so many threads at least.
+inline uint64_t blocks_of(uint64_t threads, int of_block) { return (threads + of_block - 1) / of_block; }
+
 template <class T, int Threads>
 struct PerThread {
 #if defined(__CUDACC__)

@@ -6,7 +6,11 @@
 #include "block.hpp"
 #include "../raster/project.inl"
 #include "../raster/moving_camera.inl"
+#include "../raster/similarity.inl"
+#include "../dense/nuisances.hpp"
 #include "kernels.inl"
+#include "compare.inl"
+#include "compare_passes.inl"
 #include "passes.inl"
 // clang-format on
 

@@ -660,12 +660,12 @@ struct Descend {
     }
 };
 
-// The sums by the poses over all blocks; a block has one of the six of a pose.
-struct SumPoses {
+// What the blocks of another kernel have summed, summed over them; a block has one of the columns.
+struct SumBlocks {
     static constexpr int kThreads = 256;
-    const double* partial;  // [blocks][poses][6]
-    int blocks, poses;
-    double* out;  // [poses][6]
+    const double* partial;  // [blocks][columns]
+    int blocks, columns;
+    double* out;  // [columns]
     SPIKED_DEVICE void operator()(const Block<kThreads>& block) const {
         SPIKED_SHARED double totals[Block<kThreads>::kWarps];
         PerThread<Sums<double, 1>, kThreads> sums;
@@ -673,7 +673,7 @@ struct SumPoses {
         block.each([&](int thread) {
             double sum = 0;
             for (int i = thread; i < blocks; i += kThreads)
-                sum += partial[static_cast<int64_t>(i) * poses * 6 + block.index];
+                sum += partial[static_cast<int64_t>(i) * columns + block.index];
             sums[thread] = {{sum}};
             some[thread] = true;
         });

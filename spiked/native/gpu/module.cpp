@@ -20,12 +20,88 @@ void forward_scene(GpuRenderer& self, GpuScene& scene, Array<const double, 3> ro
     self.forward(scene, views, background.data(), values.data(), alpha.data(), depth.data());
 }
 
-void descend(GpuRenderer& self, AnyArray<const float> d_values, GpuScene& scene, Array<const float, 1> rates,
+size_t pixels_of(const GpuRenderer& self) { return static_cast<size_t>(self.camera().height) * self.camera().width; }
+
+template <class T>
+void expect_plane(const GpuRenderer& self, const Array<T, 2>& plane) {
+    expect(plane.shape(0) == static_cast<size_t>(self.camera().height) &&
+               plane.shape(1) == static_cast<size_t>(self.camera().width),
+           "a plane has another size than the images");
+}
+
+std::unique_ptr<GpuFrame> frame(GpuRenderer& self, AnyArray<const float> rates, AnyArray<const float> deviation,
+                                std::optional<Array<const float, 3>> windows,
+                                std::optional<Array<const uint8_t, 2>> channels) {
+    const size_t height = self.camera().height, width = self.camera().width, values = rates.size();
+    expect((values == height * width || (values == 3 * height * width && !channels)) && deviation.size() == values,
+           "rates and deviations are [H, W] or [H, W, 3]");
+    expect(!windows || (windows->shape(0) == 2 && windows->shape(1) == height && windows->shape(2) == width),
+           "windows are [2, H, W]");
+    if (channels) expect_plane(self, *channels);
+    nb::gil_scoped_release release;
+    return self.frame({values, rates.data(), deviation.data(), windows ? windows->data() : nullptr,
+                       channels ? channels->data() : nullptr});
+}
+
+void expect_alike(const GpuRenderer& self, const GpuFrame& frame) {
+    expect(frame.width == self.camera().width && frame.height == self.camera().height, "the frame has another size");
+}
+
+nb::tuple compare(GpuRenderer& self, GpuScene& scene, GpuFrame& frame, Array<const double, 3> rotations,
+                  Array<const double, 2> centres, Array<const float, 1> background, float white, float floor,
+                  float share, float scale, std::optional<float> level, float model_error, float sigmas) {
+    expect_poses(rotations, centres, background);
+    const size_t poses = rotations.shape(0), pixels = pixels_of(self);
+    expect_alike(self, frame);
+    expect(!frame.moving || poses > 1, "windows need two poses");
+    expect(frame.values == pixels * (frame.mosaic ? 1 : scene.colours()) && (!frame.mosaic || scene.colours() == 3),
+           "the frame has other colours than the scene");
+    expect(white > 0, "white is not positive");
+    expect(!level || (self.has_gains() && frame.values == pixels), "gains are set first, for frames of one value a pixel");
+    const Views views{rotations.data(), centres.data(), static_cast<int>(poses), nullptr, nullptr, nullptr, nullptr};
+    const RateLoss loss{white, floor, share, scale, level.has_value(), level.value_or(1.0f), model_error, sigmas};
+    RateComparison made;
+    {
+        nb::gil_scoped_release release;
+        made = self.compare(scene, frame, views, background.data(), loss);
+    }
+    return nb::make_tuple(made.error, made.similarity, made.expected_light, made.seen_light);
+}
+
+void set_gains(GpuRenderer& self, Array<const float, 2> gain) {
+    expect_plane(self, gain);
+    nb::gil_scoped_release release;
+    self.set_gains(gain.data());
+}
+
+void slope(GpuRenderer& self, AnyArray<float> out) {
+    expect(self.compared(), "the last image was not compared");
+    expect(out.size() == pixels_of(self) * (self.mosaic() ? 1 : self.splats().colours), "the output has the wrong size");
+    nb::gil_scoped_release release;
+    self.slope(out.data());
+}
+
+void add_evidence(GpuRenderer& self, GpuFrame& frame, float level, float model_error) {
+    expect(self.compared() && self.has_gains(), "the last image was not compared");
+    expect_alike(self, frame);
+    expect(frame.values == pixels_of(self), "gains are of frames of one value a pixel");
+    nb::gil_scoped_release release;
+    self.add_evidence(frame, level, model_error);
+}
+
+void take_evidence(GpuRenderer& self, Array<float, 2> xx, Array<float, 2> xy) {
+    expect_plane(self, xx);
+    expect_plane(self, xy);
+    nb::gil_scoped_release release;
+    self.take_evidence(xx.data(), xy.data());
+}
+
+void descend(GpuRenderer& self, std::optional<AnyArray<const float>> d_values, GpuScene& scene, Array<const float, 1> rates,
              float blur, bool own_axes, float beta1, float beta2, float epsilon, float most_log_scale, float widest,
              Array<const float, 1> centre) {
     expect(self.poses() > 0, "backward follows forward");
-    const size_t pixels = static_cast<size_t>(self.camera().height) * self.camera().width;
-    expect(d_values.size() == pixels * (self.mosaic() ? 1 : scene.colours()), "d_values has the wrong size");
+    expect(d_values ? d_values->size() == pixels_of(self) * (self.mosaic() ? 1 : scene.colours()) : self.compared(),
+           "d_values has the wrong size, or the last image was not compared");
     expect(self.splats().count == scene.count() && self.splats().colours == scene.colours(),
            "the last image is of another scene");
     expect(rates.shape(0) == 5, "a rate for each of the five arrays");
@@ -41,7 +117,7 @@ void descend(GpuRenderer& self, AnyArray<const float> d_values, GpuScene& scene,
                              widest,
                              {c[0], c[1], c[2]}};
     nb::gil_scoped_release release;
-    self.descend(d_values.data(), scene, given);
+    self.descend(d_values ? d_values->data() : nullptr, scene, given);
 }
 
 void set_scene(GpuScene& self, Array<const float, 2> means, Array<const float, 2> quats,
@@ -103,6 +179,7 @@ NB_MODULE(_gpu, m) {
         .def("opacity_logits", &opacity_logits, nb::arg("out").noconvert())
         .def_prop_ro("count", &GpuScene::count)
         .def_prop_ro("colours", &GpuScene::colours);
+    nb::class_<GpuFrame>(m, "Frame");
     nb::class_<GpuRenderer> renderer(m, "Renderer");
     bind_passes<GpuRenderer>(renderer);
     renderer
@@ -110,10 +187,19 @@ NB_MODULE(_gpu, m) {
              nb::arg("centres").noconvert(), nb::arg("weights").none().noconvert(),
              nb::arg("windows").none().noconvert(), nb::arg("channels").none().noconvert(), nb::arg("background"),
              nb::arg("values").noconvert(), nb::arg("alpha").noconvert(), nb::arg("depth").noconvert())
-        .def("descend", &descend, nb::arg("d_values"), nb::arg("scene"), nb::arg("rates"), nb::arg("blur"),
+        .def("descend", &descend, nb::arg("d_values").none(), nb::arg("scene"), nb::arg("rates"), nb::arg("blur"),
              nb::arg("own_axes"), nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"), nb::arg("most_log_scale"),
              nb::arg("widest"), nb::arg("centre"))
-        .def("scene", &GpuRenderer::scene);
+        .def("scene", &GpuRenderer::scene)
+        .def("frame", &frame, nb::arg("rates"), nb::arg("deviation"), nb::arg("windows").none(),
+             nb::arg("channels").none())
+        .def("compare", &compare, nb::arg("scene"), nb::arg("frame"), nb::arg("rotations"), nb::arg("centres"),
+             nb::arg("background"), nb::arg("white"), nb::arg("floor"), nb::arg("share"), nb::arg("scale"),
+             nb::arg("level").none(), nb::arg("model_error"), nb::arg("sigmas"))
+        .def("slope", &slope, nb::arg("out").noconvert())
+        .def("set_gains", &set_gains, nb::arg("gain"))
+        .def("add_evidence", &add_evidence, nb::arg("frame"), nb::arg("level"), nb::arg("model_error"))
+        .def("take_evidence", &take_evidence, nb::arg("xx").noconvert(), nb::arg("xy").noconvert());
     m.def(
         "renderer",
         [](double fx, double fy, double cx, double cy, int width, int height, double near, bool emulated,

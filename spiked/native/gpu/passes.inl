@@ -24,8 +24,6 @@ namespace {
 
 constexpr uint64_t kMaxPairs = 1u << 30;  // of a splat and a tile
 
-uint64_t blocks_of(uint64_t threads, int of_block) { return (threads + of_block - 1) / of_block; }
-
 // call(std::true_type or std::false_type), by the value.
 template <class Call>
 void choose(bool value, Call call) {
@@ -132,23 +130,64 @@ class Resident final : public GpuScene {
 template <class Device>
 class Passes final : public GpuRenderer {
   public:
-    explicit Passes(const PinholeF& camera) : GpuRenderer(camera) {}
+    explicit Passes(const PinholeF& camera) : GpuRenderer(camera), comparer_(device_) {}
 
     const char* instructions() const override { return Device::kName; }
 
     void forward(const SplatArrays& splats, const Views& views, const float background[3], float* values, float* alpha,
                  float* depth) override {
-        poses_ = 0;  // until it is done
+        start();
         take(splats);
-        render(views, background, values, alpha, depth);
+        show(views, background, values, alpha, depth);
     }
 
     void forward(GpuScene& scene, const Views& views, const float background[3], float* values, float* alpha,
                  float* depth) override {
-        poses_ = 0;
+        start();
         splats_ = static_cast<Resident<Device>&>(scene).arrays();
-        render(views, background, values, alpha, depth);
+        show(views, background, values, alpha, depth);
     }
+
+    RateComparison compare(GpuScene& scene, GpuFrame& given, const Views& poses, const float background[3],
+                           const RateLoss& loss) override {
+        start();
+        auto& frame = static_cast<Frame<Device>&>(given);
+        splats_ = static_cast<Resident<Device>&>(scene).arrays();
+        const float* windows = frame.moving ? frame.windows.data() : nullptr;
+        render(poses, {nullptr, windows, frame.mosaic ? frame.channels.data() : nullptr}, background);
+        const RateComparison made = comparer_.compare(comparer_.pair(image_.data(), frame, loss.gains), loss);
+        compared_ = true;
+        return made;
+    }
+
+    std::unique_ptr<GpuFrame> frame(const FrameArrays& given) override {
+        auto frame = std::make_unique<Frame<Device>>();
+        frame->width = camera_.width, frame->height = camera_.height, frame->values = given.values;
+        frame->mosaic = given.channels != nullptr, frame->moving = given.windows != nullptr;
+        device_.upload(frame->rates, given.rates, given.values);
+        device_.upload(frame->deviation, given.deviation, given.values);
+        if (frame->moving) device_.upload(frame->windows, given.windows, 2 * pixels());
+        if (frame->mosaic) device_.upload(frame->channels, given.channels, pixels());
+        device_.finish();
+        return frame;
+    }
+
+    void set_gains(const float* gain) override {
+        comparer_.set_gains(gain, pixels());
+        has_gains_ = true;
+    }
+
+    void slope(float* out) override {
+        device_.download(out, comparer_.slope(), shown());
+        device_.finish();
+    }
+
+    void add_evidence(GpuFrame& frame, float level, float model_error) override {
+        comparer_.add_evidence(comparer_.pair(image_.data(), static_cast<Frame<Device>&>(frame), true), level,
+                               model_error);
+    }
+
+    void take_evidence(float* xx, float* xy) override { comparer_.take_evidence(xx, xy, pixels()); }
 
     void backward(const float* d_values, const GradientArrays& out) override {
         differentiate(d_values);
@@ -183,22 +222,46 @@ class Passes final : public GpuRenderer {
     template <class T>
     using Buffer = typename Device::template Buffer<T>;
 
-    void render(const Views& views, const float background[3], float* values, float* alpha, float* depth) {
-        take(views);
+    // Planes on the device, see Views; windows [2][height][width].
+    struct DevicePlanes {
+        const float *weights, *windows;
+        const uint8_t* channels;
+    };
+
+    // Until an image is done there is none.
+    void start() {
+        poses_ = 0;
+        compared_ = false;
+    }
+
+    void show(const Views& views, const float background[3], float* values, float* alpha, float* depth) {
+        const int sub_poses = views.start ? views.count - 1 : views.count;
+        DevicePlanes planes{};
+        if (views.weights) planes.weights = device_.upload(weights_, views.weights, sub_poses * pixels());
+        if (views.start) planes.windows = device_.upload(weights_, views.start, 2 * pixels());
+        if (views.channels) planes.channels = device_.upload(channels_, views.channels, pixels());
+        render(views, planes, background);
+        const float* image = image_.data();
+        device_.download(values, image, shown());
+        device_.download(alpha, image + shown(), pixels());
+        device_.download(depth, image + shown() + pixels(), pixels());
+        device_.finish();
+    }
+
+    void render(const Views& poses, const DevicePlanes& planes, const float background[3]) {
+        take(poses, planes);
         choose(camera_.lens != 0, [&](auto bent) { choose(moving_, [&](auto moving) { project<bent, moving>(); }); });
         list_pairs();
         choose(splats_.colours == 3, [&](auto coloured) {
-            choose(moving_,
-                   [&](auto moving) { composite<coloured ? 3 : 1, moving>(background, values, alpha, depth); });
+            choose(moving_, [&](auto moving) { composite<coloured ? 3 : 1, moving>(background); });
         });
-        poses_ = views.count;
-        mosaic_ = views.channels != nullptr;
+        poses_ = poses.count;
+        mosaic_ = planes.channels != nullptr;
     }
 
-    // The gradients of the last image, which stay on the device.
+    // The gradients of the last image, which stay on the device; d_values: null for those of its comparison.
     void differentiate(const float* d_values) {
-        const size_t shown = pixels() * (mosaic_ ? 1 : splats_.colours);
-        const float* slopes = device_.upload(d_values_, d_values, shown);
+        const float* slopes = d_values ? device_.upload(d_values_, d_values, shown()) : comparer_.slope();
         float* slots = slots_.grow(static_cast<size_t>(pairs_) * slot_floats(splats_.colours, moving_) + 1);
         choose(splats_.colours == 3, [&](auto coloured) {
             choose(moving_, [&](auto moving) {
@@ -211,6 +274,7 @@ class Passes final : public GpuRenderer {
 
     int tiles() const { return camera_.tiles_x * camera_.tiles_y; }
     size_t pixels() const { return static_cast<size_t>(camera_.width) * camera_.height; }
+    size_t shown() const { return pixels() * (tiles_.channels ? 1 : splats_.colours); }  // values of the image
     size_t records() const { return static_cast<size_t>(splats_.count) * sub_poses_; }
 
     // Brings the splats to the device.
@@ -225,22 +289,20 @@ class Passes final : public GpuRenderer {
                    device_.upload(colours_, splats.colour, splats.colours * n)};
     }
 
-    // Brings poses and planes to the device.
-    void take(const Views& views) {
+    // Brings poses to the device.
+    void take(const Views& given, const DevicePlanes& planes) {
         const size_t n = splats_.count;
-        moving_ = views.start != nullptr;
-        sub_poses_ = moving_ ? views.count - 1 : views.count;
-        std::vector<View> poses(views.count);
-        for (int i = 0; i < views.count; ++i) poses[i] = view_of(views.rotations + 9 * i, views.centres + 3 * i);
+        moving_ = planes.windows != nullptr;
+        sub_poses_ = moving_ ? given.count - 1 : given.count;
+        std::vector<View> poses(given.count);
+        for (int i = 0; i < given.count; ++i) poses[i] = view_of(given.rotations + 9 * i, given.centres + 3 * i);
         tiles_ = {};
         tiles_.camera = camera_;
         tiles_.sub_poses = sub_poses_;
-        if (views.weights) tiles_.weights = device_.upload(weights_, views.weights, sub_poses_ * pixels());
-        if (views.channels) tiles_.channels = device_.upload(channels_, views.channels, pixels());
-        if (moving_) {
-            tiles_.begin = device_.upload(weights_, views.start, 2 * pixels());
-            tiles_.end = tiles_.begin + pixels();
-        }
+        tiles_.weights = planes.weights;
+        tiles_.channels = planes.channels;
+        tiles_.begin = planes.windows;
+        tiles_.end = moving_ ? planes.windows + pixels() : nullptr;
         scene_.camera = camera_;
         scene_.splats = splats_;
         scene_.poses = {device_.upload(views_, poses.data(), poses.size()), sub_frames_.grow(sub_poses_), sub_poses_};
@@ -302,9 +364,9 @@ class Passes final : public GpuRenderer {
     }
 
     template <int C, bool Moving>
-    void composite(const float background[3], float* values, float* alpha, float* depth) {
+    void composite(const float background[3]) {
         const uint64_t all_tiles = static_cast<uint64_t>(sub_poses_) * tiles();
-        const size_t kept = all_tiles * kTilePixels, shown = pixels() * (C == 1 || tiles_.channels ? 1 : 3);
+        const size_t kept = all_tiles * kTilePixels;
         float* at = state_.grow((C + 2) * kept);
         states_ = {};
         for (int k = 0; k < C; ++k, at += kept) states_.colour[k] = at;
@@ -312,12 +374,8 @@ class Passes final : public GpuRenderer {
         states_.depth = at + kept;
         states_.end = ends_.grow(kept);
         device_.run(Forward<C, Moving>{tiles_, states_, {background[0], background[1], background[2]}}, all_tiles);
-        float* image = image_.grow(shown + 2 * pixels());
-        device_.run(Combine<C, Moving>{tiles_, states_, image, image + shown, image + shown + pixels()}, tiles());
-        device_.download(values, image, shown);
-        device_.download(alpha, image + shown, pixels());
-        device_.download(depth, image + shown + pixels(), pixels());
-        device_.finish();
+        float* image = image_.grow(shown() + 2 * pixels());
+        device_.run(Combine<C, Moving>{tiles_, states_, image, image + shown(), image + shown() + pixels()}, tiles());
     }
 
     template <bool Bent, bool Moving>
@@ -335,10 +393,11 @@ class Passes final : public GpuRenderer {
                            slots_.data(), slot_floats(splats_.colours, Moving), out, partial, poses_},
                     count);
         double* by_poses = by_poses_.grow(static_cast<size_t>(poses_) * 6);
-        device_.run(SumPoses{partial, static_cast<int>(count), poses_, by_poses}, static_cast<uint64_t>(poses_) * 6);
+        device_.run(SumBlocks{partial, static_cast<int>(count), poses_ * 6, by_poses}, static_cast<uint64_t>(poses_) * 6);
     }
 
     Device device_;
+    Comparer<Device> comparer_;
     bool moving_ = false;
     int sub_poses_ = 0;  // or sub-frames
     uint32_t pairs_ = 0;

@@ -41,6 +41,39 @@ struct DescentRates {
     float centre[3];
 };
 
+// A view on the device, of the size of a renderer's images.
+class GpuFrame {
+  public:
+    virtual ~GpuFrame() = default;
+
+    int width = 0, height = 0;
+    size_t values = 0;  // of its rates, [height][width] or [height][width][3]
+    bool mosaic = false, moving = false;
+};
+
+// The same in main memory: start and stop, see Views, or null for a camera that stands still; channels or null.
+struct FrameArrays {
+    size_t values;
+    const float *rates, *deviation;
+    const float* windows;  // [2][height][width]
+    const uint8_t* channels;
+};
+
+// How an image is compared with a view, see RateLoss in spiked/recon/mapping/loss.py.
+struct RateLoss {
+    float white, floor;  // floor: in units of white
+    float share, scale;  // of structural similarity
+    bool gains;          // those of the renderer count, and
+    float level;         // this brightness of the view
+    float model_error, sigmas;  // of pixels that agree, see dense/nuisances.hpp
+};
+
+struct RateComparison {
+    double error;                       // mean weighted squared error, in units of white
+    double similarity;                  // mean; 1 where its share is 0
+    double expected_light, seen_light;  // summed over the pixels that agree; 0 without gains
+};
+
 class GpuRenderer {
   public:
     virtual ~GpuRenderer() = default;
@@ -52,14 +85,29 @@ class GpuRenderer {
     // The same for splats that are on this renderer's kind of device; the gradients go into a step, and stay there.
     virtual void forward(GpuScene&, const Views&, const float background[3], float* values, float* alpha,
                          float* depth) = 0;
+    // d_values: null for those that the last comparison left on the device.
     virtual void descend(const float* d_values, GpuScene&, const DescentRates&) = 0;
     virtual std::unique_ptr<GpuScene> scene() const = 0;
+
+    virtual std::unique_ptr<GpuFrame> frame(const FrameArrays&) = 0;
+    // Of one colour, [height][width].
+    virtual void set_gains(const float*) = 0;
+    // Renders a frame's windows and compares the image, which stays on the device, as the slope by it does.
+    virtual RateComparison compare(GpuScene&, GpuFrame&, const Views& poses, const float background[3],
+                                   const RateLoss&) = 0;
+    // [height][width] or [height][width][3], the slope by the image of the last comparison.
+    virtual void slope(float* out) = 0;
+    // Adds the last comparison, which was with this frame, to the evidence of the pixels' gains; and takes all of it.
+    virtual void add_evidence(GpuFrame&, float level, float model_error) = 0;
+    virtual void take_evidence(float* xx, float* xy) = 0;
 
     virtual const char* instructions() const = 0;
     const PinholeF& camera() const { return camera_; }
     const SplatArrays& splats() const { return splats_; }  // of the device
     int poses() const { return poses_; }
     bool mosaic() const { return mosaic_; }
+    bool compared() const { return compared_; }  // whether the last image was
+    bool has_gains() const { return has_gains_; }
 
   protected:
     explicit GpuRenderer(const PinholeF& camera) : camera_(camera) {}
@@ -67,7 +115,7 @@ class GpuRenderer {
     PinholeF camera_;
     SplatArrays splats_{};
     int poses_ = 0;
-    bool mosaic_ = false;
+    bool mosaic_ = false, compared_ = false, has_gains_ = false;
 };
 
 std::unique_ptr<GpuRenderer> emulated_renderer(const PinholeF&);

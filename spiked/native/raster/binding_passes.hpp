@@ -51,6 +51,14 @@ PinholeF camera_of(double fx, double fy, double cx, double cy, int width, int he
     return camera;
 }
 
+inline void expect_poses(const Array<const double, 3>& rotations, const Array<const double, 2>& centres,
+                         const Array<const float, 1>& background) {
+    const size_t s = rotations.shape(0);
+    expect(s > 0 && rotations.shape(1) == 3 && rotations.shape(2) == 3 && centres.shape(0) == s &&
+               centres.shape(1) == 3 && background.shape(0) == 3,
+           "poses disagree");
+}
+
 // Poses, planes and images of a forward pass, as Python gives them.
 struct PassArrays {
     const Array<const double, 3>& rotations;
@@ -64,9 +72,7 @@ struct PassArrays {
     // Checks them against the camera and the number of colours.
     Views views(const PinholeF& camera, size_t c) const {
         const size_t s = rotations.shape(0), height = camera.height, width = camera.width;
-        expect(s > 0 && rotations.shape(1) == 3 && rotations.shape(2) == 3 && centres.shape(0) == s &&
-                   centres.shape(1) == 3 && background.shape(0) == 3,
-               "poses disagree");
+        expect_poses(rotations, centres, background);
         expect(!weights || (weights->shape(0) == s && weights->shape(1) == height && weights->shape(2) == width),
                "weights are [S, H, W]");
         expect(!windows || (!weights && s > 1 && windows->shape(0) == 2 && windows->shape(1) == height &&

@@ -16,13 +16,14 @@ from spiked.recon.mapping.loss import RateLoss, WarpedChargeLoss
 from spiked.recon.mapping.options import MapOptions
 from spiked.recon.mapping.photometric import Nuisances
 from spiked.recon.mapping.pyramid import Level, levels
+from spiked.recon.mapping.rate_steps import RateStep, rate_steps_for
 from spiked.recon.mapping.render_requests import RenderRequest
 from spiked.recon.mapping.replay import Replay
 from spiked.recon.mapping.seeding import SweptView, isotropic_splats
 from spiked.recon.statistics import WHITE_PERCENTILE
 from spiked.render import AnyRasteriser, Camera
 from spiked.render.charge import ChargeLoss
-from spiked.render.descent import descent_for
+from spiked.render.descent import Stride, descent_for
 from spiked.render.splats import SizeLimits
 from spiked.scene import Scene
 from spiked.sensor import Image, Sensor
@@ -64,6 +65,7 @@ class Mapper:
         self.levels = levels(sensor, camera, threads)
         self.channels = self.levels[0].channels
         self.descent = descent_for(Scene.empty(self.colours), *BETAS, threads)
+        self.rate_steps = rate_steps_for(self.descent)
         self.white = 1.0
         """The radiance (spikes a frame) in whose units losses and rates are: `WHITE_PERCENTILE` of the first seeded
         view."""
@@ -91,6 +93,7 @@ class Mapper:
     def __setstate__(self, state: dict[str, object]) -> None:
         vars(self).update(state)
         self.descent = self.descent.moved()
+        self.rate_steps = rate_steps_for(self.descent)
 
     def __len__(self) -> int:
         """The number of splats."""
@@ -204,10 +207,23 @@ class Mapper:
         # A random background: otherwise dark surfaces become holes.
         background = float(self._rng.uniform(0, self.options.background)) * self.white
         if request.warp is None:
-            slope = self._compare_rates(key, view, request, level, background)
+            self._fit_rates(key, view, request, background, decay, level)
         else:
             slope = self._compare_charge(key, request, level, background)
-        self._descend(level.rasteriser, slope, decay, request.centres[len(request.centres) // 2])
+            self.descent.step(level.rasteriser, slope, *self._next_stride(decay, _middle(request.centres)))
+
+    def _fit_rates(
+        self, key: int, view: View, request: RenderRequest, background: float, decay: float, level: Level
+    ) -> None:
+        """A step on a view's rates over its pixels' windows."""
+        first = self.options.demosaic_first and level.mosaic is not None
+        known = self.nuisances if level.factor == 1 and not first and self._knows_nuisances() else None
+        gains = self.steps >= GAINS_FROM
+        step = RateStep(key, view, request, level, self.view_loss, self.white, background, first, known, gains)
+        stride = self._next_stride(decay, _middle(request.centres))
+        self._losses[key] = self.rate_steps.take(step, self.descent, stride)
+        if known is not None and self.steps % NUISANCE_STEPS == 0:
+            known.update()
 
     def replay(self, replay: Replay, decay: float) -> None:
         """One gradient step towards what another map shows."""
@@ -215,14 +231,14 @@ class Mapper:
         image = replay.render(self.descent.model, background)
         shown = replay.comparable(image.values)
         slope = self.rate_loss(shown, replay.target(shown), self.white)[1]
-        self._descend(replay.rasteriser, replay.slope(slope, image.values), decay, replay.centre)
+        slope = replay.slope(slope, image.values)
+        self.descent.step(replay.rasteriser, slope, *self._next_stride(decay, replay.centre))
 
-    def _descend(self, rasteriser: AnyRasteriser, slope: Image, decay: float, centre: Array) -> None:
-        """A step along the gradient of an image that was seen from `centre`."""
+    def _next_stride(self, decay: float, centre: Array) -> Stride:
+        """How far the next step goes, on an image that was seen from `centre`; counts it."""
         self.steps, rates = self.steps + 1, self.options.rates_of(self.fast)
         scaled = tuple(decay * rate for rate in rates.of_arrays(self.white))
-        axes, limits = rates.axes(self.depth, self.camera.intrinsics.fx), self._limits(centre)
-        self.descent.step(rasteriser, slope, scaled, limits, axes)
+        return Stride(scaled, self._limits(centre), rates.axes(self.depth, self.camera.intrinsics.fx))
 
     def _limits(self, centre: Array) -> SizeLimits:
         """How large splats may be after a step on an image that was seen from `centre`."""
@@ -231,30 +247,8 @@ class Mapper:
             return SizeLimits(self._most_log_scale)
         return SizeLimits(self._most_log_scale, pruning.widest, (centre[0], centre[1], centre[2]))
 
-    def _compare_rates(self, key: int, view: View, request: RenderRequest, level: Level, background: float) -> Image:
-        """Gradient of the loss by the image, from a view's rates over its pixels' windows."""
-        target = level.target(view, request.windows, request.seen)
-        first = self.options.demosaic_first and level.mosaic is not None
-        model = self.descent.model
-        image = level.render(model, replace(request, windows=target.windows), background, demosaiced=first)
-        expected = image.values
-        factor: Image | None = None
-        if first:
-            target = level.demosaiced_target(target)
-        elif level.factor == 1 and self._knows_nuisances():
-            factor = self.nuisances.factor(key)
-            self.nuisances.observe(key, image.values, view.rate, target.deviation, self.steps >= GAINS_FROM)
-            expected = expected * factor
-            if self.steps % NUISANCE_STEPS == NUISANCE_STEPS - 1:
-                self.nuisances.update()
-        made = self.view_loss.compare(expected, target, self.white, None if first else level.mosaic)
-        self._losses[key], slope = made.error, made.slope
-        if factor is not None:
-            slope *= factor
-        return slope
-
     def _compare_charge(self, key: int, request: RenderRequest, level: Level, background: float) -> Image:
-        """As `_compare_rates`, from the charge between the spikes of all frames around a view."""
+        """Gradient of the loss by the image, from the charge between the spikes of all frames around a view."""
         model = self.descent.model
         image = level.rasteriser.forward(model, request.rotations, request.centres, background=background)
         gain, phase = self.nuisances.factor(key), int(self._rng.integers(level.factor))
@@ -278,6 +272,7 @@ class Mapper:
     def forget_views(self) -> None:
         """Drop what is stored for each view, after some were dropped."""
         self._losses.clear()
+        self.rate_steps.forget_views()
         self.nuisances.forget_views()
 
     @property
@@ -345,3 +340,8 @@ class Mapper:
         """Render the map from a pose: radiance [H, W, C]."""
         values = self.rasteriser.forward(self.scene, rotation[None], centre[None]).values
         return values[..., None] if values.ndim == 2 else values
+
+
+def _middle(centres: Array) -> Array:
+    """Of the poses of an exposure."""
+    return centres[len(centres) // 2]

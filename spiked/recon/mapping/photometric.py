@@ -1,5 +1,7 @@
 """Photometric nuisances: each pixel's gain, and the brightness of each view (flicker, lamps)."""
 
+from typing import Protocol
+
 import numpy as np
 
 from spiked.native._dense import agreement, gain_evidence
@@ -17,12 +19,22 @@ GAIN_LIMITS = (0.5, 2.0)
 """Limits of a pixel's gain."""
 
 
+class Evidence(Protocol):
+    """Sums of residuals that are gathered elsewhere, as on a GPU."""
+
+    def take_evidence(self) -> tuple[Image, Image]:
+        """Those since they were last taken, [H, W]: squares of the model, and products with the residual."""
+
+
 class Nuisances:
     """Estimates gain(x) and a level for each view in `observed = gain(x) * level * rendered`.
 
     Closed-form weighted regressions; the gains have a ridge towards 1 and mean log gain 0. The levels are relative to
     each other: their mean belongs to the brightness of the scene.
     """
+
+    _elsewhere: Evidence | None = None
+    """Where there is more evidence of the gains than here."""
 
     def __init__(self, height: int, width: int, fixed: Image | None = None) -> None:
         """`fixed` [H, W] are gains of a calibration; they are not estimated."""
@@ -33,6 +45,10 @@ class Nuisances:
         self._observed = 0.0
         self._levels: dict[int, float] = {}
         self._mean_level = 1.0
+
+    def __getstate__(self) -> dict[str, object]:
+        self._collect()
+        return vars(self)
 
     def level(self, key: int) -> float:
         """Brightness of a view relative to the scene's."""
@@ -52,12 +68,30 @@ class Nuisances:
         # A ratio of means: least squares underestimates the brightness while the map is rough, and the map follows.
         # Weights by precision would give most weight to the darkest pixels.
         expected, light = agreement(self.gain, *seen, MODEL_ERROR, AGREEING_SIGMAS)
-        if expected > 0:
-            self.note(key, light / expected)
+        self.compare(key, expected, light)
         if not gains:
             return
         gain_evidence(self.gain, *seen, self.level(key), MODEL_ERROR, self._xx, self._xy)
         self._observed += 1
+
+    def compare(self, key: int, expected: float, light: float) -> None:
+        """Take the light of the pixels of a view that agree with the map: what was expected of them and observed."""
+        if expected > 0:
+            self.note(key, light / expected)
+
+    def expect(self, evidence: Evidence) -> None:
+        """Count a view whose residuals are `evidence`, which is taken when the gains are estimated."""
+        if evidence is not self._elsewhere:
+            self._collect()
+        self._elsewhere = evidence
+        self._observed += 1
+
+    def _collect(self) -> None:
+        if self._elsewhere is not None:
+            xx, xy = self._elsewhere.take_evidence()
+            self._xx += xx
+            self._xy += xy
+            self._elsewhere = None
 
     def note(self, key: int, brightness: float) -> None:
         """Set the brightness of a view over its render without nuisances."""
@@ -68,6 +102,7 @@ class Nuisances:
         """Estimate the gains from the accumulated residuals."""
         if not self._observed:
             return
+        self._collect()
         # A view observed again adds no information: the evidence is that of the distinct views.
         once = np.float32(min(1.0, len(self._levels) / self._observed))
         if not self._fixed:
@@ -80,6 +115,7 @@ class Nuisances:
 
     def forget_views(self) -> None:
         """Drop what is stored for each view, after some were dropped."""
+        self._collect()
         self._levels.clear()
         self._xx[:] = self._xy[:] = 0
         self._observed = 0.0

@@ -15,8 +15,10 @@ KERNEL = re.compile(
     r".*?Function properties.*?\n\s*(?P<stack>\d+) bytes stack frame, (?P<spilled>\d+) bytes spill stores.*?\n"
     r".*?Used (?P<registers>\d+) registers"
 )
-PER_PIXEL = ("Forward", "Backward", "Combine", "CompareRates", "CompareStructure", "DifferentiateStructure", "MixSlopes",
-             "AddEvidence")  # fmt: skip
+PER_PIXEL = (
+    *("Forward", "Backward", "Combine"),
+    *("CompareRates", "CompareStructure", "DifferentiateStructure", "MixSlopes", "AddEvidence"),
+)
 KERNELS = {*PER_PIXEL, "Prepare", "SetSubFrames", "Project", "CountTiles", "ListPairs", "FindTiles", "Unproject",
            "SumBlocks", "Descend", "TakeRows"}  # fmt: skip
 

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import render_scenes as scenes
+from spiked.native._dense import agreement, gain_evidence
 from test_gpu import DEVICES
 from test_moving import BACKGROUND, Case, relative
 
 from spiked.errors import ConfigurationError
-from spiked.native._dense import agreement, gain_evidence
 from spiked.recon import MapOptions, Options, Reconstructor
 from spiked.recon.mapping import mapper as mapping
 from spiked.recon.mapping.loss import RateLoss

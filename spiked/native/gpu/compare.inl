@@ -68,9 +68,7 @@ struct Plane {
     SPIKED_DEVICE static int mirrored(int i, int count) {
         return count == 1 ? 0 : i < 0 ? -i : i < count ? i : 2 * count - 2 - i;
     }
-    SPIKED_DEVICE int64_t place(int x, int y) const {
-        return (static_cast<int64_t>(y) * width + x) * colours + colour;
-    }
+    SPIKED_DEVICE int64_t place(int x, int y) const { return (static_cast<int64_t>(y) * width + x) * colours + colour; }
     SPIKED_DEVICE bool has(int x, int y) const { return x >= 0 && x < width && y >= 0 && y < height; }
     SPIKED_DEVICE float at(const float* image, int x, int y) const {
         if (!mosaic) return image[place(x, y)];
@@ -201,7 +199,7 @@ struct DifferentiateStructure {
             const int x = tile.x(thread), y = tile.y(thread);
             if (!tile.plane.has(x, y)) return;
             const float a = tile.plane.at(expected, x, y), b = tile.plane.at(image.rates, x, y);
-            const float(&d)[3] = by[thread].of;
+            const float (&d)[3] = by[thread].of;
             gradient[tile.plane.place(x, y)] = by_rendered(a, b, d[0], d[1], d[2]) / static_cast<float>(count);
         });
     }
@@ -224,8 +222,8 @@ struct MixSlopes {
                 const Plane plane{image.width, image.height, image.colours, static_cast<int>(at % image.colours),
                                   image.mosaic};
                 // The filter of a mosaic is symmetric, so it is its own transpose.
-                const float by = plane.at(similarity, static_cast<int>(pixel % image.width),
-                                          static_cast<int>(pixel / image.width));
+                const float by =
+                    plane.at(similarity, static_cast<int>(pixel % image.width), static_cast<int>(pixel / image.width));
                 sum = (1 - loss.share) * sum - loss.share * loss.scale * by;
             }
             slope[at] = sum * image.factor(at, loss.level);
@@ -244,8 +242,8 @@ struct AddEvidence {
         block.each([&](int thread) {
             const int64_t at = static_cast<int64_t>(block.index) * kThreads + thread;
             if (at >= image.values) return;
-            const GainTerms terms = gain_terms(image.gain[at], image.rendered[at], image.rates[at],
-                                               image.deviation[at], level, model_error);
+            const GainTerms terms = gain_terms(image.gain[at], image.rendered[at], image.rates[at], image.deviation[at],
+                                               level, model_error);
             xx[at] = first ? terms.xx : xx[at] + terms.xx;
             xy[at] = first ? terms.xy : xy[at] + terms.xy;
         });

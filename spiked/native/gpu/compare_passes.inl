@@ -84,8 +84,11 @@ class Comparer {
         const float square = loss.white * loss.white;
         float *derivatives = derivatives_.grow(3 * count), *gradient = gradient_.grow(count);
         double* partial = structure_.grow(blocks);
-        device_.run(CompareStructure{image, {image.width, image.height, 1e-4f * square, 9e-4f * square},
-                                     expected_.data(), derivatives, partial},
+        device_.run(CompareStructure{image,
+                                     {image.width, image.height, 1e-4f * square, 9e-4f * square},
+                                     expected_.data(),
+                                     derivatives,
+                                     partial},
                     blocks);
         device_.run(SumBlocks{partial, static_cast<int>(blocks), 1, total}, 1);
         device_.run(DifferentiateStructure{image, expected_.data(), derivatives, gradient}, blocks);

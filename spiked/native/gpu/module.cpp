@@ -57,7 +57,8 @@ nb::tuple compare(GpuRenderer& self, GpuScene& scene, GpuFrame& frame, Array<con
     expect(frame.values == pixels * (frame.mosaic ? 1 : scene.colours()) && (!frame.mosaic || scene.colours() == 3),
            "the frame has other colours than the scene");
     expect(white > 0, "white is not positive");
-    expect(!level || (self.has_gains() && frame.values == pixels), "gains are set first, for frames of one value a pixel");
+    expect(!level || (self.has_gains() && frame.values == pixels),
+           "gains are set first, for frames of one value a pixel");
     const Views views{rotations.data(), centres.data(), static_cast<int>(poses), nullptr, nullptr, nullptr, nullptr};
     const RateLoss loss{white, floor, share, scale, level.has_value(), level.value_or(1.0f), model_error, sigmas};
     RateComparison made;
@@ -76,7 +77,8 @@ void set_gains(GpuRenderer& self, Array<const float, 2> gain) {
 
 void slope(GpuRenderer& self, AnyArray<float> out) {
     expect(self.compared(), "the last image was not compared");
-    expect(out.size() == pixels_of(self) * (self.mosaic() ? 1 : self.splats().colours), "the output has the wrong size");
+    expect(out.size() == pixels_of(self) * (self.mosaic() ? 1 : self.splats().colours),
+           "the output has the wrong size");
     nb::gil_scoped_release release;
     self.slope(out.data());
 }
@@ -96,9 +98,9 @@ void take_evidence(GpuRenderer& self, Array<float, 2> xx, Array<float, 2> xy) {
     self.take_evidence(xx.data(), xy.data());
 }
 
-void descend(GpuRenderer& self, std::optional<AnyArray<const float>> d_values, GpuScene& scene, Array<const float, 1> rates,
-             float blur, bool own_axes, float beta1, float beta2, float epsilon, float most_log_scale, float widest,
-             Array<const float, 1> centre) {
+void descend(GpuRenderer& self, std::optional<AnyArray<const float>> d_values, GpuScene& scene,
+             Array<const float, 1> rates, float blur, bool own_axes, float beta1, float beta2, float epsilon,
+             float most_log_scale, float widest, Array<const float, 1> centre) {
     expect(self.poses() > 0, "backward follows forward");
     expect(d_values ? d_values->size() == pixels_of(self) * (self.mosaic() ? 1 : scene.colours()) : self.compared(),
            "d_values has the wrong size, or the last image was not compared");

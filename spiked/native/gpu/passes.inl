@@ -393,7 +393,8 @@ class Passes final : public GpuRenderer {
                            slots_.data(), slot_floats(splats_.colours, Moving), out, partial, poses_},
                     count);
         double* by_poses = by_poses_.grow(static_cast<size_t>(poses_) * 6);
-        device_.run(SumBlocks{partial, static_cast<int>(count), poses_ * 6, by_poses}, static_cast<uint64_t>(poses_) * 6);
+        device_.run(SumBlocks{partial, static_cast<int>(count), poses_ * 6, by_poses},
+                    static_cast<uint64_t>(poses_) * 6);
     }
 
     Device device_;

@@ -61,10 +61,10 @@ struct FrameArrays {
 
 // How an image is compared with a view, see RateLoss in spiked/recon/mapping/loss.py.
 struct RateLoss {
-    float white, floor;  // floor: in units of white
-    float share, scale;  // of structural similarity
-    bool gains;          // those of the renderer count, and
-    float level;         // this brightness of the view
+    float white, floor;         // floor: in units of white
+    float share, scale;         // of structural similarity
+    bool gains;                 // those of the renderer count, and
+    float level;                // this brightness of the view
     float model_error, sigmas;  // of pixels that agree, see dense/nuisances.hpp
 };
 

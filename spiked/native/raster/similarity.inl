@@ -27,7 +27,8 @@ struct Similar {
 };
 
 // From the windowed x, y, x^2, y^2 and xy.
-SPIKED_DEVICE SPIKED_INLINED static inline Similar similar(const SsimImage& image, float m, float n, float xx, float yy, float xy) {
+SPIKED_DEVICE SPIKED_INLINED static inline Similar similar(const SsimImage& image, float m, float n, float xx, float yy,
+                                                           float xy) {
     const float a1 = 2 * m * n + image.c1, a2 = 2 * (xy - m * n) + image.c2;
     const float over1 = 1 / (m * m + n * n + image.c1);
     const float over2 = 1 / (xx - m * m + yy - n * n + image.c2);
@@ -36,7 +37,8 @@ SPIKED_DEVICE SPIKED_INLINED static inline Similar similar(const SsimImage& imag
 }
 
 // The derivative of the similarities around a pixel by its x, from their windowed derivatives.
-SPIKED_DEVICE SPIKED_INLINED static inline float by_rendered(float x, float y, float by_mean, float by_xx, float by_xy) {
+SPIKED_DEVICE SPIKED_INLINED static inline float by_rendered(float x, float y, float by_mean, float by_xx,
+                                                             float by_xy) {
     return by_mean + 2 * x * by_xx + y * by_xy;
 }
 

@@ -100,7 +100,8 @@ static void ssim_gradient(const SsimImage& image, const float* rendered, const f
         const float *a = rendered + at, *b = target + at;
         float* out = d_rendered + at;
         for (int k = 0; k < 3; ++k) blur_column(planes[5 + k] + at, width, width, d_rows[k]);
-        for (int x = 0; x < width; ++x) out[x] = over * by_rendered(a[x], b[x], d_rows[0][x], d_rows[1][x], d_rows[2][x]);
+        for (int x = 0; x < width; ++x)
+            out[x] = over * by_rendered(a[x], b[x], d_rows[0][x], d_rows[1][x], d_rows[2][x]);
     }
 }
 

@@ -1,7 +1,6 @@
 """The map: Gaussian splats fitted to views by gradient descent."""
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -210,7 +209,7 @@ class Mapper:
             self._fit_rates(key, view, request, background, decay, level)
         else:
             slope = self._compare_charge(key, request, level, background)
-            self.descent.step(level.rasteriser, slope, *self._next_stride(decay, _middle(request.centres)))
+            self.descent.step(level.rasteriser, slope, *self._next_stride(decay, request.middle[1]))
 
     def _fit_rates(
         self, key: int, view: View, request: RenderRequest, background: float, decay: float, level: Level
@@ -220,7 +219,7 @@ class Mapper:
         known = self.nuisances if level.factor == 1 and not first and self._knows_nuisances() else None
         gains = self.steps >= GAINS_FROM
         step = RateStep(key, view, request, level, self.view_loss, self.white, background, first, known, gains)
-        stride = self._next_stride(decay, _middle(request.centres))
+        stride = self._next_stride(decay, request.middle[1])
         self._losses[key] = self.rate_steps.take(step, self.descent, stride)
         if known is not None and self.steps % NUISANCE_STEPS == 0:
             known.update()
@@ -283,13 +282,12 @@ class Mapper:
 
     def densify(self, key: int, view: View, request: RenderRequest) -> None:
         """Add splats at the largest errors of a view, as `options.densification` says."""
-        middle = len(request.centres) // 2
-        rotation, centre = request.rotations[middle], request.centres[middle]
+        rotation, centre = request.middle
         if request.warp is None:
             level = self.levels[0]
-            image = level.render(self.descent.model, request)
-            deviation = level.target(view, request.windows, request.seen).deviation
-            certainty = self.rate_loss.certainty(deviation, self.white)
+            target = level.target(view, request)
+            image = level.render(self.descent.model, request, target.windows)
+            certainty = self.rate_loss.certainty(target.deviation, self.white)
             error = (view.rate - self.nuisances.factor(key) * image.values) * certainty
         else:
             image = self.rasteriser.forward(self.descent.model, rotation[None], centre[None])
@@ -340,8 +338,3 @@ class Mapper:
         """Render the map from a pose: radiance [H, W, C]."""
         values = self.rasteriser.forward(self.scene, rotation[None], centre[None]).values
         return values[..., None] if values.ndim == 2 else values
-
-
-def _middle(centres: Array) -> Array:
-    """Of the poses of an exposure."""
-    return centres[len(centres) // 2]

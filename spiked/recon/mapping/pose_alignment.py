@@ -8,7 +8,7 @@ the path is a prior. Basis weights map the blocks of the views to the knots.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
 import cv2
@@ -243,8 +243,8 @@ Compared = tuple[RenderedImage, Image, Image, Image]
 
 def _windowed(key: int, view: View, request: RenderRequest, mapper: Mapper, level: Level) -> Compared:
     """A view's rates and the map rendered over the pixels' windows."""
-    target = level.target(view, request.windows, request.seen)
-    image = level.render(mapper.descent.model, replace(request, windows=target.windows))
+    target = level.target(view, request)
+    image = level.render(mapper.descent.model, request, target.windows)
     expected = image.values
     if level.factor == 1:
         expected = np.asarray(expected * mapper.nuisances.factor(key), np.float32)

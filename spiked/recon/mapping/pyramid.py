@@ -25,7 +25,7 @@ class Target:
     deviation: Image
     """Their standard deviation, of the same shape; infinite for masked pixels."""
     windows: Image | None
-    """[2, H, W] as in `RenderRequest`."""
+    """[2, H, W], when each pixel looks, in sub-frames (`Rasteriser.forward_moving`); None: the camera stands still."""
     pixel: int = 1
     """Size of its pixels in sensor pixels."""
 
@@ -56,27 +56,38 @@ class Level:
         return None if self.channels is None else self._mosaic
 
     def render(
-        self, scene: AnySplats, request: RenderRequest, background: float = 0.0, *, demosaiced: bool = False
+        self,
+        scene: AnySplats,
+        request: RenderRequest,
+        windows: Image | None,
+        background: float = 0.0,
+        *,
+        demosaiced: bool = False,
     ) -> RenderedImage:
-        """Render a scene at this size; the request's windows are of this size. `background` is a radiance.
+        """Render a scene at this size over the windows of a `Target`. `background` is a radiance.
 
         `demosaiced`: all colours at every pixel, as in `demosaiced_target`.
         """
         poses, channels = (request.rotations, request.centres), None if demosaiced else self.channels
-        if request.windows is None:
+        if windows is None:
             return self.rasteriser.forward(scene, *poses, channels=channels, background=background)
-        return self.rasteriser.forward_moving(scene, *poses, request.windows, channels=channels, background=background)
+        return self.rasteriser.forward_moving(scene, *poses, windows, channels=channels, background=background)
 
     def demosaiced_target(self, target: Target) -> Target:
         """A mosaic's target [H, W] of this size with colours interpolated, [H, W, 3]."""
         deviation = np.repeat(target.deviation[..., None], 3, -1)
         return replace(target, values=fill_mosaic(target.values, self.channels), deviation=deviation)
 
-    def target(self, view: View, windows: Image | None, seen: NDArray[np.bool_] | None) -> Target:
-        """A view at this size; incomplete large pixels at the right and lower edges are left out.
+    def target(self, view: View, request: RenderRequest) -> Target:
+        """A view at this size for the render of a request; incomplete large pixels at the right and lower edges are
+        left out.
 
-        A large pixel is valid if more than half of its pixels are `seen`; None: all are.
+        Pixels that look much longer than the request are masked; a large pixel if at least half of its pixels are.
         """
+        windows: Image | None = None
+        seen: NDArray[np.bool_] | None = None
+        if request.sub_frames:
+            _, windows, seen = view.exposure(request.sub_frames)
         if self.factor == 1:
             deviation = view.deviation if seen is None else np.where(seen, view.deviation, np.float32(np.inf))
             return Target(view.rate, deviation, windows)

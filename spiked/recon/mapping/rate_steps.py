@@ -3,7 +3,7 @@
 `rate_steps_for` gives the kind that suits the map: where it is on a GPU, neither images nor slopes leave that.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -40,7 +40,7 @@ class RateStep:
 
     def target(self) -> Target:
         """What the render is compared with."""
-        target = self.level.target(self.view, self.request.windows, self.request.seen)
+        target = self.level.target(self.view, self.request)
         return self.level.demosaiced_target(target) if self.demosaiced else target
 
 
@@ -50,13 +50,13 @@ class RateSteps:
     def take(self, step: RateStep, descent: Descent, stride: Stride) -> float:
         """Change the scene of `descent`; returns the error of `Comparison`, before the step."""
         level, target, nuisances, factor = step.level, step.target(), step.nuisances, None
-        request = replace(step.request, windows=target.windows)
-        expected = level.render(descent.model, request, step.background, demosaiced=step.demosaiced).values
+        model, demosaiced = descent.model, step.demosaiced
+        expected = level.render(model, step.request, target.windows, step.background, demosaiced=demosaiced).values
         if nuisances is not None:
             factor = nuisances.factor(step.key)
             nuisances.observe(step.key, expected, target.values, target.deviation, step.gains)
             expected = expected * factor
-        made = step.loss.compare(expected, target, step.white, None if step.demosaiced else level.mosaic)
+        made = step.loss.compare(expected, target, step.white, None if demosaiced else level.mosaic)
         slope = made.slope if factor is None else np.multiply(made.slope, factor, out=made.slope)
         descent.step(level.rasteriser, slope, *stride)
         return made.error
@@ -109,7 +109,7 @@ class DeviceRateSteps(RateSteps):
             target, channels = step.target(), None if step.demosaiced else step.level.channels
             return rasteriser.frame(target.values, target.deviation, target.windows, channels)
 
-        return self._frames.get((step.key, step.level.factor, len(step.request.centres)), make)
+        return self._frames.get((step.key, step.level.factor, step.request.sub_frames), make)
 
 
 def rate_steps_for(descent: Descent) -> RateSteps:

@@ -1,16 +1,14 @@
-"""What to render for a view: poses along the camera's motion and the exposure of each pixel, or frames to warp."""
+"""What to render for a view: poses along the camera's motion during its exposure, or frames to warp."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spiked.pose import Array
 from spiked.recon.frontend.spike_targets import AdjacentSpikes
 from spiked.recon.frontend.windowing import View
 from spiked.recon.mapping.frame_warp import FrameWarp
 from spiked.render import Camera
-from spiked.sensor import Image
 from spiked.spline import Path
 
 SUB_FRAME_PX = 3.0
@@ -25,20 +23,25 @@ MOTION_PERCENTILE = 75
 
 @dataclass(frozen=True)
 class RenderRequest:
-    """What to render for a view: poses, camera to world, and the exposure of each pixel."""
+    """What to render for a view: poses, camera to world, along its exposure."""
 
     rotations: Array
     """[S, 3, 3]"""
     centres: Array
     """[S, 3]"""
-    windows: Image | None = None
-    """[2, H, W] for a camera that moves from pose to pose (`Rasteriser.forward_moving`); None: it stands still."""
-    seen: NDArray[np.bool_] | None = None
-    """[H, W], pixels that these windows describe; None: all."""
+    sub_frames: int = 0
+    """S - 1 where the camera moves from pose to pose, and each pixel looks in its own time (`View.exposure`); 0: it
+    stands still at each."""
     warp: FrameWarp | None = None
     """Fast motion: the frames to compare with the render from the one given pose."""
     times: Array = field(default_factory=lambda: np.zeros(0))
     """[S] of the poses in frames, where they are along an exposure."""
+
+    @property
+    def middle(self) -> tuple[Array, Array]:
+        """Rotation and centre in the middle of the exposure."""
+        number = len(self.centres) // 2
+        return self.rotations[number], self.centres[number]
 
 
 @dataclass
@@ -71,13 +74,11 @@ class RenderPlanner:
             rotations, centres = path.poses(np.clip(times, path.begin, path.end))
             moved_px = self.motion_px(rotations[0], centres[0], rotations[-1], centres[-1])
             parts = int(np.clip(np.ceil(moved_px / (SUB_FRAME_PX * pixel)), 1, MAX_SUB_FRAMES))
-        windows: Image | None
-        seen: NDArray[np.bool_] | None
-        times, windows, seen = view.exposure(parts)
+        times = view.exposure_times(parts)
         if not self.blur_matched and not isinstance(view.shown, AdjacentSpikes):  # these have instants
-            times, windows, seen = 0.5 * (times[1:] + times[:-1]), None, None
+            times, parts = 0.5 * (times[1:] + times[:-1]), 0
         rotations, centres = path.poses(np.clip(times, path.begin, path.end))
-        return RenderRequest(rotations, centres, windows, seen, times=times)
+        return RenderRequest(rotations, centres, parts, times=times)
 
     def warped(self, view: View, path: Path) -> RenderRequest | None:
         """For a view of fast motion: one pose, and the frames around it inside the path; None for others, and for

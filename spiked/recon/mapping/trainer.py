@@ -232,9 +232,8 @@ class MapTrainer:
         """A view rendered over its exposure at the size of a level, with its target, by the sub-frames of its path."""
         view = self.shown(view_id)
         request = self.planner.exposed(view, path, level.factor)
-        target = level.target(view, request.windows, request.seen)
-        request = replace(request, windows=target.windows)
-        image = level.render(self.mapper.descent.model, request)
+        target = level.target(view, request)
+        image = level.render(self.mapper.descent.model, request, target.windows)
         factor = None
         if level.factor == 1 and self.options.nuisances:
             factor = self.mapper.nuisances.factor(view_id)

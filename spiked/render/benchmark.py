@@ -15,6 +15,7 @@ from spiked.pose import exp_so3
 from spiked.render.camera import Camera
 from spiked.render.charge import WARP_CELL_PX, ChargeLoss
 from spiked.render.choice import chosen
+from spiked.render.comparison import RateTerms
 from spiked.render.cpu import Rasteriser, usable_cores
 from spiked.render.descent import Descent, DeviceDescent
 from spiked.render.gpu import GpuRasteriser
@@ -150,6 +151,25 @@ def steps_with_adam(
         return repeated(step, repetitions)
 
     return [(rasteriser.instructions, timed(rasteriser, fit)) for rasteriser, fit in fits]
+
+
+def step_on_a_view(
+    size: Size, repetitions: int, sub_frames: int = 0, device: Literal["cuda", "emulated"] = "cuda"
+) -> Timing:
+    """Steps on a GPU that render, compare with a view and descend: splats, view, image and gradient stay there."""
+    camera, splats = scene(size)
+    poses = passing(camera, sub_frames + 1)
+    rasteriser, fit = GpuRasteriser(camera, device=device), DeviceDescent(splats, *BETAS)
+    rates, windows = np.full((size.height, size.width), 0.5, np.float32), None
+    if sub_frames:
+        windows = np.stack([np.zeros_like(rates), np.full_like(rates, sub_frames)])
+    view = rasteriser.frame(rates, np.full_like(rates, 0.05), windows)
+
+    def step() -> None:
+        rasteriser.compare(fit.on_device(rasteriser), *poses, view, RateTerms(1.0, 0.03, 0.2, 0.01))
+        fit.step(rasteriser, None, (1e-9,) * 5, SizeLimits(), MeanAxes())
+
+    return repeated(step, repetitions)
 
 
 def passing(

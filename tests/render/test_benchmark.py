@@ -24,3 +24,9 @@ def test_the_row_of_a_gpu() -> None:
     row = benchmark.on_device(benchmark.Size(300, 64, 40), repetitions=1, device="emulated")
     assert row.name == "step with Adam, 0k splats, 64x40, emulated GPU"
     assert row.value > 0 and row.ratio is not None and row.ratio > 0
+
+
+def test_a_step_on_a_view_is_timed() -> None:
+    for sub_frames in (0, 2):
+        timing = benchmark.step_on_a_view(benchmark.Size(300, 64, 40), 1, sub_frames, device="emulated")
+        assert timing.best_s > 0

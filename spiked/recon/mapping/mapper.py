@@ -209,7 +209,7 @@ class Mapper:
             self._fit_rates(key, view, request, background, decay, level)
         else:
             slope = self._compare_charge(key, request, level, background)
-            self.descent.step(level.rasteriser, slope, *self._next_stride(decay, request.middle[1]))
+            self._descend(level.rasteriser, slope, decay, request.middle[1])
 
     def _fit_rates(
         self, key: int, view: View, request: RenderRequest, background: float, decay: float, level: Level
@@ -230,8 +230,11 @@ class Mapper:
         image = replay.render(self.descent.model, background)
         shown = replay.comparable(image.values)
         slope = self.rate_loss(shown, replay.target(shown), self.white)[1]
-        slope = replay.slope(slope, image.values)
-        self.descent.step(replay.rasteriser, slope, *self._next_stride(decay, replay.centre))
+        self._descend(replay.rasteriser, replay.slope(slope, image.values), decay, replay.centre)
+
+    def _descend(self, rasteriser: AnyRasteriser, slope: Image, decay: float, centre: Array) -> None:
+        """A step along the gradient of an image that was seen from `centre`."""
+        self.descent.step(rasteriser, slope, *self._next_stride(decay, centre))
 
     def _next_stride(self, decay: float, centre: Array) -> Stride:
         """How far the next step goes, on an image that was seen from `centre`; counts it."""

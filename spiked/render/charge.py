@@ -20,6 +20,8 @@ from spiked.sensor import BitOrder, Sensor
 
 WARP_CELL_PX = 8
 """Spacing in px of the nodes at which displacements are given."""
+JITTER = 0.02
+"""Standard deviation of an interval's charge beside that of its ends, in spikes."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class Charge:
     """Spikes counted over spikes expected, by the pixels that roughly agree; 1 without any."""
 
 
-class _Layout(TypedDict):
+class SpikeLayout(TypedDict):
     """How the kernel reads the bits of a stored frame; tile [4] has the colours of a mosaic's 2x2 sites."""
 
     width: int
@@ -59,7 +61,7 @@ class ChargeLoss:
         self._threads = threads
         self._native = _ChargeLoss(threads)
         mosaic = None if sensor.mosaic is None else sensor.mosaic.channels(2, 2).ravel()
-        self._layout: _Layout = {
+        self.layout: SpikeLayout = {
             "width": sensor.width,
             "height": sensor.height,
             "row_stride": sensor.row_stride,
@@ -87,7 +89,7 @@ class ChargeLoss:
         every: int = 1,
         phase: int = 0,
         floor: float,
-        jitter: float = 0.02,
+        jitter: float = JITTER,
     ) -> Charge:
         """Loss, slope and brightness of an image in spikes a frame.
 
@@ -109,7 +111,7 @@ class ChargeLoss:
             raise ConfigurationError(f"frames are bytes as they are stored, not {frames.dtype}")
         try:
             loss, pixels, chi2, intervals, expected, counted = self._native.run(
-                **self._layout,
+                **self.layout,
                 frames=np.ascontiguousarray(frames),
                 grids=np.ascontiguousarray(displacements, np.float32),
                 cell=WARP_CELL_PX,

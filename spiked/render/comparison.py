@@ -3,12 +3,13 @@
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
+from spiked.render.charge import JITTER
 from spiked.render.splats import Floats
 
 MOST_FRAME_BYTES = 1 << 30
-"""Views that a map keeps on a GPU: 640 of 400x250, 64 of 1000x1000."""
+"""Views of a kind that a map keeps on a GPU: 640 of 400x250, 64 of 1000x1000 that see slow motion."""
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,22 @@ class DeviceFrame:
     native: Any
     nbytes: int
     """Bytes on the device."""
+
+
+@dataclass(frozen=True)
+class DeviceSpikes:
+    """Frames of spikes on a GPU; made by `GpuRasteriser.spikes`."""
+
+    native: Any
+    nbytes: int
+    """Bytes on the device."""
+
+
+@dataclass(frozen=True)
+class DeviceLight:
+    """Gains and dark rates of a sensor's pixels on a GPU; made by `GpuRasteriser.light`."""
+
+    native: Any
 
 
 @dataclass(frozen=True)
@@ -62,16 +79,48 @@ class Compared:
     """The view's rates, likewise."""
 
 
-class FrameCache:
+@dataclass(frozen=True)
+class ChargeTerms:
+    """The terms of a charge loss, see `ChargeLoss` and `WarpedChargeLoss`."""
+
+    pixel: int
+    """Side of the image's pixels in those of the sensor; then of so many pairs of the sensor's rows one is used."""
+    phase: int
+    """Number of that pair."""
+    level: float
+    """Brightness of the view, times the gains."""
+    floor: float
+    """Noise added to each pixel, spikes a frame."""
+    white: float
+    """The rate that counts as full scale: slopes are divided by its square."""
+    nearest: float
+    """Smallest depth; nearer ones are clipped."""
+    detail: float
+    """Gain of the slope's detail finer than `detail_px`; 0: it stays as it is."""
+    detail_px: float
+    """Standard deviation of a blur, in pixels of the image: 1.5 at most."""
+    jitter: float = JITTER
+    """Of an interval's charge."""
+
+
+@dataclass(frozen=True)
+class ChargeCompared:
+    """An image compared with spikes, as `Charge`; its slope stays on the device."""
+
+    loss: float
+    chi2: float
+    brightness: float
+
+
+Kept = TypeVar("Kept", DeviceFrame, DeviceSpikes)
+
+
+class FrameCache(Generic[Kept]):
     """Views on a GPU by their keys: those used last, as many as fit."""
 
     def __init__(self, most_bytes: int = MOST_FRAME_BYTES) -> None:
         self._most_bytes = most_bytes
-        self._frames: OrderedDict[Hashable, DeviceFrame] = OrderedDict()
-
-    def __getstate__(self) -> dict[str, object]:
-        """Without the views: they are made anew when they are asked for."""
-        return vars(self) | {"_frames": OrderedDict()}
+        self._frames: OrderedDict[Hashable, Kept] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -81,7 +130,7 @@ class FrameCache:
         """Bytes that are held."""
         return sum(frame.nbytes for frame in self._frames.values())
 
-    def get(self, key: Hashable, make: Callable[[], DeviceFrame]) -> DeviceFrame:
+    def get(self, key: Hashable, make: Callable[[], Kept]) -> Kept:
         """The view of a key, which is made if it is not there; the last one stays whatever its size."""
         if key in self._frames:
             self._frames.move_to_end(key)

@@ -16,7 +16,17 @@ from numpy.typing import ArrayLike, NDArray
 import spiked.native._gpu as _gpu
 from spiked.errors import ConfigurationError
 from spiked.render.camera import Camera
-from spiked.render.comparison import Compared, DeviceFrame, RateTerms, ViewGains
+from spiked.render.charge import WARP_CELL_PX, SpikeLayout
+from spiked.render.comparison import (
+    ChargeCompared,
+    ChargeTerms,
+    Compared,
+    DeviceFrame,
+    DeviceLight,
+    DeviceSpikes,
+    RateTerms,
+    ViewGains,
+)
 from spiked.render.cpu import Rasteriser, checked_poses
 from spiked.render.splats import AnySplats, DeviceScene, Floats, Gradients, MeanAxes, RenderedImage, SizeLimits
 from spiked.scene import Scene
@@ -76,6 +86,7 @@ class GpuRasteriser(Rasteriser):
         there is no GPU."""
         self._emulated = device == "emulated"
         self._gain: Floats | None = None
+        self._charge_colours = 1
         super().__init__(camera, 1, near)
 
     def _forward(self, *inputs: Any) -> RenderedImage:
@@ -155,6 +166,57 @@ class GpuRasteriser(Rasteriser):
             self._native.take_evidence(xx, xy)
         return xx, xy
 
+    def spikes(self, frames: NDArray[np.uint8], layout: SpikeLayout) -> DeviceSpikes:
+        """Frames [n, frame_bytes] on this device, at most 64."""
+        with self._told(), device_errors():
+            return DeviceSpikes(self._native.spikes(np.ascontiguousarray(frames), **layout), frames.nbytes)
+
+    def light(self, gain: Floats, dark: Floats | None) -> DeviceLight:
+        """What multiplies the light of a sensor's pixels [H, W] (0: one that does not count), and what is added."""
+        arrays = [None if array is None else np.ascontiguousarray(array, np.float32) for array in (gain, dark)]
+        with self._told(), device_errors():
+            return DeviceLight(self._native.light(*arrays))
+
+    def compare_charge(
+        self,
+        scene: DeviceScene,
+        rotations: ArrayLike,
+        centres: ArrayLike,
+        spikes: DeviceSpikes,
+        light: DeviceLight,
+        motion: tuple[Floats, Floats],
+        terms: ChargeTerms,
+        background: float = 0.0,
+    ) -> ChargeCompared:
+        """Render a scene from one pose, [1, 3, 3] and [1, 3], and compare the image with the spikes of frames to which
+        it is warped, `motion` as of `FrameWarp.motion`.
+
+        The camera has no distortion. The gradient of the loss by the image stays on the device for `descend`.
+        """
+        poses = checked_poses(rotations, centres)
+        self._inputs, self._charge_colours = None, int(scene.native.colours)
+        turn, shift = (np.ascontiguousarray(part, np.float32) for part in motion)
+        with self._told(), device_errors():
+            loss, pixels, chi2, intervals, expected, counted = self._native.compare_charge(
+                scene.native, spikes.native, light.native, *poses, np.full(3, background, np.float32), turn, shift,
+                cell=WARP_CELL_PX, nearest=terms.nearest, pixel=terms.pixel, every=terms.pixel, phase=terms.phase,
+                level=terms.level, floor=terms.floor, jitter=terms.jitter, scale=1 / terms.white**2,
+                detail=terms.detail, window=_detail_window(terms.detail_px),
+            )  # fmt: skip
+        return ChargeCompared(
+            loss / max(pixels, 1.0),
+            chi2 / intervals if intervals > 0 else 0.0,
+            counted / expected if expected > 0 else 1.0,
+        )
+
+    def charge_slope(self) -> Floats:
+        """`Charge.slope` of the last comparison with spikes, [H, W] or [H, W, 3]: without detail, and not divided."""
+        size = (self.camera.height, self.camera.width)
+        out = np.empty(size if self._charge_colours == 1 else (*size, 3), np.float32)
+        with self._told(), device_errors():
+            self._native.charge_slope(out)
+        return out
+
     def descend(
         self,
         d_values: Floats | None,
@@ -196,3 +258,9 @@ class GpuRasteriser(Rasteriser):
             return _gpu.renderer(near=near, emulated=self._emulated, **optics)
         except RuntimeError as error:
             raise ConfigurationError(f"cannot render on a GPU: {error}") from error
+
+
+def _detail_window(sigma_px: float) -> Floats:
+    """Weights of pixels 0 to 6 from the middle, of 13 that `cv2.GaussianBlur` takes for a sigma of 1.5 px."""
+    weights = np.exp(-0.5 * (np.arange(-6, 7) / sigma_px) ** 2)
+    return np.asarray((weights / weights.sum())[6:], np.float32)

@@ -18,9 +18,10 @@ KERNEL = re.compile(
 PER_PIXEL = (
     *("Forward", "Backward", "Combine"),
     *("CompareRates", "CompareStructure", "DifferentiateStructure", "MixSlopes", "AddEvidence"),
+    *("SmoothDepths", "CompareCharge", "MeanSlope", "BlurRows", "AddDetail"),
 )
 KERNELS = {*PER_PIXEL, "Prepare", "SetSubFrames", "Project", "CountTiles", "ListPairs", "FindTiles", "Unproject",
-           "SumBlocks", "Descend", "TakeRows"}  # fmt: skip
+           "SumBlocks", "Descend", "TakeRows", "KeyDepths", "MedianDepth", "WarpNodes", "Clear", "Scale"}  # fmt: skip
 
 
 @pytest.mark.skipif(NVCC is None, reason="there is no nvcc here")

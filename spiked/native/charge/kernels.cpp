@@ -7,6 +7,7 @@
 #include "kernels.hpp"
 
 #include "../common/simd.hpp"
+#include "pixel.hpp"
 
 namespace spiked {
 namespace {
@@ -92,17 +93,12 @@ static void gather(const ChargeJob& job, const ChargeRow& row, int64_t x0, int c
         float *light = work.light[f], *right = work.right[f], *down = work.down[f], *inside = work.inside[f];
         int32_t* at = work.at[f];
         for (int i = 0; i < kPixels; ++i) {
-            float x = ((float)(x0 + i) + 0.5f + dx[i]) * shrink - 0.5f;
-            float y = ((float)row.y + 0.5f + dy[i]) * shrink - 0.5f;
-            inside[i] = (x >= 0) & (y >= 0) & (x < right_edge) & (y < lower_edge) ? 1.0f : 0.0f;
-            x = x > 0 ? x : 0;
-            x = x < right_edge ? x : right_edge;
-            y = y > 0 ? y : 0;
-            y = y < lower_edge ? y : lower_edge;
-            const int32_t column = (int32_t)x, line_number = (int32_t)y;
-            right[i] = x - (float)column;
-            down[i] = y - (float)line_number;
-            at[i] = line_number * stride + column;
+            const Spot spot = spot_of(((float)(x0 + i) + 0.5f + dx[i]) * shrink - 0.5f,
+                                      ((float)row.y + 0.5f + dy[i]) * shrink - 0.5f, right_edge, lower_edge);
+            inside[i] = spot.inside ? 1.0f : 0.0f;
+            right[i] = spot.right;
+            down[i] = spot.down;
+            at[i] = spot.line * stride + spot.column;
         }
         for (int r = 0; r < kRuns; ++r) {
             const int from = r * kLanes;
@@ -134,9 +130,6 @@ static void gather(const ChargeJob& job, const ChargeRow& row, int64_t x0, int c
 
 // Residuals of the intervals, and the slope of the loss by the light of each frame.
 static void residual(const ChargeJob& job, const ChargeRow& row, int64_t x0, ChargeWork& work, ChargeSums& sums) {
-    constexpr float kEdgeWeight = 6.0f;  // 1 / variance of the charge before the first and after the last spike
-    // Counts are accurate to half a spike, the map to some percent; limits chosen by hand.
-    constexpr float kAgreeSpikes = 1.2f, kAgreeShare = 0.2f;
     const float floor2 = job.floor * job.floor, jitter2 = job.jitter * job.jitter;
     float charge[kPixels] = {}, spikes[kPixels] = {}, residual[kPixels] = {}, squares[kPixels] = {};
     float first[kPixels] = {}, last[kPixels] = {}, charge_first[kPixels] = {}, charge_last[kPixels] = {};
@@ -166,27 +159,17 @@ static void residual(const ChargeJob& job, const ChargeRow& row, int64_t x0, Cha
     }
     float inner[kPixels], outer[kPixels];  // factor of a residual; the slope outside of all intervals
     for (int i = 0; i < kPixels; ++i) {
-        const bool some = spikes[i] > 0, more = spikes[i] > 1;
-        const float span = last[i] - first[i];
-        const float edge = some ? charge_first[i] + (charge[i] - charge_last[i]) - 1 : charge[i];
-        const float edge_length = some ? seen[i] - span : seen[i];
-        const float rate = more ? (spikes[i] - 1) / (span > 0 ? span : 1) : 1;
-        const float variance = rate * rate * (1.0f / 6) + jitter2;
-        const float precision = (more ? lengths[i] / variance : 0) + kEdgeWeight * edge_length * edge_length;
-        // A pixel that fires in every frame may have received more light.
-        const bool saturated = more & (span < spikes[i]), above = charge[i] > spikes[i];
-        const bool enough = seen[i] >= kLeastChargeFrames;
-        const float scale = enough ? floor2 / (1 + floor2 * precision) : 0;
-        inner[i] = more & !(saturated & above) ? 2 * scale / variance : 0;
-        outer[i] = saturated & above ? 0 : 2 * kEdgeWeight * scale * edge;
-        sums.loss += scale * ((more ? squares[i] / variance : 0) + kEdgeWeight * edge * edge);
-        sums.pixels += enough;
-        sums.chi2 += enough & more ? squares[i] / variance : 0;
-        sums.intervals += enough & more ? spikes[i] - 1 : 0;
-        const float off = charge[i] - spikes[i] > 0 ? charge[i] - spikes[i] : spikes[i] - charge[i];
-        const bool agrees = enough & (off < kAgreeSpikes + kAgreeShare * (charge[i] + spikes[i]));
-        sums.expected += agrees ? charge[i] : 0;
-        sums.counted += agrees ? spikes[i] : 0;
+        const Weighed weighed = weigh(
+            {charge[i], spikes[i], seen[i], first[i], last[i], charge_first[i], charge_last[i], lengths[i], squares[i]},
+            floor2, jitter2);
+        inner[i] = weighed.inner;
+        outer[i] = weighed.outer;
+        sums.loss += weighed.loss;
+        sums.pixels += weighed.enough;
+        sums.chi2 += weighed.chi2;
+        sums.intervals += weighed.intervals;
+        sums.expected += weighed.expected;
+        sums.counted += weighed.counted;
     }
     float after[kPixels];
     for (int i = 0; i < kPixels; ++i) after[i] = outer[i];

@@ -3,12 +3,11 @@
 #include <stdint.h>
 
 #include "../common/instruction_sets.hpp"
+#include "limits.hpp"
 
 namespace spiked {
 
 constexpr int kMaxSide = 4096;  // pixels
-constexpr int kMaxChargeFrames = 64;
-constexpr int kLeastChargeFrames = 4;  // a pixel within the image for fewer frames is not used
 
 // Frames of spikes, and an image that is sampled at displaced positions of their pixels (kernels.cpp).
 struct ChargeJob {

@@ -7,6 +7,7 @@
 #include "../common/arrays.hpp"
 #include "../geometry/camera.hpp"
 #include "bindings.hpp"
+#include "warp_node.hpp"
 
 namespace spiked {
 namespace {
@@ -29,8 +30,18 @@ void warp_nodes(Array<const float, 2> inverse, float shrink, Array<const float, 
            "straight nodes are [rows, columns, 2], and the camera is fx, fy, cx, cy");
     Pinhole k = {1, 1, 0, 0, lens_of(given)};
     if (camera) k.fx = camera->data()[0], k.fy = camera->data()[1], k.cx = camera->data()[2], k.cy = camera->data()[3];
-    const size_t width = inverse.shape(1);
-    const float right = static_cast<float>(width - 1), lowest = static_cast<float>(inverse.shape(0) - 1);
+    const size_t height = inverse.shape(0), width = inverse.shape(1);
+    const InverseDepths depths{inverse.data(),
+                               static_cast<int64_t>(width),
+                               static_cast<float>(width - 1),
+                               static_cast<float>(height - 1),
+                               shrink,
+                               nearest};
+    const auto bent = [&](float& u, float& v) {
+        if (!k.lens.model) return;
+        const Bent at = bend(k.lens, (u - k.cx) / k.fx, (v - k.cy) / k.fy);
+        u = static_cast<float>(k.fx * at.x + k.cx), v = static_cast<float>(k.fy * at.y + k.cy);
+    };
     nb::gil_scoped_release release;
     float* out = moved.data();
     for (size_t f = 0; f < frames; ++f) {
@@ -39,20 +50,7 @@ void warp_nodes(Array<const float, 2> inverse, float shrink, Array<const float, 
             for (size_t column = 0; column < columns; ++column, out += 2) {
                 const float x = cell * static_cast<float>(column), y = cell * static_cast<float>(row);
                 const float* from = straight ? straight->data() + 2 * (row * columns + column) : nullptr;
-                const float p = from ? from[0] : x, r = from ? from[1] : y;
-                const float infinity[3] = {a[0] * p + a[1] * r + a[2], a[3] * p + a[4] * r + a[5],
-                                           a[6] * p + a[7] * r + a[8]};
-                float u = x, v = y;
-                for (int round = 0; round < 2; ++round) {
-                    const size_t i = static_cast<size_t>(std::clamp(u * shrink, 0.0f, right));
-                    const size_t j = static_cast<size_t>(std::clamp(v * shrink, 0.0f, lowest));
-                    const float q = inverse.data()[j * width + i], z = std::max(infinity[2] + q * b[2], nearest);
-                    u = (infinity[0] + q * b[0]) / z, v = (infinity[1] + q * b[1]) / z;
-                    if (!k.lens.model) continue;
-                    const Bent bent = bend(k.lens, (u - k.cx) / k.fx, (v - k.cy) / k.fy);
-                    u = static_cast<float>(k.fx * bent.x + k.cx), v = static_cast<float>(k.fy * bent.y + k.cy);
-                }
-                out[0] = u - x, out[1] = v - y;
+                warp_node(depths, a, b, x, y, from ? from[0] : x, from ? from[1] : y, bent, out);
             }
     }
 }

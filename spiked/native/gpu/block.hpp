@@ -20,6 +20,15 @@ constexpr int kWarp = 32;
 // Blocks of a grid that has so many threads at least.
 inline uint64_t blocks_of(uint64_t threads, int of_block) { return (threads + of_block - 1) / of_block; }
 
+// Adds to what other threads add to, too. Whole numbers: their order changes nothing.
+SPIKED_DEVICE inline void add_whole(int64_t* sum, int64_t value) {
+#if defined(__CUDACC__)
+    atomicAdd(reinterpret_cast<unsigned long long*>(sum), static_cast<unsigned long long>(value));
+#else
+    *sum += value;
+#endif
+}
+
 template <class T, int Threads>
 struct PerThread {
 #if defined(__CUDACC__)

@@ -59,15 +59,18 @@ struct CompareRates {
     }
 };
 
+// The place of number i among so many, mirrored at both ends as often as needed.
+SPIKED_DEVICE inline int mirrored(int i, int count) {
+    while (i < 0 || i >= count) i = count == 1 ? 0 : i < 0 ? -i : 2 * count - 2 - i;
+    return i;
+}
+
 // A pixel of an image's plane; of a mosaic the 3x3 binomial mean around it, mirrored at the border, which mixes all
 // colours in the same proportion (`luminance` in spiked/recon/frontend/windowing.py).
 struct Plane {
     int width, height, colours, colour;
     bool mosaic;
 
-    SPIKED_DEVICE static int mirrored(int i, int count) {
-        return count == 1 ? 0 : i < 0 ? -i : i < count ? i : 2 * count - 2 - i;
-    }
     SPIKED_DEVICE int64_t place(int x, int y) const { return (static_cast<int64_t>(y) * width + x) * colours + colour; }
     SPIKED_DEVICE bool has(int x, int y) const { return x >= 0 && x < width && y >= 0 && y < height; }
     SPIKED_DEVICE float at(const float* image, int x, int y) const {

@@ -14,9 +14,13 @@
 #include "../raster/moving_camera.inl"
 #include "../raster/similarity.inl"
 #include "../dense/nuisances.hpp"
+#include "../charge/pixel.hpp"
+#include "../charge/warp_node.hpp"
 #include "kernels.inl"
 #include "compare.inl"
+#include "charge.inl"
 #include "compare_passes.inl"
+#include "charge_passes.inl"
 #include "passes.inl"
 // clang-format on
 

@@ -3,6 +3,7 @@
 #include <nanobind/stl/unique_ptr.h>
 #include <nanobind/stl/vector.h>
 
+#include "../charge/limits.hpp"
 #include "../raster/binding_passes.hpp"
 #include "renderer.hpp"
 
@@ -67,6 +68,68 @@ nb::tuple compare(GpuRenderer& self, GpuScene& scene, GpuFrame& frame, Array<con
         made = self.compare(scene, frame, views, background.data(), loss);
     }
     return nb::make_tuple(made.error, made.similarity, made.expected_light, made.seen_light);
+}
+
+std::unique_ptr<GpuSpikes> spikes(GpuRenderer& self, Array<const uint8_t, 2> bytes, int width, int height,
+                                  int row_stride, bool flipped, bool msb, Array<const uint8_t, 1> tile) {
+    expect(
+        width > 0 && width % 8 == 0 && height > 0 && height <= kMaxSide && width <= kMaxSide && row_stride >= width / 8,
+        "a row is whole bytes and fits its stride");
+    expect(bytes.shape(0) > 0 && bytes.shape(0) <= kMaxChargeFrames &&
+               bytes.shape(1) == static_cast<size_t>(row_stride) * height,
+           "frames are uint8 [n, row_stride * height], at most 64");
+    expect(tile.shape(0) == 4 && *std::max_element(tile.data(), tile.data() + 4) < 3, "a tile is four of 0, 1, 2");
+    SpikeLayout layout{width, height, row_stride, flipped, msb, {}};
+    std::copy_n(tile.data(), 4, layout.tile);
+    nb::gil_scoped_release release;
+    return self.spikes(layout, bytes.data(), static_cast<int>(bytes.shape(0)));
+}
+
+std::unique_ptr<GpuLight> light(GpuRenderer& self, Array<const float, 2> gain,
+                                std::optional<Array<const float, 2>> dark) {
+    expect(gain.size() > 0 && (!dark || (dark->shape(0) == gain.shape(0) && dark->shape(1) == gain.shape(1))),
+           "gain and dark are [H, W]");
+    nb::gil_scoped_release release;
+    return self.light(static_cast<int>(gain.shape(1)), static_cast<int>(gain.shape(0)), gain.data(),
+                      dark ? dark->data() : nullptr);
+}
+
+nb::tuple compare_charge(GpuRenderer& self, GpuScene& scene, GpuSpikes& spikes, GpuLight& light,
+                         Array<const double, 3> rotations, Array<const double, 2> centres,
+                         Array<const float, 1> background, Array<const float, 3> turn, Array<const float, 2> shift,
+                         int cell, float nearest, float pixel, int every, int phase, float level, float floor,
+                         float jitter, float scale, float detail, Array<const float, 1> window) {
+    expect_poses(rotations, centres, background);
+    const size_t frames = spikes.frames;
+    const PinholeF& camera = self.camera();
+    expect(rotations.shape(0) == 1, "an image is compared with spikes from one pose");
+    expect(turn.shape(0) == frames && turn.shape(1) == 3 && turn.shape(2) == 3 && shift.shape(0) == frames &&
+               shift.shape(1) == 3,
+           "turn [n, 3, 3] and shift [n, 3] are of the frames");
+    expect(light.width == spikes.layout.width && light.height == spikes.layout.height,
+           "gain and dark have the sensor's size");
+    expect(camera.width > 1 && camera.height > 1 && camera.lens == 0, "the image is at least 2x2, without distortion");
+    expect(cell > 0 && pixel >= 1 && nearest > 0, "cell, pixel and nearest are positive");
+    expect(every > 0 && phase >= 0 && phase < every, "phase is one of every");
+    expect(floor > 0 && jitter > 0, "floor and jitter are positive");
+    expect(window.shape(0) == kDetailReach + 1, "the window has seven weights");
+    ChargeLoss loss{turn.data(), shift.data(), cell,   nearest, pixel,  every, phase,
+                    level,       floor,        jitter, scale,   detail, {}};
+    std::copy_n(window.data(), kDetailReach + 1, loss.window);
+    const Views pose{rotations.data(), centres.data(), 1, nullptr, nullptr, nullptr, nullptr};
+    ChargeComparison made;
+    {
+        nb::gil_scoped_release release;
+        made = self.compare_charge(scene, spikes, light, pose, background.data(), loss);
+    }
+    return nb::make_tuple(made.loss, made.pixels, made.chi2, made.intervals, made.expected, made.counted);
+}
+
+void charge_slope(GpuRenderer& self, AnyArray<float> out) {
+    expect(self.charge_values() > 0 && out.size() == self.charge_values(),
+           "no image was compared with spikes, or the output has another size");
+    nb::gil_scoped_release release;
+    self.charge_slope(out.data());
 }
 
 void set_gains(GpuRenderer& self, Array<const float, 2> gain) {
@@ -182,6 +245,8 @@ NB_MODULE(_gpu, m) {
         .def_prop_ro("count", &GpuScene::count)
         .def_prop_ro("colours", &GpuScene::colours);
     nb::class_<GpuFrame>(m, "Frame");
+    nb::class_<GpuSpikes>(m, "Spikes");
+    nb::class_<GpuLight>(m, "Light");
     nb::class_<GpuRenderer> renderer(m, "Renderer");
     bind_passes<GpuRenderer>(renderer);
     renderer
@@ -199,6 +264,15 @@ NB_MODULE(_gpu, m) {
              nb::arg("background"), nb::arg("white"), nb::arg("floor"), nb::arg("share"), nb::arg("scale"),
              nb::arg("level").none(), nb::arg("model_error"), nb::arg("sigmas"))
         .def("slope", &slope, nb::arg("out").noconvert())
+        .def("spikes", &spikes, nb::arg("bytes"), nb::kw_only(), nb::arg("width"), nb::arg("height"),
+             nb::arg("row_stride"), nb::arg("flipped"), nb::arg("msb"), nb::arg("tile"))
+        .def("light", &light, nb::arg("gain"), nb::arg("dark").none())
+        .def("compare_charge", &compare_charge, nb::arg("scene"), nb::arg("spikes"), nb::arg("light"),
+             nb::arg("rotations"), nb::arg("centres"), nb::arg("background"), nb::arg("turn"), nb::arg("shift"),
+             nb::kw_only(), nb::arg("cell"), nb::arg("nearest"), nb::arg("pixel"), nb::arg("every"), nb::arg("phase"),
+             nb::arg("level"), nb::arg("floor"), nb::arg("jitter"), nb::arg("scale"), nb::arg("detail"),
+             nb::arg("window"))
+        .def("charge_slope", &charge_slope, nb::arg("out").noconvert())
         .def("set_gains", &set_gains, nb::arg("gain"))
         .def("add_evidence", &add_evidence, nb::arg("frame"), nb::arg("level"), nb::arg("model_error"))
         .def("take_evidence", &take_evidence, nb::arg("xx").noconvert(), nb::arg("xy").noconvert());

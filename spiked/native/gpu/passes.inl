@@ -130,7 +130,7 @@ class Resident final : public GpuScene {
 template <class Device>
 class Passes final : public GpuRenderer {
   public:
-    explicit Passes(const PinholeF& camera) : GpuRenderer(camera), comparer_(device_) {}
+    explicit Passes(const PinholeF& camera) : GpuRenderer(camera), comparer_(device_), charge_(device_) {}
 
     const char* instructions() const override { return Device::kName; }
 
@@ -156,9 +156,44 @@ class Passes final : public GpuRenderer {
         const float* windows = frame.moving ? frame.windows.data() : nullptr;
         render(poses, {nullptr, windows, frame.mosaic ? frame.channels.data() : nullptr}, background);
         const RateComparison made = comparer_.compare(comparer_.pair(image_.data(), frame, loss.gains), loss);
+        slope_ = comparer_.slope();
         compared_ = true;
         return made;
     }
+
+    ChargeComparison compare_charge(GpuScene& scene, GpuSpikes& spikes, GpuLight& light, const Views& pose,
+                                    const float background[3], const ChargeLoss& loss) override {
+        start();
+        splats_ = static_cast<Resident<Device>&>(scene).arrays();
+        render(pose, {}, background);
+        const float *image = image_.data(), *depth = image + shown() + pixels();
+        const ChargeComparison made =
+            charge_.compare(camera_, splats_.colours, image, depth, static_cast<Spikes<Device>&>(spikes),
+                            static_cast<Light<Device>&>(light), loss);
+        slope_ = charge_.slope();
+        compared_ = true;
+        return made;
+    }
+
+    std::unique_ptr<GpuSpikes> spikes(const SpikeLayout& layout, const uint8_t* bytes, int frames) override {
+        auto made = std::make_unique<Spikes<Device>>();
+        made->layout = layout, made->frames = frames;
+        device_.upload(made->bytes, bytes, static_cast<size_t>(frames) * layout.height * layout.row_stride);
+        device_.finish();
+        return made;
+    }
+
+    std::unique_ptr<GpuLight> light(int width, int height, const float* gain, const float* dark) override {
+        auto made = std::make_unique<Light<Device>>();
+        made->width = width, made->height = height, made->dark = dark != nullptr;
+        device_.upload(made->factor, gain, static_cast<size_t>(width) * height);
+        if (dark) device_.upload(made->added, dark, static_cast<size_t>(width) * height);
+        device_.finish();
+        return made;
+    }
+
+    void charge_slope(float* out) override { charge_.raw_slope(out); }
+    size_t charge_values() const override { return charge_.values(); }
 
     std::unique_ptr<GpuFrame> frame(const FrameArrays& given) override {
         auto frame = std::make_unique<Frame<Device>>();
@@ -178,7 +213,7 @@ class Passes final : public GpuRenderer {
     }
 
     void slope(float* out) override {
-        device_.download(out, comparer_.slope(), shown());
+        device_.download(out, slope_, shown());
         device_.finish();
     }
 
@@ -261,7 +296,7 @@ class Passes final : public GpuRenderer {
 
     // The gradients of the last image, which stay on the device; d_values: null for those of its comparison.
     void differentiate(const float* d_values) {
-        const float* slopes = d_values ? device_.upload(d_values_, d_values, shown()) : comparer_.slope();
+        const float* slopes = d_values ? device_.upload(d_values_, d_values, shown()) : slope_;
         float* slots = slots_.grow(static_cast<size_t>(pairs_) * slot_floats(splats_.colours, moving_) + 1);
         choose(splats_.colours == 3, [&](auto coloured) {
             choose(moving_, [&](auto moving) {
@@ -399,6 +434,8 @@ class Passes final : public GpuRenderer {
 
     Device device_;
     Comparer<Device> comparer_;
+    ChargeComparer<Device> charge_;
+    const float* slope_ = nullptr;  // by the image of the last comparison
     bool moving_ = false;
     int sub_poses_ = 0;  // or sub-frames
     uint32_t pairs_ = 0;

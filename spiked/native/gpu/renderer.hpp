@@ -74,6 +74,52 @@ struct RateComparison {
     double expected_light, seen_light;  // summed over the pixels that agree; 0 without gains
 };
 
+// How the bits of a stored frame lie; tile has the colours of a mosaic's 2x2 sites.
+struct SpikeLayout {
+    int width, height, row_stride;
+    bool flipped, msb;
+    uint8_t tile[4];
+};
+
+// Frames of spikes on the device.
+class GpuSpikes {
+  public:
+    virtual ~GpuSpikes() = default;
+
+    SpikeLayout layout{};
+    int frames = 0;
+};
+
+// What multiplies the light of a sensor's pixels on the device, and what is added to it.
+class GpuLight {
+  public:
+    virtual ~GpuLight() = default;
+
+    int width = 0, height = 0;
+    bool dark = false;
+};
+
+constexpr int kDetailReach = 6;  // pixels of the blur that separates detail
+
+// How an image is compared with spikes, see ChargeLoss in spiked/render/charge.py and WarpedChargeLoss in
+// spiked/recon/mapping/loss.py.
+struct ChargeLoss {
+    const float *turn, *shift;  // [frames][9], [frames][3], see native/charge/warp_node.hpp
+    int cell;                   // px of the sensor between nodes
+    float nearest;              // depth
+    float pixel;                // side of an image pixel in sensor pixels
+    int every, phase;           // of `every` pairs of rows, the one of number `phase` is used
+    float level;                // times the gain
+    float floor, jitter;
+    float scale;   // of the slope
+    float detail;  // gain of what the blur takes away; 0 for none
+    float window[kDetailReach + 1];
+};
+
+struct ChargeComparison {
+    double loss, pixels, chi2, intervals, expected, counted;  // sums, as ChargeSums
+};
+
 class GpuRenderer {
   public:
     virtual ~GpuRenderer() = default;
@@ -97,6 +143,15 @@ class GpuRenderer {
                                    const RateLoss&) = 0;
     // [height][width] or [height][width][3], the slope by the image of the last comparison.
     virtual void slope(float* out) = 0;
+    // The same of the last one with spikes, neither scaled nor with detail; it stays until the next one.
+    virtual void charge_slope(float* out) = 0;
+    virtual size_t charge_values() const = 0;  // of that slope; 0 before any
+    virtual std::unique_ptr<GpuSpikes> spikes(const SpikeLayout&, const uint8_t* bytes, int frames) = 0;
+    // [height][width]; dark: or null.
+    virtual std::unique_ptr<GpuLight> light(int width, int height, const float* gain, const float* dark) = 0;
+    // Renders from one pose and compares the image, warped by its depth, with spikes.
+    virtual ChargeComparison compare_charge(GpuScene&, GpuSpikes&, GpuLight&, const Views& pose,
+                                            const float background[3], const ChargeLoss&) = 0;
     // Adds the last comparison, which was with this frame, to the evidence of the pixels' gains; and takes all of it.
     virtual void add_evidence(GpuFrame&, float level, float model_error) = 0;
     virtual void take_evidence(float* xx, float* xy) = 0;

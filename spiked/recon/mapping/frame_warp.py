@@ -26,6 +26,15 @@ class FrameWarp:
     """[n, 3, 3], at the middle of each frame"""
     centres: Array
     """[n, 3]"""
+    first: int = 0
+    """Absolute number of the first frame."""
+
+    def motion(self, camera: Camera, rotation: Array, centre: Array) -> tuple[Image, Image]:
+        """Turns [n, 3, 3] and shifts [n, 3] from pixels p of the frames to those of an image by `camera` from a pose,
+        p' ~ turn p + shift / depth, without distortion."""
+        k = camera.intrinsics.matrix()
+        turn = (k @ rotation.T @ self.rotations @ np.linalg.inv(k)).astype(np.float32)
+        return turn, np.ascontiguousarray(((self.centres - centre) @ rotation @ k.T).astype(np.float32))
 
     def displacements(self, camera: Camera, rotation: Array, centre: Array, depth: Image) -> NDArray[np.float32]:
         """Displacements from nodes `WARP_CELL_PX` apart in each frame to an image rendered by `camera` from a pose.
@@ -35,13 +44,9 @@ class FrameWarp:
         """
         columns, rows = -(-camera.width // WARP_CELL_PX) + 1, -(-camera.height // WARP_CELL_PX) + 1
         inverse, shrink = _smooth_inverse(depth, camera.width)
-        k = camera.intrinsics.matrix()
-        turn = (k @ rotation.T @ self.rotations @ np.linalg.inv(k)).astype(np.float32)
-        shift = ((self.centres - centre) @ rotation @ k.T).astype(np.float32)
+        turn, shift = self.motion(camera, rotation, centre)
         moved = np.empty((len(turn), rows, columns, 2), np.float32)
-        warp_nodes(
-            inverse, shrink, turn, np.ascontiguousarray(shift), WARP_CELL_PX, MIN_RELATIVE_DEPTH, moved, **_lens(camera)
-        )
+        warp_nodes(inverse, shrink, turn, shift, WARP_CELL_PX, MIN_RELATIVE_DEPTH, moved, **_lens(camera))
         return moved
 
 

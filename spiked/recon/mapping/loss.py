@@ -240,10 +240,7 @@ class WarpedChargeLoss:
         """
         assert request.warp is not None
         moved = request.warp.displacements(self.camera, request.rotations[0], request.centres[0], image.depth)
-        dark = None
-        if self.calibration is not None:
-            gain = np.where(self.calibration.dead, 0, gain * self.calibration.gain)
-            dark = self.calibration.dark
+        gain, dark = self.light(gain)
         # An image of large pixels needs only a part of the sensor's rows.
         charge = self.kernel(
             image.values,
@@ -256,9 +253,19 @@ class WarpedChargeLoss:
             phase=phase,
             floor=self.floor * white,
         )
-        error = charge.slope if pixel == 1 else cv2.blur(charge.slope, (1, pixel))
         slope = charge.slope if pixel > 1 else self._with_detail(charge.slope)
+        error = self.error(charge.slope, pixel)
         return ChargeComparison(charge.loss / white**2, slope / np.float32(white**2), error, charge.brightness)
+
+    def light(self, gain: Image) -> tuple[Image, Image | None]:
+        """Gains and dark rates of the pixels, for gains of a map: those of the calibration, too."""
+        if self.calibration is None:
+            return gain, None
+        return np.where(self.calibration.dead, 0, gain * self.calibration.gain), self.calibration.dark
+
+    def error(self, slope: Image, pixel: int) -> Image:
+        """`ChargeComparison.error` for a slope without detail, of an image with pixels of that size."""
+        return slope if pixel == 1 else cv2.blur(slope, (1, pixel))
 
     def _with_detail(self, slope: Image) -> Image:
         """A gradient [h, w] or [h, w, C] with fine detail amplified, see `detail`."""

@@ -12,10 +12,10 @@ from spiked.recon.frontend.demosaic import fill_mosaic
 from spiked.recon.frontend.windowing import View
 from spiked.recon.mapping.carrying import Homes, Places
 from spiked.recon.mapping.loss import RateLoss, WarpedChargeLoss
+from spiked.recon.mapping.map_steps import ChargeStep, RateStep, map_steps_for
 from spiked.recon.mapping.options import MapOptions
 from spiked.recon.mapping.photometric import Nuisances
 from spiked.recon.mapping.pyramid import Level, levels
-from spiked.recon.mapping.rate_steps import RateStep, rate_steps_for
 from spiked.recon.mapping.render_requests import RenderRequest
 from spiked.recon.mapping.replay import Replay
 from spiked.recon.mapping.seeding import SweptView, isotropic_splats
@@ -64,7 +64,7 @@ class Mapper:
         self.levels = levels(sensor, camera, threads)
         self.channels = self.levels[0].channels
         self.descent = descent_for(Scene.empty(self.colours), *BETAS, threads)
-        self.rate_steps = rate_steps_for(self.descent)
+        self.map_steps = map_steps_for(self.descent)
         self.white = 1.0
         """The radiance (spikes a frame) in whose units losses and rates are: `WHITE_PERCENTILE` of the first seeded
         view."""
@@ -85,14 +85,13 @@ class Mapper:
         self.steps = 0
         self.homes = Homes()
         self._most_log_scale = np.inf
-        self._charge_error: Image = np.zeros((1, 1), np.float32)
         self._rng = np.random.default_rng(seed)
         self._losses: dict[int, float] = {}
 
     def __setstate__(self, state: dict[str, object]) -> None:
         vars(self).update(state)
         self.descent = self.descent.moved()
-        self.rate_steps = rate_steps_for(self.descent)
+        self.map_steps = map_steps_for(self.descent)
 
     def __len__(self) -> int:
         """The number of splats."""
@@ -208,8 +207,7 @@ class Mapper:
         if request.warp is None:
             self._fit_rates(key, view, request, background, decay, level)
         else:
-            slope = self._compare_charge(key, request, level, background)
-            self._descend(level.rasteriser, slope, decay, request.middle[1])
+            self._fit_charge(key, request, background, decay, level)
 
     def _fit_rates(
         self, key: int, view: View, request: RenderRequest, background: float, decay: float, level: Level
@@ -220,7 +218,7 @@ class Mapper:
         gains = self.steps >= GAINS_FROM
         step = RateStep(key, view, request, level, self.view_loss, self.white, background, first, known, gains)
         stride = self._next_stride(decay, request.middle[1])
-        self._losses[key] = self.rate_steps.take(step, self.descent, stride)
+        self._losses[key] = self.map_steps.fit_rates(step, self.descent, stride)
         if known is not None and self.steps % NUISANCE_STEPS == 0:
             known.update()
 
@@ -249,16 +247,13 @@ class Mapper:
             return SizeLimits(self._most_log_scale)
         return SizeLimits(self._most_log_scale, pruning.widest, (centre[0], centre[1], centre[2]))
 
-    def _compare_charge(self, key: int, request: RenderRequest, level: Level, background: float) -> Image:
-        """Gradient of the loss by the image, from the charge between the spikes of all frames around a view."""
-        model = self.descent.model
-        image = level.rasteriser.forward(model, request.rotations, request.centres, background=background)
-        gain, phase = self.nuisances.factor(key), int(self._rng.integers(level.factor))
-        charge = self.charge_loss(image, request, gain, self.white, pixel=level.factor, phase=phase)
-        if self._knows_nuisances():
-            self.nuisances.note(key, self.nuisances.level(key) * charge.brightness)
-        self._losses[key], self._charge_error = charge.loss, charge.error
-        return charge.slope
+    def _fit_charge(self, key: int, request: RenderRequest, background: float, decay: float, level: Level) -> None:
+        """A step on the charge between the spikes of all frames around a view."""
+        phase, knows = int(self._rng.integers(level.factor)), self._knows_nuisances()
+        loss, nuisances = self.charge_loss, self.nuisances
+        step = ChargeStep(key, request, level, loss, self.white, background, phase, nuisances, knows)
+        stride = self._next_stride(decay, request.middle[1])
+        self._losses[key] = self.map_steps.fit_charge(step, self.descent, stride)
 
     def _knows_nuisances(self) -> bool:
         return self.options.nuisances and self.steps >= NUISANCES_FROM
@@ -274,7 +269,7 @@ class Mapper:
     def forget_views(self) -> None:
         """Drop what is stored for each view, after some were dropped."""
         self._losses.clear()
-        self.rate_steps.forget_views()
+        self.map_steps.forget_views()
         self.nuisances.forget_views()
 
     @property
@@ -293,9 +288,9 @@ class Mapper:
             certainty = self.rate_loss.certainty(target.deviation, self.white)
             error = (view.rate - self.nuisances.factor(key) * image.values) * certainty
         else:
-            image = self.rasteriser.forward(self.descent.model, rotation[None], centre[None])
             size = (self.camera.width, self.camera.height)
-            error = cv2.resize(self._charge_error, size, interpolation=cv2.INTER_LINEAR)
+            error = cv2.resize(self.map_steps.charge_error, size, interpolation=cv2.INTER_LINEAR)
+            image = self.rasteriser.forward(self.descent.model, rotation[None], centre[None])
         seen = fill_mosaic(view.rate, self.channels) if request.warp is None else image.values
         self._replace(error, seen, image.depth, rotation, centre, view.time)
 

@@ -88,7 +88,8 @@ class RenderPlanner:
         times = view.first + 0.5 + np.arange(len(view.frames))
         covered = (times >= path.begin) & (times <= path.end)
         rotations, centres = path.poses(np.append(times[covered], view.time))
-        warp = FrameWarp(view.frames[covered], rotations[:-1], centres[:-1])
+        first = view.first + int(np.argmax(covered))
+        warp = FrameWarp(view.frames[covered], rotations[:-1], centres[:-1], first)
         return RenderRequest(rotations[-1:], centres[-1:], warp=warp)
 
     def motion_px(self, rotation: Array, centre: Array, other: Array, other_centre: Array) -> float:

@@ -16,7 +16,7 @@ cd "$away"  # in the tree, and without -P, Python would find the folder `spiked`
 python="$venv/bin/python -P"
 nvidia-smi --query-gpu=name,driver_version,memory.total --format=csv
 "$venv/bin/spiked" version
-$python -m pytest -q -p no:cacheprovider "$tree/tests/render/test_gpu.py" "$tree/tests/render/test_gpu_loss.py" "$tree/tests/render/test_gsplat.py" "$tree/tests/render/test_torch.py"
+$python -m pytest -q -p no:cacheprovider "$tree/tests/render/test_gpu.py" "$tree/tests/render/test_gpu_loss.py" "$tree/tests/render/test_gpu_charge.py" "$tree/tests/render/test_gsplat.py" "$tree/tests/render/test_torch.py"
 $python "$tree/evaluation/gpu/measure.py"
 for renderer in cuda cpu; do
     echo "whole runs, $renderer"

@@ -126,14 +126,7 @@ class Rasteriser:
         1 % of the picture's contrast (docs/performance.md). Everything else is as in `forward`; backward() gives the
         gradients by all S + 1 poses.
         """
-        size = (self.camera.height, self.camera.width)
-        windows = np.ascontiguousarray(windows, np.float32)
-        if windows.shape != (2, *size):
-            raise ConfigurationError(
-                f"windows are {windows.shape}, expected {(2, *size)}: begin and end of each pixel's"
-            )
-        if not np.isfinite(windows).all():
-            raise ConfigurationError("a window is not finite: give a pixel that does not look an empty one, as 0, 0")
+        windows = checked_windows(windows, (self.camera.height, self.camera.width))
         if len(np.asarray(centres)) < 2:
             raise ConfigurationError("a moving camera needs two poses at least, at the beginning and at the end")
         return self._forward(splats, rotations, centres, None, windows, channels, background)
@@ -152,7 +145,7 @@ class Rasteriser:
         arrays, count, colours = self._splats(splats)
         size = (self.camera.height, self.camera.width)
         if channels is not None:
-            channels = _checked_channels(channels, size, colours)
+            channels = checked_channels(channels, size, colours)
         backgrounds = _checked_background(background)
         values = np.empty(size if colours == 1 or channels is not None else (*size, 3), np.float32)
         alpha = np.empty(size, np.float32)
@@ -201,7 +194,17 @@ def checked_poses(rotations: ArrayLike, centres: ArrayLike) -> tuple[NDArray[np.
     return rotations, centres
 
 
-def _checked_channels(channels: NDArray[Any], size: tuple[int, int], colours: int) -> NDArray[np.uint8]:
+def checked_windows(windows: Floats, size: tuple[int, int]) -> Floats:
+    """[2, H, W], contiguous. Raises ConfigurationError for another shape, and where they are not finite."""
+    windows = np.ascontiguousarray(windows, np.float32)
+    if windows.shape != (2, *size):
+        raise ConfigurationError(f"windows are {windows.shape}, expected {(2, *size)}: begin and end of each pixel's")
+    if not np.isfinite(windows).all():
+        raise ConfigurationError("a window is not finite: give a pixel that does not look an empty one, as 0, 0")
+    return windows
+
+
+def checked_channels(channels: NDArray[Any], size: tuple[int, int], colours: int) -> NDArray[np.uint8]:
     """As bytes. Raises ConfigurationError for other values than 0, 1 and 2: a cast would wrap or cut them."""
     given = np.asarray(channels)
     fits = given.shape == size and colours == 3 and np.issubdtype(given.dtype, np.integer)

@@ -27,7 +27,7 @@ from spiked.render.comparison import (
     RateTerms,
     ViewGains,
 )
-from spiked.render.cpu import Rasteriser, checked_poses
+from spiked.render.cpu import Rasteriser, checked_channels, checked_poses, checked_windows
 from spiked.render.splats import AnySplats, DeviceScene, Floats, Gradients, MeanAxes, RenderedImage, SizeLimits
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics
@@ -74,6 +74,16 @@ def device_errors() -> Iterator[None]:
         ) from error
 
 
+@contextmanager
+def _native_errors() -> Iterator[None]:
+    """`device_errors`, and ConfigurationError for what does not fit."""
+    try:
+        with device_errors():
+            yield
+    except ValueError as error:
+        raise ConfigurationError(f"scene, view and image do not fit: {error}") from error
+
+
 class GpuRasteriser(Rasteriser):
     """`Rasteriser` on a GPU: the same methods, shapes and errors. The same input gives the same bits.
 
@@ -86,6 +96,8 @@ class GpuRasteriser(Rasteriser):
         there is no GPU."""
         self._emulated = device == "emulated"
         self._gain: Floats | None = None
+        """What images are compared with on the device: gains, and the last view."""
+        self._frame: DeviceFrame | None = None
         self._charge_colours = 1
         super().__init__(camera, 1, near)
 
@@ -108,10 +120,13 @@ class GpuRasteriser(Rasteriser):
         """A view on this device: rates and their deviations [H, W] or [H, W, 3], infinite where nothing was seen, the
         windows [2, H, W] of `forward_moving` or None for a camera that stands still, and a mosaic's channels [H, W]."""
         arrays = [np.ascontiguousarray(array, np.float32) for array in (rates, deviation)]
+        size = (self.camera.height, self.camera.width)
         if windows is not None:
-            windows = np.ascontiguousarray(windows, np.float32)
+            windows = checked_windows(windows, size)
+        if channels is not None:
+            channels = checked_channels(channels, size, 3)
         parts = [array for array in (*arrays, windows, channels) if array is not None]
-        with self._told(), device_errors():
+        with _native_errors():
             return DeviceFrame(self._native.frame(*arrays, windows, channels), sum(part.nbytes for part in parts))
 
     def compare(
@@ -133,7 +148,7 @@ class GpuRasteriser(Rasteriser):
         poses = checked_poses(rotations, centres)
         self._inputs = None  # backward() needs the slope of an image that was brought here
         self._frame = frame  # its windows are needed until descend() is done
-        with self._told(), device_errors():
+        with _native_errors():
             if gains is not None and gains.gain is not self._gain:
                 self._native.set_gains(np.ascontiguousarray(gains.gain, np.float32))
                 self._gain = gains.gain
@@ -149,14 +164,16 @@ class GpuRasteriser(Rasteriser):
     def slope(self, shape: tuple[int, ...]) -> Floats:
         """The gradient of the last comparison by its image, of that shape."""
         out = np.empty(shape, np.float32)
-        with self._told(), device_errors():
+        with _native_errors():
             self._native.slope(out)
         return out
 
-    def add_evidence(self, frame: DeviceFrame, level: float, model_error: float) -> None:
-        """Add the last comparison, which was with this frame, to the evidence of the pixels' gains, see `Nuisances`."""
-        with self._told(), device_errors():
-            self._native.add_evidence(frame.native, level, model_error)
+    def add_evidence(self, level: float, model_error: float) -> None:
+        """Add the last comparison with a view to the evidence of the pixels' gains, see `Nuisances.observe`."""
+        if self._frame is None:
+            raise ConfigurationError("evidence is of an image and a view, and the last image was not compared with one")
+        with _native_errors():
+            self._native.add_evidence(self._frame.native, level, model_error)
 
     def take_evidence(self) -> tuple[Floats, Floats]:
         """The evidence since it was last taken, as sums xx and xy [H, W] of normal equations."""
@@ -168,13 +185,13 @@ class GpuRasteriser(Rasteriser):
 
     def spikes(self, frames: NDArray[np.uint8], layout: SpikeLayout) -> DeviceSpikes:
         """Frames [n, frame_bytes] on this device, at most 64."""
-        with self._told(), device_errors():
+        with _native_errors():
             return DeviceSpikes(self._native.spikes(np.ascontiguousarray(frames), **layout), frames.nbytes)
 
     def light(self, gain: Floats, dark: Floats | None) -> DeviceLight:
         """What multiplies the light of a sensor's pixels [H, W] (0: one that does not count), and what is added."""
         arrays = [None if array is None else np.ascontiguousarray(array, np.float32) for array in (gain, dark)]
-        with self._told(), device_errors():
+        with _native_errors():
             return DeviceLight(self._native.light(*arrays))
 
     def compare_charge(
@@ -194,13 +211,13 @@ class GpuRasteriser(Rasteriser):
         The camera has no distortion. The gradient of the loss by the image stays on the device for `descend`.
         """
         poses = checked_poses(rotations, centres)
-        self._inputs, self._charge_colours = None, int(scene.native.colours)
+        self._inputs, self._frame, self._charge_colours = None, None, int(scene.native.colours)
         turn, shift = (np.ascontiguousarray(part, np.float32) for part in motion)
-        with self._told(), device_errors():
+        with _native_errors():
             loss, pixels, chi2, intervals, expected, counted = self._native.compare_charge(
                 scene.native, spikes.native, light.native, *poses, np.full(3, background, np.float32), turn, shift,
                 cell=WARP_CELL_PX, nearest=terms.nearest, pixel=terms.pixel, every=terms.pixel, phase=terms.phase,
-                level=terms.level, floor=terms.floor, jitter=terms.jitter, scale=1 / terms.white**2,
+                level=terms.level, floor=terms.floor, jitter=terms.jitter, white=terms.white,
                 detail=terms.detail, window=_detail_window(terms.detail_px),
             )  # fmt: skip
         return ChargeCompared(
@@ -213,7 +230,7 @@ class GpuRasteriser(Rasteriser):
         """`Charge.slope` of the last comparison with spikes, [H, W] or [H, W, 3]: without detail, and not divided."""
         size = (self.camera.height, self.camera.width)
         out = np.empty(size if self._charge_colours == 1 else (*size, 3), np.float32)
-        with self._told(), device_errors():
+        with _native_errors():
             self._native.charge_slope(out)
         return out
 
@@ -233,20 +250,11 @@ class GpuRasteriser(Rasteriser):
         if d_values is not None:
             self._check_slope(d_values)
             d_values = np.ascontiguousarray(d_values, np.float32)
-        with self._told(), device_errors():
+        with _native_errors():
             self._native.descend(
                 d_values, scene.native, np.array(rates, np.float32), axes.blur,
                 axes.own, beta1, beta2, epsilon, limits.log_scale, limits.widest, np.array(limits.centre, np.float32),
             )  # fmt: skip
-
-    @staticmethod
-    @contextmanager
-    def _told() -> Iterator[None]:
-        """Raises ConfigurationError for what does not fit."""
-        try:
-            yield
-        except ValueError as error:
-            raise ConfigurationError(f"scene, view and image do not fit: {error}") from error
 
     def _splats(self, splats: AnySplats) -> tuple[tuple[Any, ...], int, int]:
         if isinstance(splats, DeviceScene):

@@ -181,7 +181,7 @@ def test_what_does_not_fit_is_told(device: str) -> None:
         rasteriser.compare_charge(scene, *POSE, spikes, rasteriser.light(case.gain[1:], None), motion, terms)
     with pytest.raises(ConfigurationError, match="gain and dark"):
         rasteriser.light(case.gain, case.gain[1:])
-    for wrong in ({"floor": 0.0}, {"jitter": 0.0}, {"phase": 1}, {"pixel": 0}):
+    for wrong in ({"floor": 0.0}, {"jitter": 0.0}, {"white": 0.0}, {"phase": 1}, {"pixel": 0}):
         with pytest.raises(ConfigurationError, match=r"positive|phase"):
             rasteriser.compare_charge(scene, *POSE, spikes, light, motion, replace(terms, **wrong))
 

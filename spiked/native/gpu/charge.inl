@@ -4,15 +4,7 @@
 namespace spiked {
 namespace {
 
-enum ChargeSum {
-    kLoss,
-    kCompared,
-    kChi2,
-    kIntervals,
-    kExpected,
-    kCounted,
-    kChargeSums = 8
-};  // powers of two, as above
+enum ChargeSum { kLoss, kCompared, kChi2, kIntervals, kExpected, kCounted, kChargeSums = 8 };  // a power of two
 
 // Slopes are added up as whole multiples of 2^-24 floor^2: the order in which threads do it changes nothing.
 constexpr float kSlopeSteps = 1 << 24;

@@ -98,7 +98,7 @@ nb::tuple compare_charge(GpuRenderer& self, GpuScene& scene, GpuSpikes& spikes, 
                          Array<const double, 3> rotations, Array<const double, 2> centres,
                          Array<const float, 1> background, Array<const float, 3> turn, Array<const float, 2> shift,
                          int cell, float nearest, float pixel, int every, int phase, float level, float floor,
-                         float jitter, float scale, float detail, Array<const float, 1> window) {
+                         float jitter, float white, float detail, Array<const float, 1> window) {
     expect_poses(rotations, centres, background);
     const size_t frames = spikes.frames;
     const PinholeF& camera = self.camera();
@@ -111,10 +111,10 @@ nb::tuple compare_charge(GpuRenderer& self, GpuScene& scene, GpuSpikes& spikes, 
     expect(camera.width > 1 && camera.height > 1 && camera.lens == 0, "the image is at least 2x2, without distortion");
     expect(cell > 0 && pixel >= 1 && nearest > 0, "cell, pixel and nearest are positive");
     expect(every > 0 && phase >= 0 && phase < every, "phase is one of every");
-    expect(floor > 0 && jitter > 0, "floor and jitter are positive");
+    expect(floor > 0 && jitter > 0 && white > 0, "floor, jitter and white are positive");
     expect(window.shape(0) == kDetailReach + 1, "the window has seven weights");
-    ChargeLoss loss{turn.data(), shift.data(), cell,   nearest, pixel,  every, phase,
-                    level,       floor,        jitter, scale,   detail, {}};
+    ChargeLoss loss{turn.data(), shift.data(),        cell,   nearest, pixel, every, phase, level, floor,
+                    jitter,      1 / (white * white), detail, {}};
     std::copy_n(window.data(), kDetailReach + 1, loss.window);
     const Views pose{rotations.data(), centres.data(), 1, nullptr, nullptr, nullptr, nullptr};
     ChargeComparison made;
@@ -270,7 +270,7 @@ NB_MODULE(_gpu, m) {
         .def("compare_charge", &compare_charge, nb::arg("scene"), nb::arg("spikes"), nb::arg("light"),
              nb::arg("rotations"), nb::arg("centres"), nb::arg("background"), nb::arg("turn"), nb::arg("shift"),
              nb::kw_only(), nb::arg("cell"), nb::arg("nearest"), nb::arg("pixel"), nb::arg("every"), nb::arg("phase"),
-             nb::arg("level"), nb::arg("floor"), nb::arg("jitter"), nb::arg("scale"), nb::arg("detail"),
+             nb::arg("level"), nb::arg("floor"), nb::arg("jitter"), nb::arg("white"), nb::arg("detail"),
              nb::arg("window"))
         .def("charge_slope", &charge_slope, nb::arg("out").noconvert())
         .def("set_gains", &set_gains, nb::arg("gain"))

@@ -158,7 +158,7 @@ class DeviceMapSteps(MapSteps):
         if nuisances is not None:
             nuisances.compare(step.key, made.expected_light, made.seen_light)
             if step.gains:
-                rasteriser.add_evidence(frame, nuisances.level(step.key), MODEL_ERROR)
+                rasteriser.add_evidence(nuisances.level(step.key), MODEL_ERROR)
                 nuisances.expect(rasteriser)
         return made.error
 

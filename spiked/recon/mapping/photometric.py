@@ -47,6 +47,7 @@ class Nuisances:
         self._mean_level = 1.0
 
     def __getstate__(self) -> dict[str, object]:
+        """With the evidence that is elsewhere."""
         self._collect()
         return vars(self)
 

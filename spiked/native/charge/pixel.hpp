@@ -63,12 +63,12 @@ SPIKED_DEVICE SPIKED_INLINED static inline Weighed weigh(const Gathered& g, floa
     const bool enough = g.seen >= kLeastChargeFrames;
     const float scale = enough ? floor2 / (1 + floor2 * precision) : 0;
     Weighed out;
-    out.inner = more & !(saturated & above) ? 2 * scale / variance : 0;
-    out.outer = saturated & above ? 0 : 2 * kEdgeWeight * scale * edge;
+    out.inner = (more & !(saturated & above)) ? 2 * scale / variance : 0;
+    out.outer = (saturated & above) ? 0 : 2 * kEdgeWeight * scale * edge;
     out.loss = scale * ((more ? g.squares / variance : 0) + kEdgeWeight * edge * edge);
     out.enough = enough;
-    out.chi2 = enough & more ? g.squares / variance : 0;
-    out.intervals = enough & more ? g.spikes - 1 : 0;
+    out.chi2 = (enough & more) ? g.squares / variance : 0;
+    out.intervals = (enough & more) ? g.spikes - 1 : 0;
     const float off = g.charge - g.spikes > 0 ? g.charge - g.spikes : g.spikes - g.charge;
     const bool agrees = enough & (off < kAgreeSpikes + kAgreeShare * (g.charge + g.spikes));
     out.expected = agrees ? g.charge : 0;

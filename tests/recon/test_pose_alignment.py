@@ -7,7 +7,7 @@ import spiked.native._dense as _dense
 from spiked.pose import Array, exp_so3, log_so3
 from spiked.recon.mapping.pose_alignment import (
     DRIFT_PX,
-    LONG_LANDMARKS,
+    LONG_MODEL,
     TrajectoryPrior,
     ViewNormals,
     marginalise_landmarks,
@@ -123,7 +123,7 @@ def test_the_path_is_found_although_every_place_of_the_map_has_moved() -> None:
         whole += jacobian.T @ jacobian
         right += jacobian.T @ error
 
-    by_view, slope = marginalise_landmarks(sums, LONG_LANDMARKS)
+    by_view, slope = marginalise_landmarks(sums, LONG_MODEL)
     basis = np.kron(spline.basis_matrix(times), np.eye(6))
     square, gradient = basis.T @ by_view @ basis, slope @ basis
     held = np.linalg.norm(np.linalg.solve(whole[:54, :54], -right[:54]).reshape(9, 6) - moved)
@@ -155,7 +155,7 @@ def test_places_that_many_views_see_are_taken_out_as_from_the_whole_matrix() -> 
     cut = 6 * count
     solved = np.linalg.solve(whole[cut:, cut:-1], whole[cut:])
     exact = whole[:cut] - whole[:cut, cut:-1] @ solved
-    square, gradient = marginalise_landmarks(sums, LONG_LANDMARKS)
+    square, gradient = marginalise_landmarks(sums, LONG_MODEL)
     np.testing.assert_allclose(square, exact[:, :cut], atol=1e-4 * np.abs(exact).max())
     np.testing.assert_allclose(gradient, exact[:, -1], atol=1e-4 * np.abs(exact).max())
     np.testing.assert_array_equal(square, square.T)
@@ -177,7 +177,7 @@ def test_blocks_that_do_not_fit_their_views_are_refused() -> None:
 
 def test_views_that_show_nothing_say_nothing() -> None:
     nothing = ViewNormals(np.zeros((6, 7)), np.zeros(0, np.int64), np.zeros((0, 3, 10), np.float32), 0.0)
-    square, gradient = marginalise_landmarks([nothing, nothing], LONG_LANDMARKS)
+    square, gradient = marginalise_landmarks([nothing, nothing], LONG_MODEL)
     assert not square.any()
     assert not gradient.any()
 

@@ -32,10 +32,6 @@ from spiked.spline import Spline, Waypoints
 Index = NDArray[np.int64]
 Aligned = TypeVar("Aligned", Spline, Waypoints)
 
-GRADIENT_QUANTILE = 0.7
-"""Quantile of the gradient magnitude below which pixels are left out."""
-KNOT_DAMPING = 1e-3
-"""Damping of each knot, relative to its information; 0.02 is worse (decision 13)."""
 DRIFT_PX = 3.5e-3
 """Error of a long path after 1 px of image motion, in px; it grows with the root of the motion. Three times as much or
 a third makes no difference (docs/decisions/0058-long-paths-aligned-with-the-map.md)."""
@@ -49,23 +45,30 @@ units of this standard deviation."""
 
 
 @dataclass(frozen=True)
-class LandmarkPrior:
-    """What is known of landmarks before the views: all pixels in a cube of space share one, which is held a little, as
-    few pixels may see it."""
+class AlignmentModel:
+    """What an alignment compares, and what holds poses and landmarks before the views do.
 
-    width_px: float
-    """Approximate width of a landmark in the image."""
+    All pixels in a cube of space share a landmark, which is held a little, as few pixels may see it.
+    """
+
+    quantile: float
+    """Quantile of the gradient magnitude below which pixels are left out."""
     damping: float
+    """Damping of each pose, relative to its information."""
+    landmark_px: float
+    """Approximate width of a landmark in the image."""
+    landmark_damping: float
     """Damping, relative to a landmark's own information."""
-    damping_floor: float
+    landmark_floor: float
     """Damping, relative to the median landmark's information."""
 
 
-SPLINE_LANDMARKS = LandmarkPrior(16, 1e-2, 1e-3)
-"""Half and twice the width are as good (decision 13); hardly held ones cost up to 0.4 dB (decision 59)."""
-LONG_LANDMARKS = LandmarkPrior(8, 1e-5, 1e-6)
-"""Of a path that is interpolated between views: those of a spline hold its bend, which moves each of them (decision
-59)."""
+SPLINE_MODEL = AlignmentModel(0.7, 1e-3, 16, 1e-2, 1e-3)
+"""Half and twice the width are as good, and poses held by 0.02 are worse (decision 13); landmarks that are hardly held
+cost up to 0.4 dB (decision 59)."""
+LONG_MODEL = AlignmentModel(0.85, 1e-5, 6, 1e-5, 1e-6)
+"""Of a path that is interpolated between views: what holds a spline would hold its bend, which moves every pose and
+landmark (decisions 59 and 67)."""
 
 
 @dataclass(frozen=True)
@@ -114,15 +117,15 @@ def align(
     taken.
     """
     pixel = mapper.alignment_level.factor
-    landmarks = SPLINE_LANDMARKS if isinstance(path, Spline) else LONG_LANDMARKS
+    model = SPLINE_MODEL if isinstance(path, Spline) else LONG_MODEL
     sums = []
     for (key, view), rotation, centre in zip(views, *path.poses(times), strict=True):
         request = planner.request(view, path, pixel)
-        sums.append(_view_normals(key, view, request, rotation, centre, mapper, landmarks.width_px))
+        sums.append(_view_normals(key, view, request, rotation, centre, mapper, model))
     variance = float(np.mean([s.variance for s in sums]))
     if not variance:  # no view has a valid pixel
         return path
-    square, gradient = (part / variance for part in marginalise_landmarks(sums, landmarks))
+    square, gradient = (part / variance for part in marginalise_landmarks(sums, model))
     rotations, centres = path.poses(times)
     if isinstance(path, Spline):
         rotations, centres = path.rotations, path.centres
@@ -131,7 +134,7 @@ def align(
     if known is not None:
         square, gradient = square + known.information, gradient + known.gradient(rotations, centres)
     diagonal = np.diag(square).copy()
-    square[np.diag_indices(len(square))] += KNOT_DAMPING * diagonal + 1e-6 * diagonal.max()
+    square[np.diag_indices(len(square))] += model.damping * diagonal + 1e-6 * diagonal.max()
     step = np.asarray(-share * np.linalg.solve(square, gradient).reshape(-1, 6), np.float64)
     if isinstance(path, Spline):
         return path.move(step[:, :3], step[:, 3:])
@@ -148,7 +151,7 @@ class ViewNormals:
     variance: float  # of an error
 
 
-def marginalise_landmarks(sums: list[ViewNormals], known: LandmarkPrior) -> tuple[Array, Array]:
+def marginalise_landmarks(sums: list[ViewNormals], model: AlignmentModel) -> tuple[Array, Array]:
     """Hessian [6 V, 6 V] and gradient [6 V] by the poses of V views, all landmarks marginalised (Schur complement)."""
     count = len(sums)
     hessian, gradient = np.zeros((count, 6, count, 6)), np.zeros((count, 6))
@@ -156,14 +159,14 @@ def marginalise_landmarks(sums: list[ViewNormals], known: LandmarkPrior) -> tupl
         hessian[view, :, view], gradient[view] = s.pose[:, :6], s.pose[:, 6]
     square, right = hessian.reshape(6 * count, 6 * count), gradient.ravel()
     keys, places = [s.keys for s in sums], [s.places for s in sums]
-    _dense.marginalise(keys, places, known.damping, known.damping_floor, square, right)
+    _dense.marginalise(keys, places, model.landmark_damping, model.landmark_floor, square, right)
     return square, right
 
 
 def _view_normals(
-    key: int, view: View, request: RenderRequest, rotation: Array, centre: Array, mapper: Mapper, width_px: float
+    key: int, view: View, request: RenderRequest, rotation: Array, centre: Array, mapper: Mapper, model: AlignmentModel
 ) -> ViewNormals:
-    """Normal equations of a view for its pose and the landmarks in view, `width_px` wide, in units of white."""
+    """Normal equations of a view for its pose and the landmarks in view, in units of white."""
     level = mapper.alignment_level
     if request.warp is None:
         image, smooth, seen, certainty = _windowed(key, view, request, mapper, level)
@@ -175,12 +178,12 @@ def _view_normals(
     strong = np.zeros(error.shape, bool)
     size = np.hypot(du, dv)
     inside = slice(EDGE_PX, -EDGE_PX)
-    strong[inside, inside] = (size > np.quantile(size[::4, ::4], GRADIENT_QUANTILE))[inside, inside]
+    strong[inside, inside] = (size > np.quantile(size[::4, ::4], model.quantile))[inside, inside]
     strong &= image.alpha > MIN_ALPHA
     e = error[strong]
     scale = MAD_SCALE * (median(np.abs(e)) if len(e) else 0.0) + 1e-6
     weight = np.where(strong, certainty / (1 + (error / (ROBUST_SCALES * scale)) ** 2), 0).astype(np.float32)
-    pose, keys, places = _normals(error, du, dv, image.depth, weight, level, rotation, centre, width_px)
+    pose, keys, places = _normals(error, du, dv, image.depth, weight, level, rotation, centre, model.landmark_px)
     variance = float((weight * error**2).sum() / max(float(weight.sum()), 1e-12))
     return ViewNormals(pose, keys, places, variance)
 
@@ -199,7 +202,7 @@ def _normals(
     level: Level,
     rotation: Array,
     centre: Array,
-    width_px: float = SPLINE_LANDMARKS.width_px,
+    width_px: float = SPLINE_MODEL.landmark_px,
 ) -> tuple[Array, Index, NDArray[np.float32]]:
     """Normal equations of the pixels with weight, see `ViewNormals`."""
     count, k = int((weight > 0).sum()), level.camera.intrinsics

@@ -84,7 +84,7 @@ def chosen() -> Choice:
 
 @cache
 def choice_for(wanted: str) -> Choice:
-    """The renderer for a value of SPIKED_RENDER (cpu, cuda or empty), found once. Raises ConfigurationError."""
+    """The renderer for a value of SPIKED_RENDER (cpu, cuda, emulated or empty), once. Raises ConfigurationError."""
     if wanted == "emulated":
         return Choice("emulated", "SPIKED_RENDER asks for it")
     if wanted not in ("", "cpu", "cuda"):

@@ -5,11 +5,13 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
+from spiked.errors import ConfigurationError
 from spiked.render.charge import JITTER
 from spiked.render.splats import Floats
 
 MOST_FRAME_BYTES = 1 << 30
-"""Views of a kind that a map keeps on a GPU: 640 of 400x250, 64 of 1000x1000 that see slow motion."""
+"""Views of a kind that a map keeps on a GPU: 671 of 400x250, 67 of 1000x1000 that see slow motion. The buffers are a
+quarter larger."""
 
 
 @dataclass(frozen=True)
@@ -131,11 +133,21 @@ class FrameCache(Generic[Kept]):
         return sum(frame.nbytes for frame in self._frames.values())
 
     def get(self, key: Hashable, make: Callable[[], Kept]) -> Kept:
-        """The view of a key, which is made if it is not there; the last one stays whatever its size."""
+        """The view of a key, which is made if it is not there; the last one stays whatever its size.
+
+        Where the device refuses, as it lacks memory, the others make room for it.
+        """
         if key in self._frames:
             self._frames.move_to_end(key)
             return self._frames[key]
-        made = self._frames[key] = make()
+        try:
+            made = make()
+        except ConfigurationError:
+            if not self._frames:
+                raise
+            self._frames.clear()
+            made = make()
+        self._frames[key] = made
         while len(self) > 1 and self.nbytes > self._most_bytes:
             self._frames.popitem(last=False)
         return made

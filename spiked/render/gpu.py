@@ -96,8 +96,9 @@ class GpuRasteriser(Rasteriser):
         there is no GPU."""
         self._emulated = device == "emulated"
         self._gain: Floats | None = None
-        """What images are compared with on the device: gains, and the last view."""
+        """The gains on the device."""
         self._frame: DeviceFrame | None = None
+        """The view that the last image was compared with."""
         self._charge_colours = 1
         super().__init__(camera, 1, near)
 
@@ -146,8 +147,6 @@ class GpuRasteriser(Rasteriser):
         for `descend` and `add_evidence`. SSIM of a mosaic is that of grey images.
         """
         poses = checked_poses(rotations, centres)
-        self._inputs = None  # backward() needs the slope of an image that was brought here
-        self._frame = frame  # its windows are needed until descend() is done
         with _native_errors():
             if gains is not None and gains.gain is not self._gain:
                 self._native.set_gains(np.ascontiguousarray(gains.gain, np.float32))
@@ -159,6 +158,8 @@ class GpuRasteriser(Rasteriser):
                 model_error=0.0 if gains is None else gains.model_error,
                 sigmas=0.0 if gains is None else gains.sigmas,
             )  # fmt: skip
+        self._inputs = None  # backward() needs the slope of an image that was brought here
+        self._frame = frame  # its windows are needed until descend() is done; a refused one leaves the last
         return Compared(error, 1 - similarity, expected, seen)
 
     def slope(self, shape: tuple[int, ...]) -> Floats:
@@ -175,12 +176,17 @@ class GpuRasteriser(Rasteriser):
         with _native_errors():
             self._native.add_evidence(self._frame.native, level, model_error)
 
-    def take_evidence(self) -> tuple[Floats, Floats]:
-        """The evidence since it was last taken, as sums xx and xy [H, W] of normal equations."""
+    def set_evidence(self, xx: Floats, xy: Floats) -> None:
+        """Set the evidence of the pixels' gains: sums xx and xy [H, W] of normal equations."""
+        with _native_errors():
+            self._native.set_evidence(xx, xy)
+
+    def evidence(self) -> tuple[Floats, Floats]:
+        """The evidence that was set, with what was added to it since."""
         size = (self.camera.height, self.camera.width)
         xx, xy = np.empty(size, np.float32), np.empty(size, np.float32)
-        with device_errors():
-            self._native.take_evidence(xx, xy)
+        with _native_errors():
+            self._native.evidence(xx, xy)
         return xx, xy
 
     def spikes(self, frames: NDArray[np.uint8], layout: SpikeLayout) -> DeviceSpikes:
@@ -211,8 +217,9 @@ class GpuRasteriser(Rasteriser):
         The camera has no distortion. The gradient of the loss by the image stays on the device for `descend`.
         """
         poses = checked_poses(rotations, centres)
-        self._inputs, self._frame, self._charge_colours = None, None, int(scene.native.colours)
         turn, shift = (np.ascontiguousarray(part, np.float32) for part in motion)
+        if not (np.isfinite(turn).all() and np.isfinite(shift).all()):
+            raise ConfigurationError("the motion from frames to the image is not finite")
         with _native_errors():
             loss, pixels, chi2, intervals, expected, counted = self._native.compare_charge(
                 scene.native, spikes.native, light.native, *poses, np.full(3, background, np.float32), turn, shift,
@@ -220,6 +227,7 @@ class GpuRasteriser(Rasteriser):
                 level=terms.level, floor=terms.floor, jitter=terms.jitter, white=terms.white,
                 detail=terms.detail, window=_detail_window(terms.detail_px),
             )  # fmt: skip
+        self._inputs, self._frame, self._charge_colours = None, None, int(scene.native.colours)
         return ChargeCompared(
             loss / max(pixels, 1.0),
             chi2 / intervals if intervals > 0 else 0.0,

@@ -12,6 +12,7 @@ from test_gpu import DEVICES
 from test_moving import relative
 
 from spiked.calibration import Calibration
+from spiked.distortion import Distortion, LensModel
 from spiked.errors import ConfigurationError
 from spiked.pose import exp_so3
 from spiked.recon import MapOptions, Options, Reconstructor
@@ -19,11 +20,13 @@ from spiked.recon.mapping import mapper as mapping
 from spiked.recon.mapping import pyramid
 from spiked.recon.mapping.frame_warp import MIN_RELATIVE_DEPTH, FrameWarp
 from spiked.recon.mapping.loss import ChargeComparison, WarpedChargeLoss
+from spiked.recon.mapping.map_steps import ChargeStep, DeviceMapSteps, MapSteps
+from spiked.recon.mapping.mapper import Mapper
 from spiked.recon.mapping.render_requests import RenderRequest
 from spiked.render import Camera, RenderedImage, gpu
 from spiked.render.charge import ChargeLoss
 from spiked.render.comparison import ChargeCompared, ChargeTerms
-from spiked.render.descent import DeviceDescent
+from spiked.render.descent import DeviceDescent, Stride
 from spiked.render.splats import MeanAxes, SizeLimits
 from spiked.sensor import BitOrder, Intrinsics, Mosaic, Sensor
 from spiked.simulate import MotionKind, SimulatedCamera
@@ -221,3 +224,18 @@ def test_a_reconstruction_of_fast_motion_is_that_of_the_cpu(
     blurred = [cv2.blur(picture, (5, 5)) for picture in pictures]
     assert np.abs(blurred[0] - blurred[1]).mean() < 0.02 * theirs.white
     assert ours.loss == pytest.approx(theirs.loss, rel=0.2)
+
+
+def test_through_a_lens_with_distortion_spikes_are_compared_by_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPIKED_RENDER", "emulated")
+    optics = replace(Intrinsics(80.0, 82.0, 44.7, 30.1), distortion=Distortion(LensModel.OPENCV, (-0.2, 0.05)))
+    sensor, warp = replace(SENSOR, intrinsics=optics), Case("emulated").warp
+    mapper = Mapper(sensor, Camera(optics, sensor.width, sensor.height), MapOptions(), 0, 1)
+    mapper.adopt(scenes.splats(60, 1, 6))
+    loss, still = mapper.charge_loss, Stride((0.0,) * 5, SizeLimits(), MeanAxes())
+    request, level, nuisances = RenderRequest(*POSE, warp=warp), mapper.levels[0], mapper.nuisances
+    step = ChargeStep(1, request, level, loss, WHITE, 0.1, 0, nuisances, False)
+    assert isinstance(mapper.map_steps, DeviceMapSteps)
+    losses = [steps.fit_charge(step, mapper.descent, still) for steps in (mapper.map_steps, MapSteps())]
+    assert losses[0] == losses[1] > 0
+    assert mapper.map_steps.charge_error.any() and not mapper.map_steps._spikes

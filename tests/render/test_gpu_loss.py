@@ -15,12 +15,13 @@ from test_moving import BACKGROUND, Case, relative
 from spiked.errors import ConfigurationError
 from spiked.recon import MapOptions, Options, Reconstructor
 from spiked.recon.mapping import mapper as mapping
-from spiked.recon.mapping.loss import RateLoss
+from spiked.recon.mapping.loss import LossName, RateLoss
+from spiked.recon.mapping.map_steps import DeviceMapSteps, MapSteps, RateStep
 from spiked.recon.mapping.photometric import AGREEING_SIGMAS, MODEL_ERROR, Nuisances
 from spiked.recon.mapping.pyramid import Target
 from spiked.render import Camera, choice, gpu, rasteriser_for
 from spiked.render.comparison import Compared, DeviceFrame, FrameCache, RateTerms, ViewGains
-from spiked.render.descent import DeviceDescent
+from spiked.render.descent import DeviceDescent, Stride
 from spiked.render.splats import DeviceScene, Floats, MeanAxes, SizeLimits
 from spiked.scene import Scene
 from spiked.sensor import Intrinsics, Mosaic, Sensor
@@ -134,23 +135,51 @@ def test_a_step_is_one_along_the_slope(device: str) -> None:
 
 
 @on_devices
-def test_evidence_of_gains_is_gathered_until_it_is_taken(device: str) -> None:
+def test_evidence_of_gains_is_added_to_what_there_was(device: str) -> None:
     pair = Pair(device, "mosaic")
     assert pair.gain is not None
-    xx, xy = np.zeros((2, *pair.image.shape), np.float32)
+    xx, xy = np.ones((2, *pair.image.shape), np.float32)
     view = pair.target.values, pair.target.deviation
+    pair.rasteriser.set_evidence(xx, xy)
     for level in (1.1, 0.9):
         pair.compare()
         pair.rasteriser.add_evidence(level, MODEL_ERROR)
         gain_evidence(pair.gain, pair.image, *view, level, MODEL_ERROR, xx, xy)
-    made = pair.rasteriser.take_evidence()
-    assert relative(made[0], xx) < 1e-6 and relative(made[1], xy) < 1e-5
-    assert not np.any(pair.rasteriser.take_evidence())
-    pair.compare()
-    pair.rasteriser.add_evidence(0.9, MODEL_ERROR)
-    again = np.zeros((2, *pair.image.shape), np.float32)
-    gain_evidence(pair.gain, pair.image, *view, 0.9, MODEL_ERROR, *again)
-    assert relative(pair.rasteriser.take_evidence()[0], again[0]) < 1e-6
+    made = pair.rasteriser.evidence()
+    assert relative(made[0], xx) < 1e-6 and relative(made[1], xy) < 1e-5 and made[0].min() >= 1
+
+
+@on_devices
+def test_a_checkpoint_changes_no_bit_of_the_gains(device: str) -> None:
+    """Evidence that was fetched in between is added up in the same order."""
+    made: list[Floats] = []
+    for checkpoints in (False, True):
+        pair = Pair(device, "mosaic")
+        nuisances = Nuisances(*pair.image.shape)
+        for level in (1.1, 0.9, 1.3):
+            pair.compare()
+            nuisances.expect(pair.rasteriser)
+            pair.rasteriser.add_evidence(level, MODEL_ERROR)
+            if checkpoints:
+                nuisances = pickle.loads(pickle.dumps(nuisances))
+        made.append(pickle.loads(pickle.dumps(nuisances)).__dict__["_xx"])
+    assert np.array_equal(*made) and made[0].any()
+
+
+@on_devices
+def test_a_refused_view_leaves_the_last_one(device: str) -> None:
+    pair, other = Pair(device, "one"), Pair(device, "one", level=2.0)
+    xx, xy = np.zeros((2, *pair.image.shape), np.float32)
+    made: list[Floats] = []
+    for refused in (False, True):
+        pair.compare()
+        if refused:
+            with pytest.raises(ConfigurationError, match="white"):
+                pair.rasteriser.compare(pair.scene, *pair.poses, other.frame, replace(pair.terms, white=0.0))
+        pair.rasteriser.set_evidence(xx, xy)
+        pair.rasteriser.add_evidence(1.1, MODEL_ERROR)
+        made.append(pair.rasteriser.evidence()[1])
+    assert np.array_equal(*made) and made[0].any()
 
 
 @on_devices
@@ -200,6 +229,10 @@ def test_what_does_not_fit_is_told(device: str) -> None:
     with pytest.raises(ConfigurationError, match="another size"):
         small.compare(scene, *poses, pair.frame, terms)
     pair.compare()
+    with pytest.raises(ConfigurationError, match="no evidence"):
+        rasteriser.add_evidence(1.0, MODEL_ERROR)
+    with pytest.raises(ConfigurationError, match="no evidence"):
+        rasteriser.evidence()
     with pytest.raises(ConfigurationError, match="there was none"):
         rasteriser.backward(pair.image)
 
@@ -222,10 +255,30 @@ def test_views_on_a_device_make_room_for_others() -> None:
     assert len(cache) == 1
 
 
+def test_views_make_room_where_a_device_lacks_memory() -> None:
+    room = 3
+
+    def make() -> DeviceFrame:
+        if len(cache) >= room:
+            raise ConfigurationError("out of memory")
+        return DeviceFrame(None, 1)
+
+    cache = FrameCache[DeviceFrame](100)
+    for key in range(room + 1):
+        cache.get(key, make)
+    assert len(cache) == 1
+    room = 0
+    with pytest.raises(ConfigurationError, match="out of memory"):
+        FrameCache[DeviceFrame](100).get(1, make)
+
+
 def test_pending_evidence_is_part_of_a_checkpoint() -> None:
     class Elsewhere:
-        def take_evidence(self) -> tuple[Floats, Floats]:
-            return np.ones((4, 6), np.float32), np.full((4, 6), 0.5, np.float32)
+        def set_evidence(self, xx: Floats, xy: Floats) -> None:
+            self.sums = xx + 1, xy + 0.5
+
+        def evidence(self) -> tuple[Floats, Floats]:
+            return self.sums
 
     nuisances = Nuisances(4, 6)
     nuisances.note(1, 1.0)
@@ -254,13 +307,15 @@ def test_the_emulation_can_be_asked_for(emulated: Callable[[bool], None]) -> Non
 FRAMES = 160
 
 
-def reconstructed(mosaic: Mosaic | None, steps: int) -> Reconstructor:
+def reconstructed(mosaic: Mosaic | None, steps: int, loss: LossName = LossName.CHARGE) -> Reconstructor:
     """A short recording of the built-in room, by the poses that it was made with."""
     sensor = Sensor(136, 97, 20_000.0, mosaic=mosaic, intrinsics=Intrinsics.from_fov(136, 97, 60))
     camera = SimulatedCamera(sensor)
     rotations, centres = camera.truth(np.arange(FRAMES))
     path = Trajectory((np.arange(FRAMES) + 0.5) / 20_000, rotations, centres)
-    made = Reconstructor(sensor, Options(steps=steps, poses=path, window_frames=16, threads=1, mapping=MapOptions()))
+    made = Reconstructor(
+        sensor, Options(steps=steps, poses=path, window_frames=16, threads=1, mapping=MapOptions(loss=loss))
+    )
     made.feed(0, camera.next_frames(FRAMES))
     made.finish()
     return made
@@ -291,3 +346,30 @@ def test_a_reconstruction_on_the_device_is_that_of_the_cpu(
     assert gains[0].std() > 0 and np.corrcoef(gains[0].ravel(), gains[1].ravel())[0, 1] > 0.95
     again = pickle.loads(pickle.dumps(ours))
     assert again.loss == ours.loss and np.array_equal(again.scene.means, ours.scene.means)
+
+
+def test_another_loss_is_compared_by_the_cpu(emulated: Callable[[bool], None]) -> None:
+    made = []
+    for wanted in (True, False):
+        emulated(wanted)
+        made.append(reconstructed(None, 30, LossName.INTERVAL).trainer.mapper)
+    assert isinstance(made[0].map_steps, DeviceMapSteps) and not made[0].map_steps._frames
+    assert made[0].loss == pytest.approx(made[1].loss, rel=0.2)
+
+
+def test_a_view_is_compared_by_the_sub_frames_of_its_request(emulated: Callable[[bool], None]) -> None:
+    """A view that is on the device once has other windows for other sub-frames."""
+    emulated(True)
+    trainer = reconstructed(None, 5).trainer
+    mapper, path = trainer.mapper, trainer._fitted_path
+    (view_id, *_), still = trainer.usable(path), Stride((0.0,) * 5, SizeLimits(), MeanAxes())
+    errors = []
+    for parts in (1, 3, 1, 0):
+        trainer.planner.sub_frames = parts
+        request, view = trainer.planner.request(trainer.shown(view_id), path), trainer.shown(view_id)
+        step = RateStep(view_id, view, request, mapper.levels[0], mapper.view_loss, mapper.white, 0.0)
+        errors.append(mapper.map_steps.fit_rates(step, mapper.descent, still))
+        assert errors[-1] == pytest.approx(MapSteps().fit_rates(step, mapper.descent, still), rel=1e-5)
+    assert errors[0] == errors[2] and len(set(errors)) == 3
+    mapper.forget_views()
+    assert isinstance(mapper.map_steps, DeviceMapSteps) and not mapper.map_steps._frames

@@ -224,7 +224,7 @@ struct MixSlopes {
                 const int64_t pixel = at / image.colours;
                 const Plane plane{image.width, image.height, image.colours, static_cast<int>(at % image.colours),
                                   image.mosaic};
-                // The filter of a mosaic is symmetric, so it is its own transpose.
+                // The filter of a mosaic is symmetric, so it is its own transpose but for the border.
                 const float by =
                     plane.at(similarity, static_cast<int>(pixel % image.width), static_cast<int>(pixel / image.width));
                 sum = (1 - loss.share) * sum - loss.share * loss.scale * by;
@@ -239,7 +239,6 @@ struct AddEvidence {
     static constexpr int kThreads = kValueThreads;
     Compared image;
     float level, model_error;
-    bool first;  // there is no evidence yet
     float *xx, *xy;
     SPIKED_DEVICE void operator()(const Block<kThreads>& block) const {
         block.each([&](int thread) {
@@ -247,8 +246,8 @@ struct AddEvidence {
             if (at >= image.values) return;
             const GainTerms terms = gain_terms(image.gain[at], image.rendered[at], image.rates[at], image.deviation[at],
                                                level, model_error);
-            xx[at] = first ? terms.xx : xx[at] + terms.xx;
-            xy[at] = first ? terms.xy : xy[at] + terms.xy;
+            xx[at] += terms.xx;
+            xy[at] += terms.xy;
         });
     }
 };

@@ -52,25 +52,21 @@ class Comparer {
 
     const float* slope() { return slope_.data(); }
 
-    void add_evidence(const Compared& image, float level, float model_error) {
-        const size_t count = image.values;
-        const bool first = !gathered_;
-        float *xx = first ? xx_.grow(count) : xx_.data(), *xy = first ? xy_.grow(count) : xy_.data();
-        device_.run(AddEvidence{image, level, model_error, first, xx, xy}, blocks_of(count, AddEvidence::kThreads));
-        gathered_ = true;
+    void set_evidence(const float* xx, const float* xy, size_t pixels) {
+        device_.upload(xx_, xx, pixels);
+        device_.upload(xy_, xy, pixels);
+        device_.finish();
     }
 
-    // Zeros where there is none.
-    void take_evidence(float* xx, float* xy, size_t pixels) {
-        if (!gathered_) {
-            std::fill_n(xx, pixels, 0.0f);
-            std::fill_n(xy, pixels, 0.0f);
-            return;
-        }
+    void add_evidence(const Compared& image, float level, float model_error) {
+        device_.run(AddEvidence{image, level, model_error, xx_.data(), xy_.data()},
+                    blocks_of(image.values, AddEvidence::kThreads));
+    }
+
+    void evidence(float* xx, float* xy, size_t pixels) {
         device_.download(xx, xx_.data(), pixels);
         device_.download(xy, xy_.data(), pixels);
         device_.finish();
-        gathered_ = false;
     }
 
   private:
@@ -96,7 +92,6 @@ class Comparer {
     }
 
     Device& device_;
-    bool gathered_ = false;  // evidence of gains
     Buffer<float> gain_, xx_, xy_;
     Buffer<float> expected_, slope_, derivatives_, gradient_;
     Buffer<double> partial_, structure_, totals_;

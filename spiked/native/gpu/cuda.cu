@@ -91,21 +91,22 @@ class Cuda {
         if (count == 0) return;
         void* through = stage(count * sizeof(T));
         std::memcpy(through, from, count * sizeof(T));
-        check(cudaMemcpyAsync(to, through, count * sizeof(T), cudaMemcpyHostToDevice, stream_));
+        check_call(cudaMemcpyAsync(to, through, count * sizeof(T), cudaMemcpyHostToDevice, stream_));
     }
 
     template <class T>
     void download(T* to, const T* from, size_t count) {
         if (count == 0) return;
         void* through = stage(count * sizeof(T));
-        check(cudaMemcpyAsync(through, from, count * sizeof(T), cudaMemcpyDeviceToHost, stream_));
+        check_call(cudaMemcpyAsync(through, from, count * sizeof(T), cudaMemcpyDeviceToHost, stream_));
         arriving_.push_back({to, through, count * sizeof(T)});
     }
 
     void finish() {
-        check(cudaStreamSynchronize(stream_));
-        for (const Arriving& one : arriving_) std::memcpy(one.to, one.through, one.bytes);
+        const std::vector<Arriving> arrived = std::move(arriving_);
         arriving_.clear();
+        check(cudaStreamSynchronize(stream_));
+        for (const Arriving& one : arrived) std::memcpy(one.to, one.through, one.bytes);
         for (void* memory : outgrown_) cudaFreeHost(memory);
         outgrown_.clear();
         staged_ = 0;
@@ -147,6 +148,12 @@ class Cuda {
         check(call(scratch_.grow(bytes + 1), bytes));
     }
 
+    // A call that fails gets nothing of what was on its way: its memory may be gone at the next finish().
+    void check_call(cudaError_t status) {
+        if (status != cudaSuccess) arriving_.clear();
+        check(status);
+    }
+
     // Page-locked memory, until finish().
     void* stage(size_t bytes) {
         bytes = (bytes + 255) / 256 * 256;
@@ -155,7 +162,7 @@ class Cuda {
             const size_t room = 2 * (staging_room_ + bytes) + (1 << 20);
             if (staging_) outgrown_.push_back(staging_);
             staging_ = nullptr, staging_room_ = 0, staged_ = 0;
-            check(cudaMallocHost(&staging_, room));
+            check_call(cudaMallocHost(&staging_, room));
             staging_room_ = room;
         }
         void* at = static_cast<char*>(staging_) + staged_;

@@ -148,17 +148,26 @@ void slope(GpuRenderer& self, AnyArray<float> out) {
 
 void add_evidence(GpuRenderer& self, GpuFrame& frame, float level, float model_error) {
     expect(self.compared() && self.has_gains(), "the last image was not compared");
+    expect(self.has_evidence(), "there is no evidence to add to");
     expect_alike(self, frame);
     expect(frame.values == pixels_of(self), "gains are of frames of one value a pixel");
     nb::gil_scoped_release release;
     self.add_evidence(frame, level, model_error);
 }
 
-void take_evidence(GpuRenderer& self, Array<float, 2> xx, Array<float, 2> xy) {
+void set_evidence(GpuRenderer& self, Array<const float, 2> xx, Array<const float, 2> xy) {
     expect_plane(self, xx);
     expect_plane(self, xy);
     nb::gil_scoped_release release;
-    self.take_evidence(xx.data(), xy.data());
+    self.set_evidence(xx.data(), xy.data());
+}
+
+void evidence(GpuRenderer& self, Array<float, 2> xx, Array<float, 2> xy) {
+    expect(self.has_evidence(), "there is no evidence");
+    expect_plane(self, xx);
+    expect_plane(self, xy);
+    nb::gil_scoped_release release;
+    self.evidence(xx.data(), xy.data());
 }
 
 void descend(GpuRenderer& self, std::optional<AnyArray<const float>> d_values, GpuScene& scene,
@@ -275,7 +284,8 @@ NB_MODULE(_gpu, m) {
         .def("charge_slope", &charge_slope, nb::arg("out").noconvert())
         .def("set_gains", &set_gains, nb::arg("gain"))
         .def("add_evidence", &add_evidence, nb::arg("frame"), nb::arg("level"), nb::arg("model_error"))
-        .def("take_evidence", &take_evidence, nb::arg("xx").noconvert(), nb::arg("xy").noconvert());
+        .def("set_evidence", &set_evidence, nb::arg("xx").noconvert(), nb::arg("xy").noconvert())
+        .def("evidence", &evidence, nb::arg("xx").noconvert(), nb::arg("xy").noconvert());
     m.def(
         "renderer",
         [](double fx, double fy, double cx, double cy, int width, int height, double near, bool emulated,

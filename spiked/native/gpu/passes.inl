@@ -222,7 +222,12 @@ class Passes final : public GpuRenderer {
                                model_error);
     }
 
-    void take_evidence(float* xx, float* xy) override { comparer_.take_evidence(xx, xy, pixels()); }
+    void set_evidence(const float* xx, const float* xy) override {
+        comparer_.set_evidence(xx, xy, pixels());
+        has_evidence_ = true;
+    }
+
+    void evidence(float* xx, float* xy) override { comparer_.evidence(xx, xy, pixels()); }
 
     void backward(const float* d_values, const GradientArrays& out) override {
         differentiate(d_values);

@@ -152,9 +152,10 @@ class GpuRenderer {
     // Renders from one pose and compares the image, warped by its depth, with spikes.
     virtual ChargeComparison compare_charge(GpuScene&, GpuSpikes&, GpuLight&, const Views& pose,
                                             const float background[3], const ChargeLoss&) = 0;
-    // Adds the last comparison, which was with this frame, to the evidence of the pixels' gains; and takes all of it.
+    // The evidence of the pixels' gains, [height][width]; to it the last comparison, which was with this frame, is added.
+    virtual void set_evidence(const float* xx, const float* xy) = 0;
     virtual void add_evidence(GpuFrame&, float level, float model_error) = 0;
-    virtual void take_evidence(float* xx, float* xy) = 0;
+    virtual void evidence(float* xx, float* xy) = 0;
 
     virtual const char* instructions() const = 0;
     const PinholeF& camera() const { return camera_; }
@@ -163,6 +164,7 @@ class GpuRenderer {
     bool mosaic() const { return mosaic_; }
     bool compared() const { return compared_; }  // whether the last image was
     bool has_gains() const { return has_gains_; }
+    bool has_evidence() const { return has_evidence_; }
 
   protected:
     explicit GpuRenderer(const PinholeF& camera) : camera_(camera) {}
@@ -170,7 +172,7 @@ class GpuRenderer {
     PinholeF camera_;
     SplatArrays splats_{};
     int poses_ = 0;
-    bool mosaic_ = false, compared_ = false, has_gains_ = false;
+    bool mosaic_ = false, compared_ = false, has_gains_ = false, has_evidence_ = false;
 };
 
 std::unique_ptr<GpuRenderer> emulated_renderer(const PinholeF&);

@@ -120,7 +120,7 @@ def _with_similarity(
         return Comparison(squares.error, squares.slope, squares.error)
     rendered, seen = luminance(expected, mosaic), luminance(target.values, mosaic)
     unlike, slope = loss.similarity(rendered, seen, white)
-    # The filter of `luminance` is symmetric, so it is its own transpose.
+    # The filter of `luminance` is symmetric, so it is its own transpose but for the border.
     slope = (1 - share) * squares.slope + share * scale * luminance(slope, mosaic)
     return Comparison((1 - share) * squares.error + share * scale * unlike, slope, squares.error)
 

@@ -83,6 +83,10 @@ class MapSteps:
     def __init__(self) -> None:
         self._charge_error: Image = np.zeros((1, 1), np.float32)
 
+    def __getstate__(self) -> dict[str, object]:
+        """Nothing: a map that is loaded takes the steps of its machine."""
+        return {}
+
     def fit_rates(self, step: RateStep, descent: Descent, stride: Stride) -> float:
         """Change the scene of `descent`; returns the error of `Comparison`, before the step."""
         level, target, nuisances, factor = step.level, step.target(), step.nuisances, None
@@ -131,10 +135,6 @@ class DeviceMapSteps(MapSteps):
         self._last: tuple[ChargeStep, GpuRasteriser] | None = None
         """The last step on charge that was the GPU's."""
 
-    def __getstate__(self) -> dict[str, object]:
-        """Nothing: a map that is loaded takes the steps of its machine."""
-        return {}
-
     def fit_rates(self, step: RateStep, descent: Descent, stride: Stride) -> float:
         """See `MapSteps.fit_rates`."""
         loss, rasteriser, nuisances = step.loss, step.level.rasteriser, step.nuisances
@@ -158,8 +158,8 @@ class DeviceMapSteps(MapSteps):
         if nuisances is not None:
             nuisances.compare(step.key, made.expected_light, made.seen_light)
             if step.gains:
-                rasteriser.add_evidence(nuisances.level(step.key), MODEL_ERROR)
                 nuisances.expect(rasteriser)
+                rasteriser.add_evidence(nuisances.level(step.key), MODEL_ERROR)
         return made.error
 
     def fit_charge(self, step: ChargeStep, descent: Descent, stride: Stride) -> float:

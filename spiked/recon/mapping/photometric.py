@@ -20,10 +20,13 @@ GAIN_LIMITS = (0.5, 2.0)
 
 
 class Evidence(Protocol):
-    """Sums of residuals that are gathered elsewhere, as on a GPU."""
+    """Where residuals are added up, as on a GPU: squares of the model, and products with the residual, [H, W]."""
 
-    def take_evidence(self) -> tuple[Image, Image]:
-        """Those since they were last taken, [H, W]: squares of the model, and products with the residual."""
+    def set_evidence(self, xx: Image, xy: Image) -> None:
+        """The sums to begin with."""
+
+    def evidence(self) -> tuple[Image, Image]:
+        """The sums."""
 
 
 class Nuisances:
@@ -34,7 +37,7 @@ class Nuisances:
     """
 
     _elsewhere: Evidence | None = None
-    """Where there is more evidence of the gains than here."""
+    """Where the evidence of the gains is; None: here."""
 
     def __init__(self, height: int, width: int, fixed: Image | None = None) -> None:
         """`fixed` [H, W] are gains of a calibration; they are not estimated."""
@@ -72,6 +75,7 @@ class Nuisances:
         self.compare(key, expected, light)
         if not gains:
             return
+        self._collect()
         gain_evidence(self.gain, *seen, self.level(key), MODEL_ERROR, self._xx, self._xy)
         self._observed += 1
 
@@ -81,17 +85,16 @@ class Nuisances:
             self.note(key, light / expected)
 
     def expect(self, evidence: Evidence) -> None:
-        """Count a view whose residuals are `evidence`, which is taken when the gains are estimated."""
+        """Count a view whose residuals are going to be added to `evidence`, which goes on with the sums so far."""
         if evidence is not self._elsewhere:
             self._collect()
+            evidence.set_evidence(self._xx, self._xy)
         self._elsewhere = evidence
         self._observed += 1
 
     def _collect(self) -> None:
         if self._elsewhere is not None:
-            xx, xy = self._elsewhere.take_evidence()
-            self._xx += xx
-            self._xy += xy
+            self._xx, self._xy = self._elsewhere.evidence()
             self._elsewhere = None
 
     def note(self, key: int, brightness: float) -> None:

@@ -236,9 +236,6 @@ def _renderer() -> Diagnosis:
         choice = chosen()
     except ConfigurationError as error:
         return Diagnosis(name, DiagnosisStatus.PROBLEM, str(error), "unset SPIKED_RENDER, or set it to cpu")
-    if choice.renderer == "emulated":
-        todo = "unset SPIKED_RENDER: that is for tests, and slow"
-        return Diagnosis(name, DiagnosisStatus.WARNING, f"{choice.renderer}: {choice.reason}", todo)
     if choice.unused:
         todo = "mend that, or set SPIKED_RENDER=cpu to render without the GPU"
         return Diagnosis(name, DiagnosisStatus.WARNING, f"{choice.renderer}: {choice.reason}", todo)

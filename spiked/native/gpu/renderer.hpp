@@ -152,7 +152,7 @@ class GpuRenderer {
     // Renders from one pose and compares the image, warped by its depth, with spikes.
     virtual ChargeComparison compare_charge(GpuScene&, GpuSpikes&, GpuLight&, const Views& pose,
                                             const float background[3], const ChargeLoss&) = 0;
-    // The evidence of the pixels' gains, [height][width]; to it the last comparison, which was with this frame, is added.
+    // The evidence of pixel gains, [height][width]; the last comparison, which was with this frame, is added to it.
     virtual void set_evidence(const float* xx, const float* xy) = 0;
     virtual void add_evidence(GpuFrame&, float level, float model_error) = 0;
     virtual void evidence(float* xx, float* xy) = 0;

@@ -371,5 +371,3 @@ def test_a_view_is_compared_by_the_sub_frames_of_its_request(emulated: Callable[
         errors.append(mapper.map_steps.fit_rates(step, mapper.descent, still))
         assert errors[-1] == pytest.approx(MapSteps().fit_rates(step, mapper.descent, still), rel=1e-5)
     assert errors[0] == errors[2] and len(set(errors)) == 3
-    mapper.forget_views()
-    assert isinstance(mapper.map_steps, DeviceMapSteps) and not mapper.map_steps._frames

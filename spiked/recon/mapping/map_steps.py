@@ -117,9 +117,6 @@ class MapSteps:
         """`ChargeComparison.error` of the last step on charge, [h, w] or [h, w, 3]."""
         return self._charge_error
 
-    def forget_views(self) -> None:
-        """Drop what is stored for each view."""
-
 
 class DeviceMapSteps(MapSteps):
     """Takes steps on a GPU, where views stay, too. Losses of rates other than `RateLoss`, and the charge through a lens
@@ -201,10 +198,6 @@ class DeviceMapSteps(MapSteps):
             return super().charge_error
         step, rasteriser = self._last
         return step.loss.error(rasteriser.charge_slope(), step.level.factor)
-
-    def forget_views(self) -> None:
-        """See `MapSteps.forget_views`."""
-        self._frames, self._spikes = FrameCache(), FrameCache()
 
     def _frame(self, step: RateStep, rasteriser: GpuRasteriser) -> DeviceFrame:
         """The view of a step, at its size and with the windows of its sub-frames."""

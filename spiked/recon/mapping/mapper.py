@@ -269,7 +269,6 @@ class Mapper:
     def forget_views(self) -> None:
         """Drop what is stored for each view, after some were dropped."""
         self._losses.clear()
-        self.map_steps.forget_views()
         self.nuisances.forget_views()
 
     @property

@@ -38,6 +38,17 @@ class Charge:
     """Spikes counted over spikes expected, by the pixels that roughly agree; 1 without any."""
 
 
+def charge_means(
+    loss: float, pixels: float, chi2: float, intervals: float, expected: float, counted: float
+) -> tuple[float, float, float]:
+    """Loss, chi2 and brightness of `Charge`, from the sums of a kernel."""
+    return (
+        loss / max(pixels, 1.0),
+        chi2 / intervals if intervals > 0 else 0.0,
+        counted / expected if expected > 0 else 1.0,
+    )
+
+
 class SpikeLayout(TypedDict):
     """How the kernel reads the bits of a stored frame; tile [4] has the colours of a mosaic's 2x2 sites."""
 
@@ -110,7 +121,7 @@ class ChargeLoss:
         if frames.dtype != np.uint8:
             raise ConfigurationError(f"frames are bytes as they are stored, not {frames.dtype}")
         try:
-            loss, pixels, chi2, intervals, expected, counted = self._native.run(
+            sums = self._native.run(
                 **self.layout,
                 frames=np.ascontiguousarray(frames),
                 grids=np.ascontiguousarray(displacements, np.float32),
@@ -127,10 +138,6 @@ class ChargeLoss:
             )
         except ValueError as error:
             raise ConfigurationError(f"images, frames and displacements do not fit: {error}") from error
-        slope /= np.float32(max(pixels, 1.0))
-        return Charge(
-            loss / max(pixels, 1.0),
-            slope.reshape(image.shape),
-            chi2 / intervals if intervals > 0 else 0.0,
-            counted / expected if expected > 0 else 1.0,
-        )
+        slope /= np.float32(max(sums[1], 1.0))
+        loss, chi2, brightness = charge_means(*sums)
+        return Charge(loss, slope.reshape(image.shape), chi2, brightness)

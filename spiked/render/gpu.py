@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 import spiked.native._gpu as _gpu
 from spiked.errors import ConfigurationError
 from spiked.render.camera import Camera
-from spiked.render.charge import WARP_CELL_PX, SpikeLayout
+from spiked.render.charge import WARP_CELL_PX, SpikeLayout, charge_means
 from spiked.render.comparison import (
     ChargeCompared,
     ChargeTerms,
@@ -221,18 +221,14 @@ class GpuRasteriser(Rasteriser):
         if not (np.isfinite(turn).all() and np.isfinite(shift).all()):
             raise ConfigurationError("the motion from frames to the image is not finite")
         with _native_errors():
-            loss, pixels, chi2, intervals, expected, counted = self._native.compare_charge(
+            sums = self._native.compare_charge(
                 scene.native, spikes.native, light.native, *poses, np.full(3, background, np.float32), turn, shift,
                 cell=WARP_CELL_PX, nearest=terms.nearest, pixel=terms.pixel, every=terms.pixel, phase=terms.phase,
                 level=terms.level, floor=terms.floor, jitter=terms.jitter, white=terms.white,
                 detail=terms.detail, window=_detail_window(terms.detail_px),
             )  # fmt: skip
         self._inputs, self._frame, self._charge_colours = None, None, int(scene.native.colours)
-        return ChargeCompared(
-            loss / max(pixels, 1.0),
-            chi2 / intervals if intervals > 0 else 0.0,
-            counted / expected if expected > 0 else 1.0,
-        )
+        return ChargeCompared(*charge_means(*sums))
 
     def charge_slope(self) -> Floats:
         """`Charge.slope` of the last comparison with spikes, [H, W] or [H, W, 3]: without detail, and not divided."""

@@ -2,14 +2,8 @@
 #pragma once
 #include <stdint.h>
 
+#include "../common/device.hpp"
 #include "limits.hpp"
-
-#if !defined(SPIKED_DEVICE)
-#define SPIKED_DEVICE
-#endif
-#if !defined(SPIKED_INLINED)
-#define SPIKED_INLINED
-#endif
 
 namespace spiked {
 namespace {

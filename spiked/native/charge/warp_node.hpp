@@ -2,9 +2,7 @@
 #pragma once
 #include <stdint.h>
 
-#if !defined(SPIKED_DEVICE)
-#define SPIKED_DEVICE
-#endif
+#include "../common/device.hpp"
 
 namespace spiked {
 namespace {

@@ -4,10 +4,7 @@
 #include <cmath>
 
 #include "../common/clones.hpp"
-
-#if !defined(SPIKED_DEVICE)
-#define SPIKED_DEVICE
-#endif
+#include "../common/device.hpp"
 
 namespace spiked {
 namespace {

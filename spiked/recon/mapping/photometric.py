@@ -119,7 +119,7 @@ class Nuisances:
 
     def forget_views(self) -> None:
         """Drop what is stored for each view, after some were dropped."""
-        self._collect()
+        self._elsewhere = None
         self._levels.clear()
         self._xx[:] = self._xy[:] = 0
         self._observed = 0.0

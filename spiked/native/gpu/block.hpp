@@ -109,6 +109,20 @@ struct Block {
 #endif
     }
 
+    // out[k] = the same over the whole block, by way of what its warps share, [kWarps][N].
+    template <class T, int N>
+    SPIKED_DEVICE void sums(PerThread<Sums<T, N>, Threads>& values, PerThread<bool, Threads>& some, T* shared,
+                            T* out) const {
+        warp_sums(values, some, shared, N);
+        sync();
+        each([&](int thread) {
+            if (thread >= N) return;
+            T sum = 0;
+            for (int warp = 0; warp < kWarps; ++warp) sum += shared[warp * N + thread];
+            out[thread] = sum;
+        });
+    }
+
 #if defined(__CUDACC__)
   private:
     // A lane gives half of its 2 Half sums to the one on the other side and goes on with the other half, from `kept`

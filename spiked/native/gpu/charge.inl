@@ -183,14 +183,7 @@ struct CompareCharge {
             some[thread] = true;
             compare(at, x, y, gain, scene.dark ? scene.dark[site] : 0, sums[thread].of);
         });
-        block.warp_sums(sums, some, &totals[0][0], kChargeSums);
-        block.sync();
-        block.each([&](int thread) {
-            if (thread >= kChargeSums) return;
-            double sum = 0;
-            for (int warp = 0; warp < Block<kThreads>::kWarps; ++warp) sum += totals[warp][thread];
-            partial[static_cast<int64_t>(block.index) * kChargeSums + thread] = sum;
-        });
+        block.sums(sums, some, &totals[0][0], partial + static_cast<int64_t>(block.index) * kChargeSums);
     }
 
   private:

@@ -48,14 +48,7 @@ struct CompareRates {
             sum[kExpectedLight] = light;
             sum[kObservedLight] = rate;
         });
-        block.warp_sums(sums, some, &totals[0][0], kCompareSums);
-        block.sync();
-        block.each([&](int thread) {
-            if (thread >= kCompareSums) return;
-            double sum = 0;
-            for (int warp = 0; warp < Block<kThreads>::kWarps; ++warp) sum += totals[warp][thread];
-            partial[static_cast<int64_t>(block.index) * kCompareSums + thread] = sum;
-        });
+        block.sums(sums, some, &totals[0][0], partial + static_cast<int64_t>(block.index) * kCompareSums);
     }
 };
 
@@ -156,14 +149,7 @@ struct CompareStructure {
             derivatives[2 * count + at] = found.by_xy;
             sums[thread].of[0] = found.value;
         });
-        block.warp_sums(sums, some, totals, 1);
-        block.sync();
-        block.each([&](int thread) {
-            if (thread > 0) return;
-            double sum = 0;
-            for (double total : totals) sum += total;
-            partial[block.index] = sum;
-        });
+        block.sums(sums, some, totals, partial + block.index);
     }
 };
 

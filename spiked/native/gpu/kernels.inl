@@ -677,14 +677,7 @@ struct SumBlocks {
             sums[thread] = {{sum}};
             some[thread] = true;
         });
-        block.warp_sums(sums, some, totals, 1);
-        block.sync();
-        block.each([&](int thread) {
-            if (thread > 0) return;
-            double sum = 0;
-            for (double total : totals) sum += total;
-            out[block.index] = sum;
-        });
+        block.sums(sums, some, totals, out + block.index);
     }
 };
 
